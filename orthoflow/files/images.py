@@ -207,9 +207,16 @@ def preview_webp(
     return cells_webp(shown.shape, _cells_of(image, shown), longest_side_px=longest_side_px)
 
 
-def cells_webp(shape: tuple[int, ...], cells: Cells, *, longest_side_px: int) -> bytes:
-    """Give the WebP of `preview_webp` of a raster that is made part by part, never as a whole."""
-    return encode_webp(_preview(shape, cells, longest_side_px))
+def cells_webp(
+    shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
+) -> bytes:
+    """Give the WebP of `preview_webp` of a raster that is made part by part, never as a whole.
+
+    Where it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
+    """
+    image = _preview(shape, cells, longest_side_px)
+    factor = min(-(-least_px // max(shape)), longest_side_px // max(shape))
+    return encode_webp(image.repeat(factor, axis=0).repeat(factor, axis=1) if factor > 1 else image)
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:

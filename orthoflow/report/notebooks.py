@@ -274,6 +274,7 @@ class WallImage:
             self.image.mask.shape,
             lambda part: (eight_bits(self.rgb[part]), np.isin(self.image.mask[part], _SHOWN)),
             longest_side_px=_THUMBNAIL_PX,
+            least_px=_THUMBNAIL_PX // 2,
         )
         return _picture(picture, "image/webp", repr(self))
 

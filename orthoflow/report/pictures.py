@@ -45,8 +45,6 @@ _DIVERGING_TABLE: Final = np.rint(
 ).astype(np.uint8)
 # Rasters of one wall by two methods: their planes are some centimetres and a degree apart at most.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
-# Longest side of a picture on the page, however few cells it has.
-_LEAST_SHOWN_PX: Final = 400
 _SAME_PLACE_SHARE: Final = 0.1  # of the longer side, between centres
 
 
@@ -88,14 +86,6 @@ class Picture:
     def width_m(self) -> float:
         """Width on the wall, metres; 0 for what is no raster of a wall."""
         return self.frame.width * self.frame.gsd_m if self.frame is not None else 0.0
-
-    @property
-    def shown_px(self) -> int:
-        """How wide it is shown where it has few cells: large enough to see each; else 0."""
-        if self.frame is None or max(self.frame.width, self.frame.height) >= _LEAST_SHOWN_PX:
-            return 0
-        longest = max(self.frame.width, self.frame.height)
-        return max(1, round(_LEAST_SHOWN_PX * self.frame.width / longest))
 
     @property
     def layer(self) -> str:

@@ -222,6 +222,29 @@ def test_an_encoded_image_is_shrunk_to_a_longest_side_and_never_enlarged() -> No
         images.shrunk_webp(b"", "a.png", longest_side_px=20)
 
 
+@pytest.mark.parametrize(
+    ("least_px", "longest_px", "factor"),
+    [(0, 1000, 1), (8, 1000, 1), (9, 1000, 2), (33, 1000, 5), (33, 17, 2), (33, 15, 1)],
+)
+def test_a_picture_of_few_cells_shows_each_as_a_square(
+    least_px: int, longest_px: int, factor: int
+) -> None:
+    image = np.arange(4 * 8, dtype=np.uint8).reshape(4, 8) * 8
+    whole = np.ones(image.shape, dtype=np.bool_)
+    preview = opened(
+        images.cells_webp(
+            image.shape,
+            lambda part: (image[part], whole[part]),
+            longest_side_px=longest_px,
+            least_px=least_px,
+        )
+    )
+    assert preview.shape[:2] == (4 * factor, 8 * factor)
+    centres = preview[factor // 2 :: factor, factor // 2 :: factor, 0].astype(int)
+    # WebP is not exact: neighbouring cells are eight grey levels apart.
+    assert np.abs(centres - image).max() <= (40 if factor == 1 else 24)
+
+
 def test_previews_in_webp_are_those_in_png() -> None:
     image, shown = blocks(64, 48), np.ones((64, 48), dtype=np.bool_)
     preview = opened(images.preview_webp(image, shown, longest_side_px=32))

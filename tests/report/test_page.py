@@ -71,6 +71,20 @@ def test_a_failed_combination_stands_in_its_row_with_the_reason(page: Page) -> N
     assert "no plane & no <wall>" in text
 
 
+def test_pictures_of_few_cells_are_shown_large_and_in_their_form(page: Page) -> None:
+    for width in (1440, 390):
+        page.show_as(width)
+        shown = page.evaluate(
+            "[...document.querySelectorAll('.main .picture > img')].map(one => "
+            "[one.naturalWidth, one.naturalHeight, one.clientWidth, one.clientHeight])"
+        )
+        assert shown
+        for columns, rows, wide, high in shown:
+            assert max(columns, rows) < 640
+            assert wide > columns
+            assert wide / high == pytest.approx(columns / rows, rel=0.02)
+
+
 def test_a_failure_is_told_once_before_the_tables_and_the_baseline_is_named(page: Page) -> None:
     text = page.evaluate("document.querySelector('main').innerText")
     summary = text[: text.index("At a glance")]

@@ -99,18 +99,6 @@ def test_the_baseline_is_shown_down_to_its_cells() -> None:
     assert shown(one)[1] == shown(two)[1] == 489
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "wide_px"),
-    [(133, 40, 400), (50, 200, 100), (3, 1200, 0), (399, 1, 400), (400, 10, 0)],
-)
-def test_a_picture_of_few_cells_is_shown_larger_than_they_are(
-    width: int, height: int, wide_px: int
-) -> None:
-    frame = samples.facing_south(0.01, width, height)
-    assert Picture(uri="", title="", caption="", frame=frame).shown_px == wide_px
-    assert Picture(uri="", title="", caption="").shown_px == 0
-
-
 def test_a_wall_has_its_share_of_the_close_cells_by_its_form() -> None:
     asked: list[int] = []
 

@@ -170,6 +170,18 @@
     });
   }
 
+  // A picture of few cells is shown larger than they are, and keeps its form in doing so.
+  for (const image of document.querySelectorAll(".raster .picture > img")) {
+    const enlarge = () => {
+      const { naturalWidth: width, naturalHeight: height } = image, longest = Math.max(width, height);
+      if (!longest || longest >= 640) return;
+      image.classList.add("few");
+      image.style.width = `min(${640 * width / longest}px, calc(var(--high) * ${width / height}))`;
+    };
+    if (image.complete) enlarge();
+    image.addEventListener("load", enlarge);
+  }
+
   // Pictures are in the page once; where one is needed again, it is taken from its first place.
   const pictureOf = (id) => {
     const copy = document.createElement("img");
@@ -406,6 +418,7 @@
     const shown = document.createElement("div");
     shown.className = `shown ${figure.className} ${picture.className.replace("picture", "")}`;
     for (const part of picture.querySelectorAll(":scope > img, :scope > svg:not(.legend)")) shown.append(part.cloneNode(true));
+    shown.querySelector("img.few")?.removeAttribute("style");
     Object.assign(shown.style, { width: `${size.width}px`, height: `${size.height}px` });
     view.stage.replaceChildren(shown);
     view.caption.textContent = [...figure.querySelectorAll("figcaption strong, figcaption .soft")]
