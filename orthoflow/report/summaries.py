@@ -83,18 +83,14 @@ def limits(run: Run) -> tuple[Limit, ...]:
 
     Of the warnings those that help stand first, then the frequent ones, then the baseline's.
     """
-    addresses: dict[str, list[str]] = {}
-    for cell in run.record.cells:
-        if cell.status == "failed":
-            addresses.setdefault(cell.error_message, []).append(cell.address)
+    failures = alike(
+        (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
+    )
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
     warnings = alike((cell.address, text) for cell in by_baseline for text in cell.warnings)
     return (
-        *(
-            Limit(text=text, cells=tuple(cells), is_failure=True)
-            for text, cells in addresses.items()
-        ),
+        *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),
     )
 
