@@ -1,17 +1,20 @@
 """What large walls take: the surface `tin` of a wall, and inspections of an orthoimage.
 
-    python benchmarks/large_walls.py FOLDER [--side 10000] [--only tin surf checkpoints]
+    python benchmarks/large_walls.py FOLDER [--side 10000] [--only tin surf checkpoints openings]
 
 makes a wall of side x side cells in FOLDER, with a point in two of three of them, a window of 400
 cells and one of 900, and an orthoimage and an intensity with the same waves on it, displaced by
-half a cell. Each method runs in a process of its own on files that are mapped. Prints processor
-seconds and the anonymous memory of each, and exits with 1 where a number is not what was put in.
+half a cell; and one with a niche, which is found (`segment.openings`) and judged
+(`inspect.openings`). Each method runs in a process of its own on files that are mapped. Prints
+processor seconds and the anonymous memory of each, and exits with 1 where a number is not what was
+put in.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,11 +22,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.openings import InspectOpenings
 from orthoflow_plugins.inspect.surf import InspectSurf
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.segment.openings import SegmentOpenings
+from orthoflow_plugins.simulate.building import Paint, SceneDraft, wall_side
 from plane_streaming import measured
 
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import (
     CheckPoints,
     Orthoimage,
@@ -35,16 +42,24 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import StepContext
+from orthoflow.testing.examples import example
 
 GSD_M = 0.001
 UP = np.array([0.0, 0.0, 1.0])
 SHIFT_CELLS = 0.5
 ROWS_AT_ONCE = 256
+NICHE_M = 0.2
+PAINT = Paint(kind=TextureKind.PLAIN, rgb=(200, 200, 200), reflectance=0.5)
 
 
 def main() -> None:
     """Run each method in a process of its own; with --run, run one in this."""
-    methods = {"tin": run_tin, "surf": run_surf, "checkpoints": run_checkpoints}
+    methods = {
+        "tin": run_tin,
+        "surf": run_surf,
+        "checkpoints": run_checkpoints,
+        "openings": run_openings,
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -138,6 +153,50 @@ def run_checkpoints(folder: Path, side: int) -> None:
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     off = metrics["mean_x_mm"] - 1e3 * GSD_M * 0.25
     expect(f"points are where they were measured, not {off:g} mm off", is_met=bool(abs(off) < 1e-6))
+
+
+def run_openings(folder: Path, side: int) -> None:
+    """Find a niche, and compare it with the scene."""
+    half_m = 0.5 * GSD_M * side
+    full, niche = (-half_m, half_m, -half_m, half_m), (-0.2 * half_m, 0.3 * half_m) * 2
+    draft = SceneDraft()
+    flat = wall_side(draft, omega_deg=90.0, phi_deg=0.0, distance_m=2.0)
+    plane = flat.true_plane("wall", full)
+    hole = flat.recess(niche, NICHE_M, PAINT)
+    flat.place(full, 0.0, PAINT, SurfaceRole.WALL, plane=plane, holes=[hole])
+    outline = draft.planes[plane]
+    raster = frame_over(outline.outline, outline.plane.normal, gsd_m=GSD_M)
+    allocate = partial(new, folder)
+    depth_m = allocate("depth", raster.shape)
+    rows, columns = (slice(round(first * side), round(last * side)) for first, last in
+                     ((0.35, 0.6), (0.4, 0.65)))  # fmt: skip
+    depth_m[rows, columns] = -NICHE_M
+    mask, count = allocate("mask", raster.shape, np.uint8), allocate("count", raster.shape, "u4")
+    for first in range(0, side, ROWS_AT_ONCE):
+        part = slice(first, first + ROWS_AT_ONCE)
+        mask[part], count[part] = SurfaceMask.MEASURED, 1
+    wall = Wall(
+        frame=raster,
+        plane_index=0,
+        name="wall",
+        depth_m=depth_m,
+        sigma_m=depth_m,
+        count=count,
+        mask=mask,
+    )
+    walls = Walls(
+        walls=(wall,), up=UP, intensity_source="none", buffer_front_m=0.1, buffer_behind_m=0.3
+    )
+    truth = replace(example("truth"), scene=draft.finished(spectral_gap=0.0))
+    ctx = StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
+    params = SegmentOpenings.Params(width_least_m=0.1, area_least_m2=0.01)
+    found = SegmentOpenings().run(SegmentOpenings.In(walls=walls), params, ctx)
+    inputs = InspectOpenings.In(truth=truth, openings=found.openings, walls=walls)
+    InspectOpenings().run(inputs, InspectOpenings.Params(area_least_m2=0.01), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    expect("the niche is found", is_met=bool(metrics["n_found_openings"] == 1))
+    off = metrics["side_max_mm"]
+    expect(f"its sides are within a cell, not {off:.2f} mm off", is_met=bool(off <= 1e3 * GSD_M))
 
 
 def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:

@@ -2,6 +2,8 @@
 
 A task is the same JSON as on one machine and runs in the same guarded child process there
 (`engine.dask_worker`); its products go into the store, and dask carries nothing but its result.
+Workers that this executor makes itself are threads of this process: all that they do is to wait for
+child processes, which so come from one server that has libraries loaded, not from one per worker.
 """
 
 from __future__ import annotations
@@ -59,7 +61,13 @@ _STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
 # File times decide what is old in a store.
 _CLOCKS_APART_S: Final = 60.0
-_DEAF_TO_INTERRUPTS: Final = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+# Otherwise each worker would look a hundred times a second at what its thread does, which is to
+# wait, and fifty times at its own loop.
+_QUIET: Final = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
+}
 
 
 @dataclass(kw_only=True)
@@ -88,19 +96,21 @@ class DaskExecutor:
         """
         self._tell = tell
         self._retries = plan.options.retries
-        self._methods = methods_text(plan.methods)
+        self._address = plan.options.scheduler
+        # Its own workers have the code that made the plan.
+        self._methods = methods_text(plan.methods) if self._address else ""
         self._running: dict[str, _Running] = {}
         self._news: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
         self._topic = f"orthoflow-{uuid.uuid4().hex}"
         self._stop_at: float | None = None
         self._capacity = capacity
         self._looked = self._with_workers = time.monotonic()
-        self._address = plan.options.scheduler
-        self._client = _client(self._address, capacity, plan.options.retries)
+        self._client = _client(self._address, capacity)
         try:
             self._client.subscribe_topic(self._topic, self._hear)
-            self._wait_for_workers()
-            self._look_at_workers(scratch)
+            if self._address:
+                self._wait_for_workers()
+                self._look_at_workers(scratch)
         except BaseException:
             self.close()
             raise
@@ -226,7 +236,8 @@ class DaskExecutor:
         workers = self._workers() if self._client.status == "running" else {}
         if workers:
             self._with_workers = now
-            self._capacity = _capacity(workers)
+            # Its own share the cores of this machine, however many they are.
+            self._capacity = _capacity(workers) if self._address else self._capacity
         elif self._running and now - self._with_workers > _PATIENCE_S:
             raise self._lost()
 
@@ -285,7 +296,7 @@ class DaskExecutor:
                 )
 
 
-def _client(address: str, capacity: Capacity, retries: int) -> Client:
+def _client(address: str, capacity: Capacity) -> Client:
     # It tells of each lost worker, with tracebacks; what matters is said by us.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address:
@@ -296,16 +307,19 @@ def _client(address: str, capacity: Capacity, retries: int) -> Client:
                 f"--scheduler {address}: no scheduler of dask answers there "
                 f"({one_line(error) or type(error).__name__}); expected tcp://HOST:PORT"
             ) from error
-    with dask.config.set({"distributed.scheduler.allowed-failures": retries}):
+    with dask.config.set(_QUIET):
         cluster = LocalCluster(
             n_workers=capacity.n_tasks,
             threads_per_worker=1,
-            resources={CORES: capacity.share},
+            processes=False,
+            # The scheduler of the run sees to it that all together take no more than there are.
+            resources={CORES: capacity.n_cores},
             # Steps are processes of their own, whose memory is watched by us.
             memory_limit=0,
+            # Nobody else reaches them.
             dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
-            preload=[_DEAF_TO_INTERRUPTS],
         )
     return Client(cluster, set_as_default=False)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from distributed import Worker, get_worker
+from distributed.worker import WORKER_ANY_RUNNING
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.environment import environment
@@ -45,7 +46,8 @@ class Order:
         name: what the scheduler calls it.
         topic: where to say how it goes.
         retries: so often it may be tried again after its worker was lost.
-        methods: what the plan says of its methods, see `methods_text`.
+        methods: what the plan says of its methods, see `methods_text`; empty for a worker in the
+            process that made the plan.
     """
 
     task_file: str
@@ -93,7 +95,7 @@ def run_attempt(order: Order) -> str:
     )
     if n_before > order.retries:
         return _refused(own, StepFailedError(describe_loss(task.who, n_before)))
-    if wrong := misfit(order.methods):
+    if wrong := order.methods and misfit(order.methods):
         return _refused(own, PluginError(f"{task.who} cannot run on {worker.address}: {wrong}"))
 
     def tell(_: str, event: StepEvent) -> None:
@@ -127,7 +129,8 @@ def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> C
 def _is_given_up(worker: Worker, name: str) -> bool:
     """Whether nobody waits for a task any more: its run has ended, or gave it to another worker."""
     state = worker.state.tasks.get(name)
-    return state is None or state.state == "cancelled"
+    is_closing = worker.status not in WORKER_ANY_RUNNING
+    return is_closing or state is None or state.state == "cancelled"
 
 
 def _refused(task: Task, error: StepFailedError | PluginError) -> str:

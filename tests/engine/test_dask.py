@@ -16,7 +16,13 @@ from distributed import LocalCluster
 from orthoflow.engine import RunOutcome, RunPlan, dask_executor, execute
 from orthoflow.engine.dask_executor import CORES, DaskExecutor
 from orthoflow.engine.dask_worker import look_around
-from orthoflow.engine.events import CellProgress, RunEvent, RunListener
+from orthoflow.engine.events import (
+    CellFinished,
+    CellProgress,
+    CellStarted,
+    RunEvent,
+    RunListener,
+)
 from orthoflow.engine.executors import Capacity
 from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
@@ -59,9 +65,9 @@ class Office:
     quiet: dict[str, str]
     n_runs: int = 0
 
-    def plan(self, *, sets: Sequence[str] = (), **options: object) -> RunPlan:
-        """Plan a run whose second step runs whatever is in the store."""
-        address = self.cluster.scheduler_address
+    def plan(self, *, own: bool = False, sets: Sequence[str] = (), **options: object) -> RunPlan:
+        """Plan a run, on workers of its own or these; its second step always runs."""
+        address = "" if own else self.cluster.scheduler_address
         return self.world.plan(
             STEPS, sets=sets, executor="dask", scheduler=address, force=("second",), **options
         )
@@ -121,6 +127,20 @@ def test_idle_workers_share_the_items_of_a_step(office: Office) -> None:
     assert told.metrics == whole.metrics
     assert "part 2 of 2 (row3 to row5)" in told.log
     assert "part " not in whole.log
+
+
+def test_workers_of_its_own_take_no_more_cores_than_there_are(office: Office) -> None:
+    slow = "use: work.slow, in: {numbers: first.numbers}, params: {steps: 5, amount: "
+    steps = "  first: {use: make.range}\n"
+    steps += "".join(f"  slow{k}: {{{slow}{k}}}}}\n" for k in range(4))
+    fresh = World(folder=office.world.folder / "cores", site=office.world.site)
+    fresh.folder.mkdir()
+    assert fresh.run(f"steps:\n{steps}", executor="dask", jobs=4, cores=2).status == "ok"
+    under_way, most = 0, 0
+    for event in fresh.events:
+        under_way += isinstance(event, CellStarted) - isinstance(event, CellFinished)
+        most = max(most, under_way)
+    assert most == 2
 
 
 def test_workers_that_share_one_core_share_no_step(office: Office) -> None:
@@ -185,8 +205,9 @@ def test_a_step_that_loses_its_workers_is_given_up(office: Office) -> None:
     assert outcome.results["other"].status == "ok"
 
 
+@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
 def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
-    office: Office,
+    office: Office, own: bool
 ) -> None:
     asked: list[RunEvent] = []
 
@@ -195,14 +216,15 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
             asked.append(event)
             os.kill(os.getpid(), signal.SIGINT)
 
-    world, folder = office.world, office.world.folder / "broken-off"
+    world, folder = office.world, office.world.folder / f"broken-off-{own}"
     with pytest.raises(CancelledStepError, match="the same command goes on"):
-        execute(office.plan(), folder, world.store, interrupt)
+        execute(office.plan(own=own), folder, world.store, interrupt)
     outcome = execute(world.plan(STEPS, force=("second",)), folder, world.store)
     assert digests(outcome) == office.quiet
 
 
-def test_a_step_that_nobody_waits_for_is_stopped(office: Office) -> None:
+@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
+def test_a_step_that_nobody_waits_for_is_stopped(office: Office, own: bool) -> None:
     steps: list[int] = []
 
     def leave(event: RunEvent) -> None:
@@ -214,9 +236,9 @@ def test_a_step_that_nobody_waits_for_is_stopped(office: Office) -> None:
             )
             raise _GoneError
 
-    plan = office.plan(sets=["second.steps=100000"])
+    plan = office.plan(own=own, sets=["second.steps=100000"])
     with pytest.raises(_GoneError):
-        execute(plan, office.world.folder / "left", office.world.store, leave)
+        execute(plan, office.world.folder / f"left-{own}", office.world.store, leave)
     # The step and its keeper.
     assert len(steps) == 2
     assert all(has_ended(process) for process in steps)

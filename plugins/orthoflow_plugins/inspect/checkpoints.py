@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
@@ -45,7 +44,7 @@ from orthoflow_plugins.inspect.image_quality import (
     quality_findings,
 )
 from orthoflow_plugins.inspect.patches import IntensityGrey
-from orthoflow_plugins.inspect.placing import on_walls, wall_of
+from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
@@ -175,10 +174,10 @@ def _pictures(inputs: InspectCheckpoints.In, ctx: StepContext) -> list[Picture]:
                 wall=image.wall,
                 frame=image.frame,
                 grey=OrthoimageGrey(image),
-                surface=wall_of(image, inputs.walls),
+                surface=wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid")),
                 image=image,
             )
-            for image in on_walls(inputs.orthoimages, inputs.walls).images
+            for place, image in enumerate(on_walls(inputs.orthoimages, inputs.walls).images)
         ]
     else:
         pictures = [
@@ -199,7 +198,7 @@ def _intensity_picture(
 ) -> Picture:
     cells, shape = IntensityGrey(intensity=intensity), wall.frame.shape
     is_large = wall.mask.size > IN_MEMORY_CELLS
-    allocate = partial(_allocated, ctx, index) if is_large else in_memory
+    allocate = in_files(ctx, str(index)) if is_large else in_memory
     rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
@@ -224,12 +223,6 @@ def _intensity_picture(
             plane_index=wall.plane_index,
         ),
     )
-
-
-def _allocated(
-    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
-) -> NDArray[np.generic]:
-    return ctx.allocate("inspection", f"{wall}.{name}", shape, dtype).view(np.ndarray)
 
 
 def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float) -> list[Finding]:

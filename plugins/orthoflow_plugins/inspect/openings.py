@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
 _NOTHING: Final = 255
+# Larger walls are looked at in coarser cells; rays to the borders of openings are as fine as ever.
+_CELLS_TOLD: Final = 1 << 24
 # Recesses of the scene may be so deep.
 _BEHIND_MOST_M: Final = 2.0
 # Of the cells about a recess, within two of it, so many are the face of the wall that it is in.
@@ -43,9 +45,9 @@ class InspectOpenings(Method):
 
     True openings are the parts of a wall that show, seen squarely, a surface of a recess that lies
     deep enough; what hangs together is one. An outline is of the opening with which it shares more
-    than half of both together, cell by cell. Each side that was seen is compared with the border
-    of the recess on rays square to the wall, a sixteenth of a cell apart; positive errors are
-    outwards.
+    than half of both together, cell by cell; a wall of more than 17 million cells is looked at in
+    coarser ones. Each side that was seen is compared with the border of the recess on rays square
+    to the wall, a sixteenth of a cell apart; positive errors are outwards.
     """
 
     id: ClassVar[str] = "inspect.openings"
@@ -122,6 +124,7 @@ class _TrueWall:
     Attributes:
         slab: its raster.
         place: in `Walls`.
+        step: cells of the raster, to both sides, in one of `labels`.
         labels: (rows, cols) openings, from 1; 0 where none is.
         face_m: depth of its face.
         deep_m: depth from which on recesses are openings.
@@ -131,6 +134,7 @@ class _TrueWall:
 
     slab: Slab
     place: int
+    step: int
     labels: NDArray[np.int32]
     face_m: float
     deep_m: float
@@ -186,7 +190,10 @@ def _true_wall(
     from orthoflow.geometry.scene_views import Rendering, render
 
     scene, slab = inputs.truth.scene, inputs.walls.slab(place)
-    nowhere = np.zeros(slab.frame.shape, dtype=np.bool_)
+    step = _step(slab.n_cells)
+    rows, columns = (-(-count // step) for count in slab.frame.shape)
+    told = replace(slab.frame, gsd_m=step * slab.frame.gsd_m, width=columns, height=rows)
+    nowhere = np.zeros(told.shape, dtype=np.bool_)
     rendering = Rendering(
         buffer_front_m=slab.front_m,
         buffer_behind_m=_BEHIND_MOST_M,
@@ -194,7 +201,7 @@ def _true_wall(
         judged=nowhere,
         cores=cores,
     )
-    true = render(scene, slab.frame, rendering)
+    true = render(scene, told, rendering)
     role = np.where(true.rectangle >= 0, scene.role[true.rectangle], _NOTHING)
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
     face_m = float(np.median(of_face)) if of_face.size else 0.0
@@ -205,12 +212,21 @@ def _true_wall(
     return _TrueWall(
         slab=slab,
         place=place,
-        labels=_labelled(is_open, is_face, params.area_least_m2 / slab.frame.gsd_m**2),
+        step=step,
+        labels=_labelled(is_open, is_face, params.area_least_m2 / told.gsd_m**2),
         face_m=face_m,
         deep_m=deep_m,
         scene=scene,
         views=views,
     )
+
+
+def _step(n_cells: int) -> int:
+    """So many cells, to both sides, become one, that a wall has not too many."""
+    step = 1
+    while n_cells // step**2 > _CELLS_TOLD:
+        step += 1
+    return step
 
 
 def _labelled(
@@ -225,10 +241,16 @@ def _labelled(
     # A recess of another wall, seen beside the edge of this one, is no opening of it.
     about = np.ones((_RIM_CELLS, _RIM_CELLS), dtype=np.uint8)
     names = np.zeros(n_areas, dtype=np.int32)
-    for label in np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] >= n_least):
-        own = (labels == label).astype(np.uint8)
-        is_rim = (cv2.dilate(own, about) > own) & (labels != label)
-        if label and is_face[is_rim].mean() >= _RIM_LEAST:
+    # Before the first comes what is no area.
+    for label in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= n_least):
+        left, top, width, height, _ = boxes[label]
+        part = (
+            slice(max(0, top - _RIM_CELLS), top + height + _RIM_CELLS),
+            slice(max(0, left - _RIM_CELLS), left + width + _RIM_CELLS),
+        )
+        own = (labels[part] == label).astype(np.uint8)
+        is_rim = cv2.dilate(own, about) > own
+        if is_face[part][is_rim].mean() >= _RIM_LEAST:
             names[label] = names.max() + 1
     return np.asarray(names[labels])
 
@@ -241,7 +263,7 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
     n_false = n_stray = 0
     for opening in openings:
         cells = _cells_of(opening, wall.frame)
-        is_own = filled((cells,), wall.frame.shape)
+        is_own = filled((cells / wall.step,), wall.labels.shape)
         shared = np.bincount(wall.labels[is_own], minlength=len(sizes))
         shared[0] = 0
         best = int(shared.argmax())
@@ -252,8 +274,10 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
             continue
         ious[best] = max(ious[best], iou)
         if opening.depth_m is not None:
-            centres = np.argwhere(wall.labels == best)[::7, ::-1].astype(np.float64) + 0.5
-            middle = wall.depths_m(centres)
+            some = np.flatnonzero(wall.labels == best)[::7]
+            down, right = np.unravel_index(some, wall.labels.shape)
+            centres = np.column_stack([right, down]).astype(np.float64) + 0.5
+            middle = wall.depths_m(wall.step * centres)
             true_m = wall.face_m - float(np.nanmedian(middle))
             depth_errors_m.append(opening.depth_m - true_m)
         for k in np.flatnonzero(opening.side_source != OutlineSource.UNSEEN):

@@ -6,19 +6,20 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Orthoimage, Orthoimages, SurfaceMask, Wall, Walls
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
+    from orthoflow.sdk import StepContext
 
 _SAME_DIRECTION_DEG: Final = 2.0
 
-_Value = TypeVar("_Value", bound=np.generic)
 _Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 
 
@@ -59,38 +60,66 @@ def rows_of(raster: _Framed, rows: slice) -> _Framed:
     return replace(raster, frame=part, **arrays)
 
 
-def wall_of(image: Orthoimage, walls: Walls) -> Wall:
+def in_files(ctx: StepContext, name: str) -> Allocate:
+    """Give arrays in files, for what many cells are wrong by, or take from elsewhere."""
+
+    def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+        return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
+
+    return allocate
+
+
+def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> Wall:
     """Give the wall of one of `on_walls`; one that lies on other cells is laid onto the image's.
 
     Orthoimages of other programs have grids of their own. Each of their cells takes what the
     nearest cell of the wall holds, its depth counted from the image's own plane, and an intensity
     between those of the four nearest.
 
+    Args:
+        image: the orthoimage.
+        walls: all of them.
+        allocate: gives arrays for what is laid onto the cells of a large image, by name.
+
     Raises:
         MethodError: it lies elsewhere.
     """
     wall = walls.walls[image.wall]
-    return wall if wall.frame.has_cells_of(image.frame) else _laid_onto(image, wall, walls)
+    if wall.frame.has_cells_of(image.frame):
+        return wall
+    _require_nearness(image, wall, walls)
+    return _laid_onto(image, wall, allocate if image.mask.size > IN_MEMORY_CELLS else in_memory)
 
 
-def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
-    """The wall on the image's cells, row by row, so that large images need little room."""
-    import cv2
-
-    frame = image.frame
-    middle = frame.corners_world().mean(axis=0)
+def _require_nearness(image: Orthoimage, wall: Wall, walls: Walls) -> None:
+    middle = image.frame.corners_world().mean(axis=0)
     aside = float(wall.frame.plane.distances_m(middle[None])[0])
-    angle = angle_between_deg(frame.normal_world, wall.frame.normal_world)
+    angle = angle_between_deg(image.frame.normal_world, wall.frame.normal_world)
     slab = walls.slab(image.wall)
     if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(
             f"orthoimage {image.name} lies {aside:.3f} m before {wall.name} and "
             f"{angle:.2f} deg askew: wire the walls that the orthoimages are of"
         )
+
+
+def _laid_onto(image: Orthoimage, wall: Wall, allocate: Allocate) -> Wall:
+    """The wall on the image's cells, row by row, so that large images need little room."""
+    import cv2
+
+    frame = image.frame
     columns = np.arange(frame.width) + 0.5
-    taken = np.full(frame.shape, -1, dtype=np.int64)
-    depth = np.full(frame.shape, np.nan, dtype=np.float32)
-    intensity = None if wall.intensity is None else np.empty(frame.shape, dtype=np.float32)
+    # What each cell holds, and what those beyond the wall get.
+    given: dict[str, tuple[NDArray[Any], float]] = {
+        "depth_m": (wall.depth_m, np.nan),
+        "sigma_m": (wall.sigma_m, np.nan),
+        "count": (wall.count, 0),
+        "mask": (wall.mask, int(SurfaceMask.VOID)),
+    }
+    laid = {name: allocate(name, frame.shape, held.dtype) for name, (held, _) in given.items()}
+    intensity = None
+    if wall.intensity is not None:
+        intensity = np.asarray(allocate("intensity", frame.shape, np.float32), np.float32)
     for row in range(frame.height):
         points = frame.world_from_wall(np.column_stack([columns, np.full(frame.width, row + 0.5)]))
         exact = wall.frame.wall_from_world(points)[:, :2]
@@ -101,27 +130,14 @@ def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
             )[0]
         places = np.floor(exact).astype(np.int64)
         inside = np.all((places >= 0) & (places < (wall.frame.width, wall.frame.height)), axis=1)
-        cells = places[inside, 1] * wall.frame.width + places[inside, 0]
-        taken[row, inside] = cells
+        right, down = places[inside].T
+        for name, (held, nothing) in given.items():
+            laid[name][row] = nothing
+            laid[name][row, inside] = held[down, right]
         surface = wall.frame.world_from_wall(
             (places[inside] + 0.5).astype(np.float64),
-            wall.depth_m.ravel()[cells].astype(np.float64),
+            wall.depth_m[down, right].astype(np.float64),
         )
-        depth[row, inside] = frame.wall_from_world(surface)[:, 2]
-    return replace(
-        wall,
-        frame=frame,
-        depth_m=depth,
-        sigma_m=_taken(wall.sigma_m, taken, np.nan),
-        count=_taken(wall.count, taken, 0),
-        mask=_taken(wall.mask, taken, int(SurfaceMask.VOID)),
-        intensity=intensity,
-        rgb=None,
-        rgb_mask=None,
-    )
-
-
-def _taken(values: NDArray[_Value], taken: NDArray[np.int64], nothing: float) -> NDArray[_Value]:
-    found: NDArray[_Value] = values.ravel()[np.maximum(taken, 0)]
-    found[taken < 0] = nothing
-    return found
+        laid["depth_m"][row, inside] = frame.wall_from_world(surface)[:, 2]
+    arrays: dict[str, Any] = laid
+    return replace(wall, frame=frame, **arrays, intensity=intensity, rgb=None, rgb_mask=None)

@@ -37,7 +37,7 @@ from orthoflow_plugins.inspect.image_quality import (
 )
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage, IntensityGrey
-from orthoflow_plugins.inspect.placing import on_walls, wall_of
+from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
 # The intensity is laid so far aside to see how exactly the comparison measures that; some hundred
 # pairs say so.
@@ -145,7 +145,7 @@ class InspectSurf(Method):
         for nth, place in enumerate(items if _unfit(inputs) is None else ()):
             image = images[place]
             ctx.progress(nth / len(items), image.name)
-            wall = wall_of(image, inputs.walls)
+            wall = wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid"))
             comparison = _Comparison(inputs.cameras, params.radius_cells, ctx.cores)
             verdict = comparison.of(image, wall)
             compared.append(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
@@ -57,7 +57,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     tie_findings,
 )
 from orthoflow_plugins.inspect.patches import PatchShifts, joined_shifts
-from orthoflow_plugins.inspect.placing import on_walls, rows_of, wall_of
+from orthoflow_plugins.inspect.placing import in_files, on_walls, rows_of, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     found_planes,
     inspect_planes,
@@ -203,11 +203,11 @@ class InspectTruth(Method):
             _draw(image, verdict, ctx)
         sources = [band for item in verdicts for band in item.sources]
         findings += sample_findings(
-            pooled([item.samples for item in verdicts], _files(ctx, "all")),
+            pooled([item.samples for item in verdicts], in_files(ctx, "all")),
             -1,
             sources_are_traced=bool(sources),
         )
-        findings += source_findings(sources, -1, _files(ctx, "all"))
+        findings += source_findings(sources, -1, in_files(ctx, "all"))
         findings += worst_plane_findings(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
@@ -253,16 +253,7 @@ class _Verdict:
         is_traced = bool(self.sources)
         numbers = sample_findings(self.samples, wall, sources_are_traced=is_traced)
         numbers += self.quality
-        return numbers + source_findings(self.sources, wall, _files(ctx, f"{wall}.sources"))
-
-
-def _files(ctx: StepContext, name: str) -> Allocate:
-    """Give arrays in files, for what many cells are wrong by."""
-
-    def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-        return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
-
-    return allocate
+        return numbers + source_findings(self.sources, wall, in_files(ctx, f"{wall}.sources"))
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
@@ -323,7 +314,7 @@ class _Judge:
     def verdict_on(self, image: Orthoimage) -> _Verdict:
         """Compare one wall, a large one in bands of whole blocks with a block about them."""
         inputs = self.inputs
-        wall = wall_of(image, self.walls)
+        wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
         step = max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
         errors: list[WallErrors] = []
         sources: list[SourceErrors] = []
@@ -347,7 +338,7 @@ class _Judge:
                 traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
                 name = f"{image.wall}.{band.rows.start}"
                 sources.append(traced.kept(name, self._files) if _is_large(image) else traced)
-        allocate = _files(self.ctx, f"{image.wall}.cells")
+        allocate = in_files(self.ctx, f"{image.wall}.cells")
         return _Verdict(
             samples=pooled([item.samples for item in errors], allocate),
             patches=joined_shifts([item.patches for item in errors]),
@@ -379,7 +370,7 @@ class _Judge:
 
     @property
     def _files(self) -> Allocate:
-        return _files(self.ctx, "bands")
+        return in_files(self.ctx, "bands")
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
         from orthoflow.geometry.scene_views import Rendering, render

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import openings as inspected
 from orthoflow_plugins.inspect.openings import InspectOpenings
 
 from orthoflow.errors import MethodError
@@ -37,6 +38,23 @@ def test_the_true_outline_has_no_error(tmp_path: Path) -> None:
     assert numbers["side_max_mm"] <= 0.7
     assert numbers["opening_depth_error_max_mm"] == pytest.approx(3.0, abs=0.01)
     assert len(inspection.points_world) == 4
+
+
+# The wall has 15 000 cells; of the raster, two by two are one.
+@pytest.mark.parametrize(("n_told", "apart"), [(15_000, 0.0), (4_000, 0.05)])
+def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_told: int, apart: float
+) -> None:
+    walls = scene()[1]
+    found = opening(walls, outwards_m=0.03), opening(walls, right_m=0.9)
+    whole, inspection = judged(tmp_path, *found)
+    monkeypatch.setattr(inspected, "_CELLS_TOLD", n_told)
+    coarse, again = judged(tmp_path, *found)
+    np.testing.assert_array_equal(again.displacement_m, inspection.displacement_m)
+    np.testing.assert_array_equal(again.points_world, inspection.points_world)
+    for name in ("opening_iou_mean", "opening_iou_min"):
+        assert coarse.pop(name) == pytest.approx(whole.pop(name), abs=apart)
+    assert coarse == pytest.approx(whole, abs=1e-9)
 
 
 @pytest.mark.parametrize("outwards_m", [0.03, -0.05])

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.placing import on_walls, wall_of
+from orthoflow_plugins.inspect import placing
+from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.products import Orthoimages, SurfaceMask, Walls
 from tests import inspect_scenes, scenes
 from tests.inspect_scenes import BUFFER_M, image_of
+from tests.raster_scenes import context
 
 
 def slanted() -> Walls:
@@ -60,7 +63,9 @@ def test_an_image_is_of_the_wall_of_its_plane() -> None:
         placed(wall=-1, plane_index=None)
 
 
-def test_cells_take_what_the_nearest_cell_of_the_wall_holds() -> None:
+def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     walls = slanted()
     wall = walls.walls[0]
     frame = wall.frame
@@ -95,6 +100,12 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds() -> None:
     # Between the four nearest, which OpenCV places to a 32nd of a cell.
     shade = 1e-3 * (exact[..., 0] - 0.5) + 1e-4 * (exact[..., 1] - 0.5)
     np.testing.assert_allclose(laid.intensity[whole], shade[whole], atol=5e-5)
+    monkeypatch.setattr(placing, "IN_MEMORY_CELLS", 1999)
+    ctx = context(tmp_path)
+    kept = wall_of(image_of(np.full(shape, 100.0), other), walls, in_files(ctx, "0"))
+    for name in ("depth_m", "sigma_m", "count", "mask", "intensity"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(laid, name))
+        assert (ctx.scratch / "allocated" / f"inspection.0.{name}").exists()
     blind = replace(walls, walls=(replace(wall, intensity=None),))
     assert wall_of(image_of(np.full(shape, 100.0), other), blind).intensity is None
 
