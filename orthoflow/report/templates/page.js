@@ -234,13 +234,16 @@
     const choose = () => {
       const { pictures, ratio } = groups[part.wall.value];
       const names = pictures.map((picture) => picture.layer);
+      // Where one step alone has variants, its name tells nothing, and takes the room of what does.
+      const steps = new Set(names.flatMap((name) => [...name.matchAll(/([^\s(,=]+)=/g)].map((found) => found[1])));
+      const told = steps.size === 1 ? names.map((name) => name.replace(`${[...steps][0]}=`, "")) : names;
       const at = (name, otherwise) => {
         const found = pictures.findIndex((picture) => picture.layer === name);
         return found < 0 ? otherwise : found;
       };
       const left = at(chosen.left, 0);
-      fill(part.left, names, left);
-      fill(part.right, names, at(chosen.right, left === 1 ? 0 : 1));
+      fill(part.left, told, left);
+      fill(part.right, told, at(chosen.right, left === 1 ? 0 : 1));
       part.stage.style.aspectRatio = ratio;
       part.stage.style.width = `min(100%, calc(75vh * ${ratio}))`;
       lay();
