@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 # Options that are no fields of the engine's.
 _POPPED: Final = ("set_files", "embed")
+_OF_STEPS: Final = ("only", "from_", "until", "force")
 
 
 def run(
@@ -47,9 +48,9 @@ def run(
         only_data: of these datasets only.
         output: folder of the run; `runs/<name>-<run id>` without one.
         store: folder of stored results.
-        **options: the command's `jobs`, `executor`, `only`, `from_`, `until`, `force`, `scheduler`,
-            `retries` and `embed`; `set_files`, one or several YAML files of
-            `step.parameter: value`, before which goes what `set` says.
+        **options: the command's `jobs`, `executor`, `scheduler`, `retries` and `embed`; `only`,
+            `from_`, `until` and `force`, a step or several; `set_files`, one or several YAML files
+            of `step.parameter: value`, before which goes what `set` says.
 
     Raises:
         WorkflowError: something is wrong with the workflow, or with what was set; says all of it.
@@ -66,6 +67,8 @@ def run(
     )
     embed = bool(options.pop("embed", False))
     _refuse_unknown(options)
+    # One step is as good as a list of one.
+    options |= {name: _several(options[name]) for name in _OF_STEPS if name in options}
     folder = None if output is None else Path(output)
     with prepared(str(workflow), changes, folder, Path(store), embed=embed, **options) as call:
         made = call.make()

@@ -40,9 +40,17 @@ def test_the_notebook_runs_and_shows_what_it_promises(
     assert "first orthoimage" in shown[0]["text/html"]
     assert "completeness" in shown[1]["text/html"]
     assert "data:image/webp" in shown[2]["text/html"]
-    assert shown[-2]["text/plain"].startswith("<RunComparison of ")
+    told = [output.get("text/plain", "") for output in shown]
+    assert any(text.startswith("<RunComparison of ") for text in told)
+    # The sweep over both rooms, its values as numbers, and their curve.
+    table = shown[-2]["text/html"]
+    assert all(f"<th>{word}</th>" in table for word in ("calm", "noisy", "0.02", "0.05", "0.10"))
+    assert any(
+        "image/png" in output.get("data", {}) for output in notebook.cells[-1].get("outputs", ())
+    )
     runs = [orthoflow.open_run(folder) for folder in sorted((tmp_path / "runs").iterdir())]
-    assert [run.record.status for run in runs] == ["ok", "ok"]
+    assert [run.record.status for run in runs] == ["ok"] * 3
+    assert len([cell for cell in runs[2].record.cells if cell.step == "plane"]) == 6
     # The room was not simulated twice.
     assert runs[1].cells["room"].cached_from == runs[0].record.run_id
     shutil.rmtree(tmp_path / "runs")
