@@ -507,9 +507,11 @@
 
   // Browsers put pictures into a PDF bit by bit, but JPEG as it is: paper gets one of each, made while nobody
   // waits, because at printing it is too late to.
-  const PAPER_PX = 1100;
-  const onPaper = new Map();
+  const PAPER_PX = 1100, LARGE_PNG = 130000;
+  const onPaper = new Map(), made = new Map();
   const paperOf = (image) => {
+    // The picture of a wall lies under others, too.
+    if (made.has(image.src)) return made.get(image.src);
     const scale = Math.min(1, PAPER_PX / Math.max(image.naturalWidth, image.naturalHeight));
     const canvas = document.createElement("canvas");
     canvas.width = Math.max(1, Math.round(scale * image.naturalWidth));
@@ -521,11 +523,12 @@
     for (let y = 0; y < canvas.height; y += 8) for (let x = y % 16; x < canvas.width; x += 16) brush.fillRect(x, y, 8, 8);
     brush.drawImage(image, 0, 0, canvas.width, canvas.height);
     const copy = new Image();
-    copy.src = canvas.toDataURL("image/jpeg", 0.8);
+    copy.src = canvas.toDataURL("image/jpeg", 0.75);
+    made.set(image.src, copy);
     return copy;
   };
   const waiting = [...document.images].filter((image) => !image.closest(".way, .stage, .earlier") && image.naturalWidth > 200
-    && image.src.startsWith("data:image/webp"));
+    && (image.src.startsWith("data:image/webp") || (image.src.startsWith("data:image/png") && image.src.length > LARGE_PNG)));
   const later = window.requestIdleCallback ?? ((work) => setTimeout(work, 50));
   const prepare = () => {
     const image = waiting.shift();
