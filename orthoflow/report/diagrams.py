@@ -15,6 +15,7 @@ _BOX_WIDTH: Final = 220
 _BOX_HEIGHT: Final = 46
 _GAP: Final = 18  # between boxes of one level
 _GAP_LEVELS: Final = 44
+_LANE_FIRST, _LANE_STEP = 14.0, 9.0  # how far from boxes that they pass arrows go down
 _ABREAST_MOST: Final = 5  # boxes of a level that a page holds side by side, at letters one can read
 _CELLS_MOST: Final = 24
 _LETTERS: Final = 30  # that fit a box at this size
@@ -54,16 +55,20 @@ def run_diagram(run: Run, *, stands_alone: bool = False) -> str:
     places = _lay_out(levels, is_down=is_down)
     width = max(place.x for place in places.values()) + _BOX_WIDTH + 2 if places else 0
     height = max(place.y for place in places.values()) + _BOX_HEIGHT + 2 if places else 0
+    pairs = [(places[before], places[name]) for name, box in boxes.items() for before in box.before]
+    lanes = _lanes(pairs, list(places.values())) if is_down else {}
     arrows = [
-        _arrow(places[before], places[name], is_down=is_down)
-        for name, box in boxes.items()
-        for before in box.before
+        _around(*pair, lanes[pair]) if pair in lanes else _arrow(*pair, is_down=is_down)
+        for pair in pairs
     ]
+    left = min(0.0, *(lane - 2.0 for lane in lanes.values())) if lanes else 0.0
+    width = max(width, *(lane + 2.0 for lane in lanes.values())) - left if lanes else width
     drawn = [_draw(box, places[name]) for name, box in boxes.items()]
     alone = f' xmlns="http://www.w3.org/2000/svg" height="{height:.0f}"' if stands_alone else ""
     style = f"<style>{_STYLE}</style>" if stands_alone else ""
+    box = f"{left:.0f} 0 {width:.0f} {height:.0f}"
     return (
-        f'<svg{alone} viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" role="img" '
+        f'<svg{alone} viewBox="{box}" width="{width:.0f}" role="img" '
         f'aria-label="graph of the run">{style}{"".join(arrows)}{"".join(drawn)}</svg>'
     )
 
@@ -175,6 +180,44 @@ def _arrow(start: _Place, end: _Place, *, is_down: bool) -> str:
         bend = max(30.0, (x1 - x0) / 2)
         ways = f"{x0 + bend:.0f},{y0:.0f} {x1 - bend:.0f},{y1:.0f}"
     return f'<path class="arrow" d="M{x0:.0f},{y0:.0f} C{ways} {x1:.0f},{y1:.0f}"/>'
+
+
+def _lanes(
+    pairs: Sequence[tuple[_Place, _Place]], places: Sequence[_Place]
+) -> dict[tuple[_Place, _Place], float]:
+    """Where an arrow past other levels goes down: beside their boxes, not below them.
+
+    Returns:
+        Start and end -> x, for those that pass a level.
+    """
+    found: dict[tuple[_Place, _Place], float] = {}
+    n_taken = {-1: 0, 1: 0}
+    for start, end in pairs:
+        passed = [place for place in places if start.y < place.y < end.y]
+        near, far = sorted((start.x, end.x))
+        # From the middle of a box to that of another: between two boxes there may be a way.
+        is_free = all(
+            one.x + _BOX_WIDTH / 2 < near or far + _BOX_WIDTH / 2 < one.x for one in passed
+        )
+        if is_free or (start, end) in found:
+            continue
+        left, right = min(one.x for one in passed), max(one.x for one in passed) + _BOX_WIDTH
+        side = -1 if start.x + _BOX_WIDTH / 2 < (left + right) / 2 else 1
+        aside = _LANE_FIRST + _LANE_STEP * n_taken[side]
+        found[start, end] = left - aside if side < 0 else right + aside
+        n_taken[side] += 1
+    return found
+
+
+def _around(start: _Place, end: _Place, lane: float) -> str:
+    x0, y0 = start.x + _BOX_WIDTH / 2, start.y + _BOX_HEIGHT
+    x1, y1 = end.x + _BOX_WIDTH / 2, end.y
+    half = _GAP_LEVELS / 2
+    return (
+        f'<path class="arrow" d="M{x0:.0f},{y0:.0f} C{x0:.0f},{y0 + half:.0f} '
+        f"{lane:.0f},{y0 + half:.0f} {lane:.0f},{y0 + _GAP_LEVELS:.0f} V{y1 - _GAP_LEVELS:.0f} "
+        f'C{lane:.0f},{y1 - half:.0f} {x1:.0f},{y1 - half:.0f} {x1:.0f},{y1:.0f}"/>'
+    )
 
 
 def _draw(box: _Box, place: _Place) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -367,6 +368,24 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
 
 
 # --- the graph ---
+
+
+def test_an_arrow_past_a_box_goes_beside_it() -> None:
+    cloud, planes = given("scan.cloud", "1", "cloud"), given("plane.p", "2", "planes")
+    told = run(
+        cell("scan"),
+        cell("plane", inputs={"cloud": cloud}),
+        cell("wall", inputs={"cloud": cloud, "planes": planes}),
+    )
+    drawn = run_diagram(told)
+    ways = re.findall(r'class="arrow" d="([^"]*)"', drawn)
+    # The boxes are 222 wide: down beside the plane's, with room in the drawing for it.
+    assert ways == [
+        "M111,47 C111,69 111,69 111,91",
+        "M111,47 C111,69 235,69 235,91 V137 C235,159 111,159 111,181",
+        "M111,137 C111,159 111,159 111,181",
+    ]
+    assert 'viewBox="0 0 237 229" width="237"' in drawn
 
 
 def test_the_graph_is_drawn_downwards_where_its_levels_are_narrow() -> None:
