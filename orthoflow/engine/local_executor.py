@@ -94,6 +94,10 @@ class _Running:
     last_words: str = ""
 
 
+# Keeper -> what runs, of all executors of this process: a cluster's workers in it have one each.
+_all_running: Final[dict[int, _Running]] = {}
+
+
 @dataclass
 class LocalExecutor:
     """Runs each task in a process group of its own."""
@@ -136,7 +140,7 @@ class LocalExecutor:
             clock=time.monotonic(),
             oom_kills=oom_kills(),
         )
-        self._running[task.address] = run
+        self._running[task.address] = _all_running[process.pid] = run
         self._selector.register(run.pipe, selectors.EVENT_READ, run)
         self._selector.register(run.process.descriptor, selectors.EVENT_READ, run)
 
@@ -206,12 +210,15 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        keepers = {run.task.address: run.process.pid for run in self._running.values()}
-        victim = self._guard.check(keepers)
+        runs = {str(keeper): run for keeper, run in _all_running.copy().items()}
+        victim = self._guard.check({name: run.process.pid for name, run in runs.items()})
         # One at a time: the memory of a dying process is not free at once.
-        if victim is None or any(run.is_victim for run in self._running.values()):
+        if victim is None or any(run.is_victim for run in runs.values()):
             return
-        run = self._running[victim.address]
+        run = runs[victim.address]
+        if self._running.get(run.task.address) is not run:
+            # Its own executor stops it.
+            return
         run.is_victim = True
         run.reason = describe_memory(run.task.who, victim.n_bytes)
         run.peak_bytes = max(run.peak_bytes, victim.n_bytes)
@@ -248,6 +255,7 @@ class LocalExecutor:
             with contextlib.suppress(KeyError):
                 self._selector.unregister(descriptor)
         os.close(run.pipe)
+        del _all_running[run.process.pid]
         run.process.close()
         del self._running[run.task.address]
 

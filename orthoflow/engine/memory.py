@@ -220,7 +220,7 @@ class MemoryGuard:
         """Choose a step to stop when too little memory is left.
 
         Args:
-            roots: address -> process above all others of every running step.
+            roots: name -> process above all others of every running step.
         """
         memory = available_memory()
         margin = memory.available - memory.floor

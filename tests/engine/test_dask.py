@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster
 
-from orthoflow.engine import RunOutcome, RunPlan, dask_executor, execute
+from orthoflow.engine import RunOutcome, RunPlan, dask_executor, execute, local_executor, memory
 from orthoflow.engine.dask_executor import CORES, DaskExecutor
 from orthoflow.engine.dask_worker import look_around
 from orthoflow.engine.events import (
@@ -24,6 +24,7 @@ from orthoflow.engine.events import (
     RunListener,
 )
 from orthoflow.engine.executors import Capacity
+from orthoflow.engine.memory import AvailableMemory
 from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
 from tests.engine_world import World, digests, has_ended, toy_world
@@ -141,6 +142,27 @@ def test_workers_of_its_own_take_no_more_cores_than_there_are(office: Office) ->
         under_way += isinstance(event, CellStarted) - isinstance(event, CellFinished)
         most = max(most, under_way)
     assert most == 2
+
+
+def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = "use: work.slow, in: {numbers: first.numbers}, params: {steps: 40, amount: "
+    steps = f"  first: {{use: make.range}}\n  a: {{{slow}1}}}}\n  b: {{{slow}2}}}}\n"
+    fresh = World(folder=office.world.folder / "short", site=office.world.site)
+    fresh.folder.mkdir()
+    running = local_executor._all_running
+
+    def left() -> AvailableMemory:
+        return AvailableMemory(available=(len(running) < 2) << 33, total=1 << 34)
+
+    monkeypatch.setattr(memory, "available_memory", left)
+    # Both are worth being stopped.
+    monkeypatch.setattr(memory, "tree_memory", lambda root: (1 << 33) + (root == min(running)))
+    outcome = fresh.run(f"steps:\n{steps}", executor="dask", jobs=2, cores=2)
+    said = [result.error_message for name, result in outcome.results.items() if name != "first"]
+    assert sorted("needed more memory" in text for text in said) == [False, True]
+    assert not running
 
 
 def test_workers_that_share_one_core_share_no_step(office: Office) -> None:
