@@ -166,10 +166,12 @@ def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, _Column]:
             columns[name] = _Column(index=index, position=field.position)
     if _NAME not in columns:
         listed = ", ".join(columns) or "none"
+        is_mapping = any(": " in name or name.endswith(":") for name in columns)
+        way_out = "; a mapping stands in the workflow, under datasets:" if is_mapping else ""
         log.add(
             header[0].position,
             "",
-            f"a table of datasets needs the column name; its columns are {listed}",
+            f"a table of datasets needs the column name; its columns are {listed}{way_out}",
         )
     return columns
 

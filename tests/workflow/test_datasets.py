@@ -348,6 +348,13 @@ TABLES = {
         "room,scan\nhall,a\n",
         "rooms.csv:1:1: a table of datasets needs the column name; its columns are room, scan",
     ),
+    "a mapping": (
+        "hall: {set: {wall.gsd_m: 1}}\n",
+        (
+            "rooms.csv:1:1: a table of datasets needs the column name; its columns are hall: "
+            "{set: {wall.gsd_m: 1}}; a mapping stands in the workflow, under datasets:"
+        ),
+    ),
     "a line without a name": (
         "name,scan\n,a.e57\n",
         "rooms.csv:2:1: name: the dataset needs a name in the column name",
