@@ -46,6 +46,7 @@ def pixels(given: GivenCamera, points_world: NDArray[np.float64]) -> NDArray[np.
         lens = lens.of_size(WIDTH, HEIGHT)
     assert isinstance(lens, Intrinsics)
     assert lens.source == "given"
+    assert (lens.width, lens.height) == (WIDTH, HEIGHT)
     return lens.posed(given.rotation, given.translation).project(points_world)[:, :2]
 
 
@@ -629,6 +630,7 @@ def test_fisheyes_of_colmap_project_as_colmap_does(tmp_path: Path, model: str, f
         files = {"cameras.bin": lens, "images.bin": image}
     (given,) = read_given_cameras(write(tmp_path, files))
     assert isinstance(given.lens, FisheyeLens)
+    assert (given.lens.width, given.lens.height) == (WIDTH, HEIGHT)
     theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
     points = POINTS * [3.0, 3.0, 1.0]
     np.testing.assert_allclose(given.lens.project(points), theirs.img_from_cam(points), atol=1e-9)

@@ -71,8 +71,8 @@ def round_scale_m(largest_m: float) -> float:
     """
     for power in range(-3, 6):
         for step in (1, 2, 5):
-            if largest_m <= step * 10.0**power * (1.0 + 1e-9):
-                return float(f"{step}e{power}")
+            if largest_m <= (scale_m := float(f"{step}e{power}")):
+                return scale_m
     return 1e6
 
 

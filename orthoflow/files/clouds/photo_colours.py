@@ -29,7 +29,7 @@ _BORDER_SHARE: Final = 0.05
 # OpenCV takes pictures of fewer than 32,767 rows.
 _REMAPPED_AT_ONCE: Final = 30_000
 _PROJECTED_AT_ONCE: Final = 1 << 19
-_SAMPLE: Final = 200_000
+_SAMPLED_MOST: Final = 200_000
 # So much of the points at either end of an axis may be outliers.
 _OUTSIDE_PERCENT: Final = 0.5
 # The cloud's longest side is cut into so many cubes to see how large its surfaces are.
@@ -210,7 +210,7 @@ class _Extent:
 
 
 def _extent(cloud: PointCloud) -> _Extent:
-    every = slice(None, None, max(1, len(cloud) // _SAMPLE))
+    every = slice(None, None, max(1, len(cloud) // _SAMPLED_MOST))
     sample = np.column_stack([cloud.x[every], cloud.y[every], cloud.z[every]]).astype(np.float64)
     low, high = np.percentile(sample, (_OUTSIDE_PERCENT, 100.0 - _OUTSIDE_PERCENT), axis=0)
     inside = sample[np.all((sample >= low) & (sample <= high), axis=1)]

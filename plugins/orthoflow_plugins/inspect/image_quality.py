@@ -143,14 +143,19 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
     """
     if cameras is None:
         return []
-    spread = np.concatenate(
+    spread_cells = np.concatenate(
         [np.zeros(0), *(cells_per_pixel(image, wall, camera) for camera in _known(cameras))]
     )
-    if not len(spread):
+    if not len(spread_cells):
         return []
     return [
-        Finding(name=name, value=float(np.mean(spread > most)), unit="1", wall=image.wall)
-        for name, most in (("stretch_share", _STRETCHED_CELLS), ("smear_share", _SMEARED_CELLS))
+        Finding(
+            name=name, value=float(np.mean(spread_cells > most_cells)), unit="1", wall=image.wall
+        )
+        for name, most_cells in (
+            ("stretch_share", _STRETCHED_CELLS),
+            ("smear_share", _SMEARED_CELLS),
+        )
     ]
 
 

@@ -38,6 +38,8 @@ def test_the_scale_is_the_largest_at_which_all_walls_fit() -> None:
     assert fitting_scale([(size[0] + 0.001, size[1])], A3) == 100
     # Upright: what is high fits onto paper that is turned.
     assert fitting_scale([(0.5, 7.0)], A3) == 20
+    # What fits at none is cut at the smallest.
+    assert fitting_scale([(1e6, 1.0)], A3) == 10_000
 
 
 @pytest.mark.parametrize("kinds", [("ortho",), ("ortho", "depth")])

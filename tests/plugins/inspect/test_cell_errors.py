@@ -11,6 +11,7 @@ from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
     WallSamples,
+    _shifts,
     depth_step_band,
     pooled,
     sample_findings,
@@ -18,6 +19,7 @@ from orthoflow_plugins.inspect.cell_errors import (
     sampling_rule,
     wall_errors,
 )
+from scipy.ndimage import gaussian_filter
 
 from orthoflow.geometry import frame_over
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask
@@ -237,3 +239,31 @@ def test_patches_further_off_than_the_rest_are_displaced() -> None:
         cells = np.vstack([spread, [far, 0.0]])
         found = numbers_of(samples_of(shift_cells=cells, shift_m=0.01 * cells))
         assert found["displaced_share"] == pytest.approx(share, abs=1e-9), far
+
+
+@pytest.mark.parametrize(("others", "n_patches"), [(OrthoMask.FILLED, 4), (OrthoMask.NONE, 0)])
+def test_patches_are_measured_between_scattered_cells_of_filled_colours(
+    others: OrthoMask, n_patches: int
+) -> None:
+    """Whose surface is shown; what nothing shows is a rim, about which smoothing leans."""
+    rng = np.random.default_rng(5)
+    rgb = gaussian_filter(rng.uniform(0.0, 255.0, (64, 65, 3)), (1.5, 1.5, 0.0))
+    mask = np.where(rng.random((64, 64)) < 0.4, others, OrthoMask.PAINTED).astype(np.uint8)
+    image_: Any = SimpleNamespace(rgb=np.rint(rgb[:, :-1]).astype(np.uint8), mask=mask)
+    true: Any = SimpleNamespace(rgb=rgb[:, 1:], frame=SimpleNamespace(gsd_m=0.004))
+    found = _shifts(image_, true, np.ones((64, 64), dtype=np.bool_))
+    assert len(found.centre) == n_patches
+    # The image shows everything a cell further to the right than it is.
+    np.testing.assert_allclose(found.shift, np.tile([1.0, 0.0], (n_patches, 1)), atol=0.05)
+
+
+@pytest.mark.parametrize(("rise_m", "is_step"), [(0.0035, False), (0.0045, True)])
+def test_a_joint_is_no_step_and_a_ledge_of_half_a_centimetre_is(
+    rise_m: float, is_step: bool
+) -> None:
+    depth_m = np.zeros((9, 12), dtype=np.float32)
+    depth_m[:, 6:] = rise_m
+    band = np.zeros((9, 12), dtype=np.bool_)
+    band[:, 4:8] = is_step
+    np.testing.assert_array_equal(depth_step_band(depth_m), band)
+    np.testing.assert_array_equal(depth_step_band(depth_m.T), band.T)
