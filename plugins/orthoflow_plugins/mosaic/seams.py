@@ -57,7 +57,7 @@ from orthoflow_plugins.mosaic.joining import (
 _IN_MEMORY_MOST: Final = 1 << 24
 # Of the map of sources: its longest side, its colours, and their share beside the grey.
 _LONGEST_PX: Final = 900
-_COLOURS: Final = {
+_NAMED_RGB: Final = {
     "blue": (31, 119, 180),
     "orange": (255, 127, 14),
     "green": (44, 160, 44),
@@ -371,7 +371,7 @@ def _source_map(image: Orthoimage) -> bytes:
     """
     step = max(1, -(-max(image.source.shape) // _LONGEST_PX))
     source = image.source[::step, ::step]
-    palette = np.array(list(_COLOURS.values()), dtype=np.float64)
+    palette = np.array(list(_NAMED_RGB.values()), dtype=np.float64)
     tint = palette[source % len(palette)]
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
@@ -381,7 +381,7 @@ def _source_map(image: Orthoimage) -> bytes:
 
 def _caption(image: Orthoimage) -> str:
     """Say which colour of `_source_map` stands for which source."""
-    names = list(_COLOURS)
+    names = list(_NAMED_RGB)
     legend = ", ".join(
         f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)
     )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _SIDE_PX: Final = 900
 # markiewicz2015, Figure 17: control green, rejected red, check yellow.
-_COLOURS: Final = {
+_ROLE_RGB: Final = {
     TieRole.REJECTED: (220, 40, 40),
     TieRole.CONTROL: (40, 200, 60),
     TieRole.CHECK: (250, 220, 40),
@@ -90,7 +90,7 @@ def draw_ties(
     # Dimmed, so that the marks stand out.
     canvas = np.rint(0.7 * small).astype(np.uint8)
     unit = 1 << _SUB_PIXEL_BITS
-    for kind, colour in _COLOURS.items():
+    for kind, colour in _ROLE_RGB.items():
         at = np.rint(to_opencv(pixels_photo[role == kind] * scale) * unit).astype(int)
         for u, v in at.tolist():
             cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)

@@ -13,7 +13,7 @@ from orthoflow.products import OpeningKind
 
 _LONGEST_PX: Final = 1400
 _SMALLEST_PX: Final = 500
-_COLOURS: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
+_KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
     "through": (30, 110, 230),
     "niche": (235, 120, 0),
     "no data": (200, 30, 160),
@@ -50,7 +50,7 @@ def outline_map(
             picture,
             [places],
             isClosed=True,
-            color=_COLOURS[kind],
+            color=_KIND_RGB[kind],
             thickness=2,
             lineType=cv2.LINE_AA,
         )
@@ -61,7 +61,7 @@ def outline_map(
             (left + 6, top + 22),
             cv2.FONT_HERSHEY_SIMPLEX,
             0.7,
-            _COLOURS[kind],
+            _KIND_RGB[kind],
             2,
             cv2.LINE_AA,
         )
