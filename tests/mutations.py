@@ -73,7 +73,7 @@ _UNSEEN_NAMES: Final = re.compile(
     r"|BAND_(CELLS|PX)|_BLOCK(_ROWS|_ENTRIES)?$|_(LONGEST|SMALLEST|MAP)_PX$|PIXELS_MOST$"
     r"|_RGB$|_BGR$|_SEED$|^_?(INK|PAPER)$"
     r"|(TIMEOUT|PATIENCE|CONNECT|STOPPING|CLOSE|GRACE|LOOK|LOOK_EVERY|SILENT|PAUSE|RETRY)_S$"
-    r"|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|^(result_version|citations|cores|threads)$"
+    r"|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|THREADS$|^(result_version|citations|cores|threads)$"
 )
 # What lays out a drawing, and how a made-up surface looks.
 _LOOKS: Final = re.compile(r"^(Margins|Paint)$")

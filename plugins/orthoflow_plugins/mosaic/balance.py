@@ -96,7 +96,7 @@ def balance_of(
     wall: Wall | None,
     cameras: Sequence[Camera | None],
     *,
-    is_local: bool = True,
+    is_local: bool,
 ) -> Balance | None:
     """Find what makes layers of a wall alike; None where they are.
 
@@ -107,8 +107,7 @@ def balance_of(
         is_local: find what is smooth over a photo, too, not only its exposure.
     """
     shape = layers[0].frame.shape
-    side = int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
-    blocks = Blocks.over(shape, side)
+    blocks = Blocks.over(shape, _block_cells(shape))
     lights = [block_light(layer, blocks) for layer in layers]
     seen = cameras if is_local else [None] * len(layers)
     radii = _radii(layers[0].frame, wall, seen, blocks, lights)
@@ -120,6 +119,11 @@ def balance_of(
     if max(float(np.abs(values).max()) for values in logs) < _ALIKE:
         return None
     return Balance(blocks=blocks, lights=tuple(lights), logs=tuple(logs), exposures=exposures)
+
+
+def _block_cells(shape: tuple[int, int]) -> int:
+    """Side of the blocks of a wall, cells."""
+    return int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
 
 
 def _radii(

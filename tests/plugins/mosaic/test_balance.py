@@ -225,6 +225,16 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
     np.testing.assert_array_equal(balance.shown(0, colours, rows, columns), lit(colours, found))
 
 
+@pytest.mark.parametrize(
+    ("shape", "side"),
+    [((20, 30), 2), ((120, 300), 3), ((400, 1000), 10), ((990, 1000), 15), ((9_000, 9_000), 16)],
+)
+def test_small_walls_have_some_thousand_blocks_and_large_ones_blocks_of_sixteen_cells(
+    shape: tuple[int, int], side: int
+) -> None:
+    assert balancing._block_cells(shape) == side
+
+
 @pytest.mark.parametrize(("factor", "differs"), [(1.03, False), (1.05, True), (0.95, True)])
 def test_photos_differ_where_either_has_to_change_by_two_percent(
     factor: float, *, differs: bool

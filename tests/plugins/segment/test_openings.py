@@ -235,16 +235,30 @@ def test_what_the_cloud_painted_moves_no_side(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.outline_m, other.outline_m)
 
 
-def test_floors_alone_are_refused_and_looked_at_when_asked(tmp_path: Path) -> None:
-    walls = scenes.walls()
-    level = Walls(
+def leaning(rise_deg: float) -> Walls:
+    """The wall, in a room of which it leans by so much from upright."""
+    walls, rise = scenes.walls(), np.radians(rise_deg)
+    frame = walls.walls[0].frame
+    return Walls(
         walls=walls.walls,
-        up=walls.walls[0].frame.normal_world,
+        up=np.sin(rise) * frame.normal_world - np.cos(rise) * frame.v_world,
         intensity_source="laser",
         buffer_front_m=scenes.FRONT_M,
         buffer_behind_m=scenes.BEHIND_M,
     )
+
+
+@pytest.mark.parametrize("rise_deg", [90.0, 33.0, -33.0])
+def test_floors_and_slopes_alone_are_refused_and_looked_at_when_asked(
+    tmp_path: Path, rise_deg: float
+) -> None:
     with pytest.raises(MethodError, match="none of the 1 walls is upright: level: true"):
-        found(tmp_path, walls=level)
-    openings, _ = found(tmp_path, walls=level, level=True)
+        found(tmp_path, walls=leaning(rise_deg))
+    if rise_deg == 90.0:
+        openings, _ = found(tmp_path, walls=leaning(rise_deg), level=True)
+        assert openings.openings
+
+
+def test_a_wall_may_lean(tmp_path: Path) -> None:
+    openings, _ = found(tmp_path, walls=leaning(27.0))
     assert openings.openings

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.segment import outlines as module
 from orthoflow_plugins.segment.areas import Area, Relief
 from orthoflow_plugins.segment.outlines import Outline, outline_of
 
@@ -255,3 +256,27 @@ def test_a_side_half_of_which_has_face_beside_it_is_seen(n_cells: int, is_seen: 
     np.testing.assert_allclose(shares, [n_cells / 70.0, 0.0, 0.0, 0.0], atol=1e-9)
     assert np.roll(found.is_seen, -begin).tolist() == [is_seen, False, False, False]
     assert found.seen_of_all == pytest.approx(n_cells / 340.0)
+
+
+def side_at(degrees: float, middle: tuple[float, float]) -> module._Side:
+    turn = np.radians(degrees)
+    none = np.zeros(2)
+    return module._Side(
+        first=0,
+        last=9,
+        begin=none,
+        end=none,
+        scatter=0.0,
+        middle=np.array(middle),
+        direction=np.array([np.cos(turn), np.sin(turn)]),
+    )
+
+
+@pytest.mark.parametrize(("degrees", "meets"), [(20.0, True), (90.0, True), (12.0, False)])
+def test_sides_that_hardly_turn_keep_the_corner_between_them(degrees: float, meets: bool) -> None:
+    level = side_at(0.0, (5.0, 2.0))
+    met = module._meeting(level, side_at(degrees, (30.0, 7.0)))
+    assert (met is not None) is meets
+    if met is not None:
+        expected = [30.0 - 5.0 / np.tan(np.radians(degrees)), 2.0]
+        np.testing.assert_allclose(met, expected, atol=1e-9)
