@@ -11,6 +11,9 @@ import pytest
 from orthoflow_plugins.plane import consensus
 from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
 from orthoflow_plugins.plane.hypotheses import Hypotheses, Scores
+from orthoflow_plugins.plane.sample import Unassigned, prepare
+
+from tests.plane_scenes import Rectangle, cloud_of, sampled
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -162,3 +165,87 @@ def test_a_rejected_plane_bars_what_is_near_it_about_the_centre() -> None:
     ConsensusProposer.reject(of, candidate)
     assert barred[0].offsets_m.tolist() == [1.5]
     np.testing.assert_array_equal(barred[0].normals, UP[None])
+
+
+# --- over a sample ---
+
+# A wall at y = 2 and a floor at z = -1, off the middle of their offsets.
+CORNER = (
+    Rectangle("wall", (5.0, 2.0, 0.0), (1.5, 0.0, 0.0), (0.0, 0.0, 1.0), 2_000),
+    Rectangle("floor", (5.0, 1.0, -1.0), (1.5, 0.0, 0.0), (0.0, 1.0, 0.0), 1_200),
+)
+
+
+def unassigned() -> Unassigned:
+    cloud = prepare(cloud_of(sampled(CORNER)), np.eye(3), cell_m=0.1, least_share=0.1, parts=1)
+    return Unassigned.of(cloud)
+
+
+@pytest.mark.parametrize(("n_hypotheses", "n_most"), [(1000, 100), (200, 50)])
+def test_a_tenth_of_the_hypotheses_is_scored_again_and_fifty_at_least(
+    n_hypotheses: int, n_most: int
+) -> None:
+    # Within half a millimetre nearly all differ, so that no more are left out.
+    wanted = search(n_hypotheses=n_hypotheses, family="any", find_m=5e-4, least_share=0.9)
+    left = unassigned()
+    over = ConsensusProposer(left, wanted, np.random.default_rng(0))
+    over._draw(left)
+    pool = over._pool
+    assert pool is not None
+    assert 0.95 * n_most <= len(pool.hypotheses) <= n_most
+    assert (np.diff(pool.scores.value) <= 0.0).all()
+
+
+def test_a_search_that_finds_nothing_draws_twice_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = unassigned()
+    over = ConsensusProposer(left, search(), np.random.default_rng(0))
+    drawn: list[int] = []
+    monkeypatch.setattr(over, "_draw", lambda of: drawn.append(of.n_points))
+    monkeypatch.setattr(over, "_best", lambda _: None)
+    assert over.propose(left) is None
+    assert drawn == [3_200] * 3
+    # Of the same points everything was asked.
+    assert over.propose(left) is None
+    assert len(drawn) == 5
+
+
+@pytest.mark.parametrize("scoring", ["count", "msac", "a-contrario"])
+@pytest.mark.parametrize("model", ["3d", "2d"])
+def test_the_plane_of_most_points_is_proposed_where_it_lies(scoring: str, model: str) -> None:
+    left = unassigned()
+    wanted = search(model=model, scoring=scoring, n_hypotheses=300, family="any")
+    over = ConsensusProposer(left, wanted, np.random.default_rng(0))
+    found = over.propose(left)
+    assert found is not None
+    assert found.start is not None
+    # Three of its points, within the tolerance; the layer of all of them is better.
+    for plane, off_m in ((found.plane, 0.05), (found.start, 0.02)):
+        side = float(np.sign(plane.normal[1]))
+        np.testing.assert_allclose(side * plane.normal, [0.0, 1.0, 0.0], atol=off_m)
+        middle_m = side * (plane.offset_m - float(plane.normal @ [5.0, 0.0, 0.0]))
+        assert middle_m == pytest.approx(2.0, abs=off_m)
+    assert found.family == ("wall" if model == "2d" else "any")
+    if scoring == "a-contrario":
+        # Of points that scatter by 2 mm.
+        assert found.own_tolerance_m is not None
+        assert 0.003 < found.own_tolerance_m < 0.015
+    else:
+        assert found.own_tolerance_m is None
+
+
+@pytest.mark.parametrize("model", ["3d", "2d"])
+def test_a_rough_hypothesis_is_polished_to_the_points_near_it(model: str) -> None:
+    left = unassigned()
+    over = ConsensusProposer(
+        left, search(model=model, scoring="a-contrario"), np.random.default_rng(0)
+    )
+    turn = math.radians(0.5)
+    normal = np.array([math.sin(turn), math.cos(turn), 0.0])
+    at = np.array([5.0, 2.004, 0.0]) - over._centre_m
+    rough = Hypotheses(normals=normal[None], offsets_m=np.array([float(normal @ at)]))
+    polished, own_m = over._polished(rough, over._score(rough, at[None], 1), 0, left)
+    fine = polished.normals[0] * np.sign(polished.normals[0, 1])
+    assert math.degrees(math.acos(min(1.0, fine[1]))) < 0.02
+    offset_m = float(polished.offsets_m[0]) * np.sign(polished.normals[0, 1])
+    assert offset_m + float(fine @ over._centre_m) == pytest.approx(2.0, abs=1e-3)
+    assert 0.003 < own_m < 0.012
