@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Cuts are made on a smaller picture of about so many cells.
 _CELLS_MOST: Final = 30_000
-_SWEEPS: Final = 2
+_SWEEPS_MOST: Final = 2
 # A seam across a depth edge costs as much as one between black and white.
 _DEPTH_EDGE_COST: Final = 1.0
 # Even where layers are equal a long seam costs more than a short one.
@@ -84,7 +84,7 @@ def cut_labels(
     blocks = Blocks.over((shape[0], shape[1]), factor)
     scene = _reduced(layers, wall, blocks, balance)
     labels = np.argmin(scene.views, axis=0)
-    for _ in range(_SWEEPS):
+    for _ in range(_SWEEPS_MOST):
         before = labels
         for alpha in range(len(layers)):
             labels = _expanded(scene, labels, alpha)

@@ -31,7 +31,7 @@ NOBODY: Final = -1
 # Walls with more cells are joined in bands of so many.
 _BAND_CELLS: Final = 1 << 25
 # Balanced colours take more than a hundred bytes a cell for a moment.
-_BALANCED_CELLS: Final = 1 << 20
+_BALANCED_AT_ONCE: Final = 1 << 20
 # A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
 # at least one looks at it. A filled cell counts less than a painted one.
 _RANKED: Final = (
@@ -197,7 +197,7 @@ def coloured(
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8
     rgb: Colours = np.asarray(allocate("rgb", (*source.shape, 3), level), level)
-    cells_most = _BAND_CELLS if balance is None else _BALANCED_CELLS
+    cells_most = _BAND_CELLS if balance is None else _BALANCED_AT_ONCE
     for band in bands_with_reach(source.shape, cells_most=cells_most, reach_rows=0):
         rows = band.rows
         for index, layer in enumerate(painters):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from orthoflow_plugins.mosaic import blocks, graph_cut
 from orthoflow_plugins.mosaic.blocks import Blocks
 from orthoflow_plugins.mosaic.depth_edges import depth_edges
 from orthoflow_plugins.mosaic.graph_cut import CutLabels
+
+from orthoflow.products import LayerMask
 
 
 @pytest.mark.parametrize("length", range(1, 40))
@@ -100,3 +105,56 @@ def test_a_layer_takes_over_what_it_shows_better_for_less_than_the_seam() -> Non
     views[0, 0, 4], views[1] = 0.015, 0.1
     views[1, 0, 4] = 0.0
     assert not graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
+
+
+# --- the smaller picture ---
+
+
+def two_layers(shape: tuple[int, int], greys: tuple[int, int]) -> list[Any]:
+    """Two layers of even greys, the second half as good, with nothing in its first two columns."""
+    found = []
+    for grey, quality in zip(greys, (2.0, 1.0), strict=True):
+        mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+        if quality == 1.0:
+            mask[:, :2] = LayerMask.OUTSIDE
+        found.append(
+            SimpleNamespace(
+                frame=SimpleNamespace(shape=shape),
+                rgb=np.full((*shape, 3), grey, dtype=np.uint8),
+                mask=mask,
+                quality=np.full(shape, quality, dtype=np.float32),
+            )
+        )
+    return found
+
+
+def test_a_step_in_depth_costs_as_much_as_one_from_black_to_white() -> None:
+    depth_m = np.zeros((1, 12), dtype=np.float32)
+    depth_m[:, 8:] = 0.1
+    wall: Any = SimpleNamespace(depth_m=depth_m)
+    blocks_of = Blocks.over((1, 12), 1)
+    reduced = graph_cut._reduced(two_layers((1, 12), (0, 255)), wall, blocks_of, None)
+    plain, edge = (
+        float(graph_cut._seam_cost(reduced, *(np.array([k]) for k in (at, at + 1, 0, 1)))[0])
+        for at in (4, 7)
+    )
+    # Black beside white on either side of the seam.
+    assert plain == pytest.approx(2 * 1000, rel=0.01)
+    assert edge - plain == pytest.approx(plain, rel=0.01)
+    assert (reduced.views[0] == 0.0).all()
+    # A photo half as good costs as much as a difference of a twentieth between black and white.
+    np.testing.assert_allclose(reduced.views[1, 0, 2:], 0.05)
+    assert (reduced.views[1, 0, :2] >= 1000.0).all()
+
+
+@pytest.mark.parametrize(
+    ("shape", "small"), [((100, 300), (100, 300)), ((200, 300), (100, 150)), ((8, 9), (8, 9))]
+)
+def test_cuts_are_made_on_some_ten_thousand_cells(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], small: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(graph_cut, "_expanded", lambda _scene, labels, _alpha: labels)
+    labels = graph_cut.cut_labels(two_layers(shape, (9, 9)), None)
+    assert labels.small.shape == small
+    # What is left where nothing moves: the better one everywhere.
+    assert not labels.small.any()

@@ -264,14 +264,17 @@ def test_cells_that_no_photo_shows_are_told_of_with_their_cause(
     assert "10% have no surface" in warning
 
 
-def test_empty_cells_of_the_raster_alone_are_not_told_of_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("n_rows", "is_told"), [(3, False), (5, True)])
+def test_empty_cells_of_the_raster_alone_and_few_others_are_not_told_of(
+    tmp_path: Path, n_rows: int, *, is_told: bool
+) -> None:
     mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:3], mask[20:] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
+    mask[:n_rows], mask[20:] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
     layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
     ctx = scenes.context(tmp_path)
     inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
     MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
-    assert ctx.warnings == []
+    assert len(ctx.warnings) == is_told
 
 
 def test_a_layer_without_paint_is_no_source_but_tells_what_is_hidden(tmp_path: Path) -> None:

@@ -248,7 +248,7 @@ def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
     told = []
     for band_cells in (1 << 24, 270 * 70):
         monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
-        for name in ("_BAND_CELLS", "_BALANCED_CELLS"):
+        for name in ("_BAND_CELLS", "_BALANCED_AT_ONCE"):
             monkeypatch.setattr(f"orthoflow_plugins.mosaic.joining.{name}", band_cells)
         ctx = context(tmp_path)
         inputs = MosaicSeams.In(layers=Layers(layers=layers))
