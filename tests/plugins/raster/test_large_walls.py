@@ -112,6 +112,9 @@ def test_walls_are_painted_from_a_cloud_without_memory_per_cell(tmp_path: Path) 
     points = known.world(*places.T, np.zeros(len(places)))
     intensity = places[:, 0].astype(np.float32) / 1000.0
     cloud = raster_scenes.cloud_of(points, intensity=intensity)
+    small = bare_walls(raster_scenes.leaning_wall(shape=(40, 10)))
+    ready = PointcloudDirect.In(walls=small, cloud=cloud)
+    PointcloudDirect().run(ready, PointcloudDirect.Params(), context(tmp_path))  # compiled
     (wall,) = bare_walls(known).walls
     blank = {name: mapped(tmp_path / name, getattr(wall, name)) for name in ("mask", "depth_m")}
     walls = dataclasses.replace(bare_walls(known), walls=(dataclasses.replace(wall, **blank),))
