@@ -87,7 +87,7 @@ def sampling_rule(
     )
 
 
-def sampling(image: Orthoimage, rule: SamplingRule, first_row: int = 0) -> Sampling:
+def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
     """Choose cells of an image; blocks that show nothing have no colours to compare.
 
     Args:

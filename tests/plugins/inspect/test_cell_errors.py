@@ -41,7 +41,7 @@ def image(mask: np.ndarray) -> Orthoimage:
 def test_a_small_wall_is_compared_whole() -> None:
     wall = image(np.full((130, 250), OrthoMask.PAINTED))
     rule = sampling_rule([wall], colour_cells_most=32_500, seen_cells_most=32_500)
-    chosen = sampling(wall, rule)
+    chosen = sampling(wall, rule, 0)
     assert chosen.coloured.all()
     assert chosen.lattice.all()
 
@@ -52,7 +52,7 @@ def test_a_large_wall_is_compared_evenly(share: float) -> None:
     walls = [image(np.full((side, side), OrthoMask.PAINTED))] * 2
     most = round(2 * share * side**2)
     rule = sampling_rule(walls, colour_cells_most=most, seen_cells_most=most)
-    chosen = sampling(walls[0], rule)
+    chosen = sampling(walls[0], rule, 0)
     blocks = chosen.coloured.reshape(40, BLOCK_CELLS, 40, BLOCK_CELLS)
     np.testing.assert_array_equal(blocks.any(axis=(1, 3)), blocks.all(axis=(1, 3)))
     # Every tenth of the wall has its share of blocks, but for a few of them.
@@ -65,12 +65,28 @@ def test_a_large_wall_is_compared_evenly(share: float) -> None:
     assert share / 3 < chosen.lattice.mean() <= share
 
 
+@pytest.mark.parametrize("n_blocks", [1, 2, 3])
+def test_a_part_of_a_wall_is_compared_where_the_whole_is(n_blocks: int) -> None:
+    mask = np.full((6 * BLOCK_CELLS + 17, 7 * BLOCK_CELLS), OrthoMask.PAINTED)
+    mask[:40] = OrthoMask.NONE
+    whole = image(mask)
+    rule = sampling_rule([whole], colour_cells_most=mask.size // 3, seen_cells_most=mask.size // 50)
+    chosen = sampling(whole, rule, 0)
+    for first in range(0, len(mask), n_blocks * BLOCK_CELLS):
+        rows = slice(first, first + n_blocks * BLOCK_CELLS)
+        part = sampling(image(mask[rows]), rule, first)
+        np.testing.assert_array_equal(part.coloured, chosen.coloured[rows])
+        np.testing.assert_array_equal(part.lattice, chosen.lattice[rows])
+    assert 0 < chosen.lattice.sum() < mask.size / 40
+    assert 0.2 < chosen.coloured.mean() < 0.45
+
+
 def test_what_shows_nothing_has_no_colours_to_compare() -> None:
     mask = np.full((3 * BLOCK_CELLS, 3 * BLOCK_CELLS), OrthoMask.NONE)
     mask[5, 5], mask[BLOCK_CELLS + 5, 2 * BLOCK_CELLS + 5] = OrthoMask.PAINTED, OrthoMask.FILLED
     wall = image(mask)
     rule = sampling_rule([wall], colour_cells_most=1_000_000, seen_cells_most=1_000_000)
-    coloured = sampling(wall, rule).coloured[::BLOCK_CELLS, ::BLOCK_CELLS]
+    coloured = sampling(wall, rule, 0).coloured[::BLOCK_CELLS, ::BLOCK_CELLS]
     np.testing.assert_array_equal(coloured, [[1, 0, 0], [0, 0, 1], [0, 0, 0]])
 
 
