@@ -227,6 +227,10 @@ def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> Non
     echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))
+    from orthoflow.report.combinations import baseline_of
+
+    if baseline := ", ".join(f"{step}={name}" for step, name in baseline_of(run).items()):
+        echo(f"baseline: {baseline}, with which the others are compared")
     echo(f"products: {run.products_folder}")
     echo(f"report: {report}")
     echo(f"record: {run.path}")

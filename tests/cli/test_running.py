@@ -439,6 +439,8 @@ def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -
     )
     done = orthoflow(tmp_path, "check", "studio.yaml")
     assert done.stdout.endswith("3 cells; baseline paint=rough\n"), done.stdout + done.stderr
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "out")
+    assert "baseline: paint=rough, with which the others are compared" in done.stdout.splitlines()
 
 
 def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
