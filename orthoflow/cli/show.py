@@ -154,6 +154,11 @@ def _as_json(run: Run) -> dict[str, object]:
 
 def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
+    # What a method does not say of its metrics is left out, as in the record.
+    values["metrics"] = [
+        {name: value for name, value in dataclasses.asdict(metric).items() if value != ""}
+        for metric in cell.metrics
+    ]
     # The bytes of pictures are in the record and the report; here their names do.
     values["figures"] = [
         {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type}
