@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect import figures
+from orthoflow_plugins.inspect import checkpoints, figures
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.findings import (
     check_findings,
@@ -319,3 +319,16 @@ def test_points_are_measured_without_memory_per_cell(
     finally:
         tracemalloc.stop()
     assert metrics["mean_x_mm"] == pytest.approx(0.25e3 * GSD_M)
+
+
+def test_the_log_names_the_points_that_are_furthest_off_and_not_thousands(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    told: list[str] = []
+    monkeypatch.setattr(ctx, "log", told.append)
+    shift_m = np.column_stack([1e-5 * np.arange(300), np.full(300, -1e-3)])
+    checkpoints._tell(shift_m, [f"p{k}" for k in range(300)], ctx)
+    assert len(told) == 200
+    assert told[0] == "check point p299: +2.99 mm right, -1.00 mm down"
+    assert told[-1].startswith("check point p100: ")

@@ -128,3 +128,12 @@ def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: P
         "n_photos": 6.0,
     }
     assert {metric.unit for metric in ctx.metrics} == {"mm"}
+
+
+def test_of_very_many_points_of_a_wall_an_even_part_says_all_about_lengths() -> None:
+    places_m = np.random.default_rng(3).uniform(0.0, 8.0, (2_500, 2))
+    wall = np.zeros(2_500, dtype=np.int32)
+    found = {item.name: item.value for item in length_findings(places_m, 0.002 * places_m, wall)}
+    assert found["length_error_rms_share"] == pytest.approx(0.002)
+    # Of three million pairs.
+    assert found["n_lengths"] < 1_000_000
