@@ -4,35 +4,56 @@
     orthoflow run quickstart.yaml -o many --store store \\
         --set room.photo_exposure_share=0.3 --set room.photo_vignetting_share=0.3
     python benchmarks/balanced_colours.py many --against one --store store
+    python benchmarks/balanced_colours.py --room 9021
+    python benchmarks/balanced_colours.py RUN --exposure 0.3 --store store
 
-`--exposure 0.3 --against RUN` with a run of real photos gives these 0.7 to 1.3 times their light.
+The second is that of a smaller room, drawn by a seed, from true planes and cameras. The third gives
+real photos 0.7 to 1.3 times their light, and compares with the same photos balanced without that.
 
-Joins the layers of a run anew, untouched and balanced. Steps along a seam are told between the
-means of two cells on either side, averaged over stretches of 24 cells: what is left of texture then
-is what the same measure gives along lines 8 cells aside.
+Joins the layers of a run anew, untouched and balanced. A step is told between the means of two
+cells on either side of a seam, averaged over stretches of 24 cells along it. Of that, the wall
+itself changes by what either photo alone shows between the same four cells, on average of both.
+What is left, the excess, is what comes of two photos: by how much they differ in these cells.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic.depth_edges import depth_edges
+from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
+from orthoflow_plugins.mosaic.joining import coloured
 from orthoflow_plugins.mosaic.light import light_of_levels
 from orthoflow_plugins.mosaic.seams import MosaicSeams
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.engine.store import Store
-from orthoflow.products import Cameras, Layers, Orthoimage, OrthoMask, Walls
+from orthoflow.geometry.bands import in_memory
+from orthoflow.products import (
+    Cameras,
+    Layer,
+    LayerMask,
+    Layers,
+    Orthoimage,
+    OrthoMask,
+    Wall,
+    Walls,
+)
 from orthoflow.records import Run, open_run
 from orthoflow.sdk import StepContext
 
-STRETCH, ASIDE, NEAR = 24, 8, 4
+STRETCH = 24
 BLOCK = 8
+
+Cells: TypeAlias = NDArray[np.int64]
 
 
 def product(run: Run, store: Store, step: str, cls: type) -> object:
@@ -49,33 +70,113 @@ def lab(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(cv2.cvtColor(rgb.astype(np.float32), cv2.COLOR_RGB2Lab), np.float32)
 
 
-def steps(image: Orthoimage, is_edge: NDArray[np.bool_], aside: int) -> NDArray[np.float64]:
-    """Mean steps of stretches of seams off depth edges, or of lines so many cells aside."""
-    colours = lab(image.rgb / 255.0)
-    found = []
+@dataclass(frozen=True, kw_only=True)
+class Mosaic:
+    """An orthoimage, and what each photo shows of the wall, as balanced.
+
+    Attributes:
+        image: the orthoimage.
+        painters: what its sources count.
+        balance: of these, or None.
+        metrics: of the step.
+    """
+
+    image: Orthoimage
+    painters: tuple[Layer, ...]
+    balance: Balance | None
+    metrics: dict[str, float]
+
+    def __str__(self) -> str:
+        return f"same cells {self.metrics['seam_step_mean_delta_e']:.2f}, {steps(self)}"
+
+    def is_painted(
+        self, photo: NDArray[np.int16], rows: Cells, columns: Cells, *, turned: bool
+    ) -> NDArray[np.bool_]:
+        """Whether photos (n,) show cells (n,); turned, rows and columns are exchanged."""
+        found = np.zeros(len(rows), dtype=np.bool_)
+        places = (columns, rows) if turned else (rows, columns)
+        for index, layer in enumerate(self.painters):
+            mine = np.flatnonzero(photo == index)
+            found[mine] = layer.mask[places[0][mine], places[1][mine]] == LayerMask.PAINTED
+        return found
+
+    def colours(
+        self, photo: NDArray[np.int16], rows: Cells, columns: Cells, *, turned: bool
+    ) -> NDArray[np.float32]:
+        """CIE L*a*b* (n, 3) of what photos show in cells, as `is_painted` takes them."""
+        found = np.zeros((len(rows), 3), dtype=self.image.rgb.dtype)
+        down, right = (columns, rows) if turned else (rows, columns)
+        for index, layer in enumerate(self.painters):
+            mine = np.flatnonzero(photo == index)
+            rgb = layer.rgb[down[mine], right[mine]]
+            if self.balance is not None and len(mine):
+                rgb = self.balance.shown(index, rgb, down[mine], right[mine])
+            found[mine] = rgb
+        return lab(found[None] / np.iinfo(found.dtype).max)[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Steps (n, 3) in CIE L*a*b* of stretches along seams.
+
+    Attributes:
+        seen: from one photo to the other.
+        wall: what either photo alone shows across the same line, on average of both.
+        share: of the cells of seams, those about which both photos show two cells on either side.
+    """
+
+    seen: NDArray[np.float64]
+    wall: NDArray[np.float64]
+    share: float
+
+    def __str__(self) -> str:
+        seen, wall, excess = (
+            np.linalg.norm(values, axis=1).mean()
+            for values in (self.seen, self.wall, self.seen - self.wall)
+        )
+        return (
+            f"stretches {seen:.2f}, of the wall {wall:.2f}, excess {excess:.2f} "
+            f"({self.share:.0%} of seams)"
+        )
+
+
+def steps(mosaic: Mosaic) -> Steps:
+    """Steps where both photos show two cells on either side of a seam."""
+    seen, wall = [], []
+    n_seam = n_counted = 0
     for turned in (False, True):
-        source, levels, edge = (
-            (values.swapaxes(0, 1) if turned else values)
-            for values in (image.source, colours, is_edge)
-        )
+        source = mosaic.image.source.T if turned else mosaic.image.source
         here = (source[:, :-1] != source[:, 1:]) & (source[:, :-1] >= 0) & (source[:, 1:] >= 0)
-        rows, columns = np.nonzero(here & ~edge[:, 1:] & ~edge[:, :-1])
-        kept = (columns >= ASIDE + 2) & (columns + ASIDE + 3 < source.shape[1])
-        for cell in range(1, NEAR + 1):
-            kept &= source[rows, columns + 1 - cell] == source[rows, columns]
-            after = np.minimum(columns + cell, source.shape[1] - 1)
-            kept &= source[rows, after] == source[rows, np.minimum(columns + 1, after)]
-        rows, columns = rows[kept], columns[kept] + aside
-        before, behind = (
-            0.5 * (levels[rows, columns + first] + levels[rows, columns + first + 1])
-            for first in (-1, 1)
-        )
-        stretch = rows // STRETCH * source.shape[1] + (columns - aside) // STRETCH
-        _, of, counts = np.unique(stretch, return_inverse=True, return_counts=True)
-        sums = np.zeros((len(counts), 3))
-        np.add.at(sums, of, before - behind)
-        found.append(np.linalg.norm(sums / counts[:, None], axis=1)[counts >= STRETCH // 2])
-    return np.concatenate(found)
+        n_seam += np.count_nonzero(here)
+        rows, columns = np.nonzero(here)
+        kept = (columns >= 1) & (columns + 2 < source.shape[1])
+        rows, columns = rows[kept], columns[kept]
+        both = source[rows, columns], source[rows, columns + 1]
+        kept = np.ones(len(rows), dtype=np.bool_)
+        for cell in range(-1, 3):
+            for photo in both:
+                kept &= mosaic.is_painted(photo, rows, columns + cell, turned=turned)
+        rows, columns, both = rows[kept], columns[kept], [photo[kept] for photo in both]
+        n_counted += len(rows)
+        cells = [
+            [mosaic.colours(photo, rows, columns + cell, turned=turned) for cell in range(-1, 3)]
+            for photo in both
+        ]
+        # (photo, side, n, 3): means of two cells.
+        shown = np.reshape(cells, (2, 2, 2, -1, 3)).mean(axis=2)
+        # Of the same two photos, in the same order: steps there and back do not cancel.
+        stretch = np.stack([rows // STRETCH, columns // STRETCH, *both])
+        _, of, counts = np.unique(stretch, axis=1, return_inverse=True, return_counts=True)
+        for found, values in (
+            (seen, shown[0, 0] - shown[1, 1]),
+            (wall, (shown[:, 0] - shown[:, 1]).mean(axis=0)),
+        ):
+            sums = np.zeros((len(counts), 3))
+            np.add.at(sums, of, values)
+            found.append((sums / counts[:, None])[counts >= STRETCH // 2])
+    return Steps(
+        seen=np.concatenate(seen), wall=np.concatenate(wall), share=n_counted / max(1, n_seam)
+    )
 
 
 def blocks(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -129,43 +230,97 @@ def exposed(layers: Layers, share: float) -> Layers:
     return replace(layers, layers=changed)
 
 
+def inputs_of_run(folder: Path, store: Store, exposure: float) -> MosaicSeams.In:
+    """What a run joined, its photos with so much more or less light."""
+    run = open_run(folder)
+    return MosaicSeams.In(
+        layers=exposed(product(run, store, "ortho", Layers), exposure),
+        walls=product(run, store, "wall", Walls),
+        cameras=product(run, store, "orient", Cameras),
+    )
+
+
+def inputs_of_room(seed: int, share: float) -> MosaicSeams.In:
+    """A room drawn by a seed, from true planes and cameras; light and corners differ by a share."""
+    with tempfile.TemporaryDirectory() as folder:
+
+        def ctx() -> StepContext:
+            return StepContext(
+                rng=np.random.default_rng(seed), cores=2, scratch=Path(tempfile.mkdtemp(dir=folder))
+            )
+
+        params = SimulateRoom.Params(
+            decoration="drawn",
+            scan_step_m=0.006,
+            panorama_step_m=0.03,
+            photo_layout="quick",
+            photo_gsd_m=0.004,
+            photo_exposure_share=share,
+            photo_vignetting_share=share,
+        )
+        room = SimulateRoom().run(SimulateRoom.In(), params, ctx())
+        walls = (
+            RasterGrid()
+            .run(
+                RasterGrid.In(cloud=room.cloud, planes=room.truth.planes),
+                RasterGrid.Params(gsd_m=0.006, buffer_m=0.3, n_walls_max=1),
+                ctx(),
+            )
+            .walls
+        )
+        cameras = room.truth.cameras
+        seen = DsmBackward.In(walls=walls, cloud=room.cloud, photos=room.photos, cameras=cameras)
+        layers = DsmBackward().run(seen, DsmBackward.Params(), ctx()).layers
+    return MosaicSeams.In(layers=layers, walls=walls, cameras=cameras)
+
+
+def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
+    """The first wall, and what each photo shows of it, balanced as the method did."""
+    params = MosaicSeams.Params.model_validate(chosen)
+    with tempfile.TemporaryDirectory() as folder:
+        ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=Path(folder))
+        image = MosaicSeams().run(inputs, params, ctx).orthoimages.images[0]
+    wall: Wall = inputs.walls.walls[0]
+    layers = [layer for layer in inputs.layers.layers if layer.wall == image.wall]
+    painters = tuple(next(item for item in layers if item.source == name) for name in image.sources)
+    balance = None
+    if params.gains != "none":
+        cameras = {item.photo: item for item in inputs.cameras.cameras if item.status == "ok"}
+        seen = [cameras.get(layer.source) for layer in painters]
+        balance = balance_of(painters, wall, seen)
+        if balance is not None:
+            balance = with_seams(balance, image.source, wall, feather_cells=params.feather_cells)
+    made = coloured(painters, image.source, balance, allocate=in_memory)
+    np.testing.assert_array_equal(made, image.rgb)
+    metrics = {item.name: item.value for item in ctx.metrics}
+    return Mosaic(image=image, painters=painters, balance=balance, metrics=metrics)
+
+
 def main() -> None:
     """Print a line for untouched, balanced, and balanced along graph cuts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, nargs="?")
+    parser.add_argument("--room", type=int, metavar="SEED")
     parser.add_argument("--against", type=Path)
     parser.add_argument("--exposure", type=float, default=0.0)
     parser.add_argument("--store", type=Path, default=Path(".orthoflow"))
     chosen = parser.parse_args()
-    store = Store(chosen.store)
-
-    def mosaic(
-        run: Run, exposure: float = 0.0, **params: object
-    ) -> tuple[Orthoimage, NDArray[np.bool_], dict]:
-        walls = product(run, store, "wall", Walls)
-        inputs = MosaicSeams.In(
-            layers=exposed(product(run, store, "ortho", Layers), exposure),
-            walls=walls,
-            cameras=product(run, store, "orient", Cameras),
-        )
-        with tempfile.TemporaryDirectory() as folder:
-            ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=Path(folder))
-            out = MosaicSeams().run(inputs, MosaicSeams.Params.model_validate(params), ctx)
-        depth_m = walls.walls[0].depth_m
-        is_edge = (depth_edges(depth_m) | np.isnan(depth_m)).astype(np.uint8)
-        is_near = cv2.dilate(is_edge, np.ones((2 * NEAR + 1,) * 2)) > 0
-        return out.orthoimages.images[0], is_near, {item.name: item.value for item in ctx.metrics}
-
-    run = open_run(chosen.run)
-    one = mosaic(open_run(chosen.against), gains="none")[0] if chosen.against else None
+    store, one = Store(chosen.store), None
+    if chosen.room is not None:
+        inputs = inputs_of_room(chosen.room, 0.3)
+        one = mosaic(inputs_of_room(chosen.room, 0.0), gains="none")
+        print(f"one exposure: {one}")
+    else:
+        inputs = inputs_of_run(chosen.run, store, chosen.exposure)
+        if chosen.against:
+            one = mosaic(inputs_of_run(chosen.against, store, 0.0), gains="none")
+        elif chosen.exposure:
+            one = mosaic(inputs_of_run(chosen.run, store, 0.0))
     for params in ({"gains": "none"}, {}, {"seams": "graph-cut"}):
-        image, is_edge, metrics = mosaic(run, chosen.exposure, **params)
-        seam = steps(image, is_edge, 0).mean()
-        texture = np.mean([steps(image, is_edge, side).mean() for side in (-ASIDE, ASIDE)])
+        made = mosaic(inputs, **params)
         print(
-            f"{params or 'default'}: same cells {metrics['seam_step_mean_delta_e']:.2f}, "
-            f"stretches {seam:.2f} at seams, {texture:.2f} aside"
-            + (f"; {against(image, one)}" if one is not None else "")
+            f"{params or 'default'}: {made}"
+            + (f"; {against(made.image, one.image)}" if one else "")
         )
 
 

@@ -17,7 +17,8 @@ _MEANINGS: Final = {
     "where no photo sees it",
     "rgb": "colours of the scan",
     "intensity": "root of the scan's intensity, from its first to its 99th percentile",
-    "plane": "a hue per plane, darker where the intensity is; grey: on no plane",
+    "plane": "a hue per plane, darker where the intensity is, or without one the colour; grey: on "
+    "no plane",
     "deviation": "distance from the plane, positive towards the viewer; grey: on no plane",
 }
 
