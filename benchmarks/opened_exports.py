@@ -279,8 +279,10 @@ def draw_points(xyz: np.ndarray, rgb: np.ndarray, up: np.ndarray, path: Path) ->
 
 def walk_viewers(walk: Walk) -> None:
     """The model by trimesh and Khronos' validator, the pages by Chromium."""
-    folder = walk.export("gltf")
-    if folder is not None:
+    for name, more in (("gltf", ()), ("gltf_relief", ("--relief",))):
+        folder = walk.export("gltf", *more, name=name)
+        if folder is None:
+            continue
         path = folder / "room.glb"
         scene = trimesh.load(path)
         walk.say(path, f"trimesh: {len(scene.geometry)} meshes, {np.round(scene.extents, 2)} m")
@@ -292,7 +294,7 @@ def walk_viewers(walk: Walk) -> None:
             walk.say(path, f"gltf-validator: {said}", is_right=is_right)
         elif done is not None:
             walk.say("gltf-validator", "not installed")
-        photographed(walk, folder / "room.html", "room")
+        photographed(walk, folder / "room.html", name)
     folder = walk.export("tiles")
     if folder is not None:
         sizes = [Image.open(tile).size for tile in folder.rglob("*.webp")]

@@ -69,9 +69,9 @@ _HELP: Final = "\n\n".join(
     "--cell",
     metavar="ADDRESS",
     help="colmap: the cell whose orientations are meant; without it the last one that oriented "
-    "photos. laz, ply, e57: the cell that found the planes; without it the last one that did. "
-    "layers: the cell that laid photos onto walls, likewise. figures: the only cell that is meant. "
-    "gltf, tiles, sheet, dxf, geojson: the cell that made the orthoimages, likewise.",
+    "photos. laz, copc, ply, e57: the cell that found the planes; without it the last one that "
+    "did. layers: the cell that laid photos onto walls, likewise. figures: the only cell that is "
+    "meant. gltf, tiles, sheet, dxf, geojson: the cell that made the orthoimages, likewise.",
 )
 @click.option(
     "--license",
@@ -117,26 +117,32 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
-    help="laz, ply, e57: the colours are of the oriented photos (grey where none sees the point), "
-    "of the scan, its intensity, a colour per plane, or blue behind and red before the plane; "
-    "without it the first of these that there is.",
+    help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "
+    "point), of the scan, its intensity, a colour per plane, or blue behind and red before the "
+    "plane; without it the first of these that there is.",
 )
 @click.option(
     "--wall",
     type=click.IntRange(min=0),
     metavar="K",
-    help="laz, ply, e57: only points over the raster of wall K, as its files are numbered. gltf, "
-    "tiles, sheet, dxf, geojson: only that wall.",
+    help="laz, copc, ply, e57: only points over the raster of wall K, as its files are numbered. "
+    "gltf, tiles, sheet, dxf, geojson: only that wall.",
 )
 @click.option(
     "--box",
     metavar="X,Y,Z,X,Y,Z",
-    help="laz, ply, e57: only points between two corners, in the coordinates of the scan, metres.",
+    help="laz, copc, ply, e57: only points between two corners, in the coordinates of the scan, "
+    "metres.",
 )
 @click.option(
     "--clean",
     is_flag=True,
-    help="laz, ply, e57: without points that have fewer than ten about them.",
+    help="laz, copc, ply, e57: without points that have fewer than ten about them.",
+)
+@click.option(
+    "--relief",
+    is_flag=True,
+    help="gltf: walls with the relief of their depths, not as planes.",
 )
 @click.option(
     "-o",

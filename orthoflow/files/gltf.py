@@ -1,10 +1,10 @@
-"""A room as binary glTF 2.0: each wall's rectangle with its orthoimage, in metres, y up."""
+"""A room as binary glTF 2.0: each wall with its orthoimage, flat or in relief, in metres, y up."""
 
 from __future__ import annotations
 
 import struct
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +17,7 @@ from orthoflow.files.images import encode_jpeg, encode_png
 from orthoflow.files.json_texts import json_bytes
 from orthoflow.files.ortho_files import OrthoFile
 from orthoflow.files.sidecars import numbers, write_bytes
+from orthoflow.files.wall_meshes import flat_mesh, relief_mesh
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import JsonValue
 from orthoflow.version import __version__
@@ -25,13 +26,18 @@ from orthoflow.version import __version__
 LONGEST_TEXTURE_PX: Final = 4096
 # Browsers take pages of some hundred megabytes; letters take a third more.
 _INSIDE_MOST_BYTES: Final = 1 << 27
-_FLOAT, _UNSIGNED_SHORT = 5126, 5123
+_COMPONENTS: Final = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 _CLAMPED, _LINEAR, _TRILINEAR = 33071, 9729, 9987
 
 
-def write_room(path: Path, orthos: Sequence[OrthoFile], up: NDArray[np.float64]) -> None:
+def write_room(
+    path: Path,
+    orthos: Sequence[OrthoFile],
+    up: NDArray[np.float64],
+    depths: Mapping[int, Path] | None = None,
+) -> None:
     """Write the walls; memory holds one texture at a time beside the file.
 
     A wall is a node with a matrix: its vertices are metres on the wall, its matrix places it
@@ -43,15 +49,20 @@ def write_room(path: Path, orthos: Sequence[OrthoFile], up: NDArray[np.float64])
         path: the new file, `.glb`.
         orthos: at least one.
         up: (3,) unit vector of the world.
+        depths: GeoTIFF of the depths of each wall, by number, for walls in relief; without them
+            walls are flat.
 
     Raises:
         StoreError: the file cannot be written.
-        InputError: an orthoimage cannot be read.
+        InputError: an orthoimage or a depth raster cannot be read.
     """
     corners = np.concatenate([ortho.frame.corners_world() for ortho in orthos])
     offset = np.round(corners.mean(axis=0))
     document = _Document()
-    children = [document.add_wall(ortho, offset) for ortho in orthos]
+    children = [
+        document.add_wall(ortho, offset, None if depths is None else depths[ortho.wall])
+        for ortho in orthos
+    ]
     first, second, _ = basis_from_up(up)
     turned = np.eye(4)
     turned[:3, :3] = [first, up, -second]
@@ -99,21 +110,16 @@ class _Document:
     meshes: list[JsonValue] = field(default_factory=list)
     nodes: list[JsonValue] = field(default_factory=list)
 
-    def add_wall(self, ortho: OrthoFile, offset: NDArray[np.float64]) -> int:
+    def add_wall(self, ortho: OrthoFile, offset: NDArray[np.float64], depth: Path | None) -> int:
         """Add mesh, texture and node of a wall; gives the node's number."""
         frame = ortho.frame
-        width_m, height_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
-        vertices = np.array(
-            [[0, 0, 0], [0, -height_m, 0], [width_m, -height_m, 0], [width_m, 0, 0]]
-        )
-        attributes: dict[str, JsonValue] = {
-            "POSITION": self._array(vertices.astype(np.float32), "VEC3"),
-            "NORMAL": self._array(np.array([[0, 0, 1]] * 4, np.float32), "VEC3"),
-            "TEXCOORD_0": self._array(
-                np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.float32), "VEC2"
-            ),
-        }
-        indices = self._array(np.array([0, 1, 2, 0, 2, 3], np.uint16), "SCALAR")
+        mesh = flat_mesh(frame) if depth is None else relief_mesh(frame, depth)
+        attributes: dict[str, JsonValue] = {"POSITION": self._array(mesh.vertices, "VEC3")}
+        if depth is None:
+            normals = np.array([[0, 0, 1]] * len(mesh.vertices), np.float32)
+            attributes["NORMAL"] = self._array(normals, "VEC3")
+        attributes["TEXCOORD_0"] = self._array(mesh.places, "VEC2")
+        indices = self._array(mesh.triangles.ravel(), "SCALAR")
         material = self._add_material(ortho)
         self.meshes.append(
             {
@@ -138,6 +144,7 @@ class _Document:
                     "width": frame.width,
                     "height": frame.height,
                     "product_digest": ortho.digest,
+                    "surface": "plane" if depth is None else "depths of the wall",
                 },
             }
         )
@@ -200,7 +207,7 @@ class _Document:
         is_index = kind == "SCALAR"
         entry: dict[str, JsonValue] = {
             "bufferView": self._view(values.tobytes(), _INDICES if is_index else _VERTICES),
-            "componentType": _UNSIGNED_SHORT if is_index else _FLOAT,
+            "componentType": _COMPONENTS[values.dtype.name],
             "count": len(values),
             "type": kind,
         }

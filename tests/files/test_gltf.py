@@ -13,6 +13,7 @@ import trimesh
 from PIL import Image
 
 from orthoflow.files import gltf
+from orthoflow.files.geotiff import write_raster
 from orthoflow.files.gltf import write_page, write_room
 from tests.browser import browser
 from tests.ortho_file_scenes import CORNER, FLOOR_SHAPE, GSD_M, UP, WALL_SHAPE, colours, room
@@ -35,6 +36,36 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room")
     write_room(folder / "room.glb", room(folder / "files"), UP)
     return folder / "room.glb"
+
+
+@pytest.fixture(scope="module")
+def carved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same in relief: the right half of each wall stands out by a metre."""
+    folder = tmp_path_factory.mktemp("carved")
+    orthos, depths = room(folder / "files"), {}
+    for ortho in orthos:
+        depth_m = np.zeros(ortho.frame.shape, dtype=np.float32)
+        depth_m[:, ortho.frame.width // 2 :] = 1.0
+        depths[ortho.wall] = folder / f"depth_{ortho.wall}.tif"
+        write_raster(depths[ortho.wall], depth_m, gsd_m=GSD_M, tags={})
+    write_room(folder / "room.glb", orthos, UP, depths)
+    return folder / "room.glb"
+
+
+def test_relief_stands_out_towards_the_viewer(written: Path, carved: Path) -> None:
+    flat, high = (trimesh.load(path).geometry for path in (written, carved))
+    for name, mesh in high.items():
+        low, top = mesh.bounds
+        rectangle = flat[name].bounds
+        np.testing.assert_allclose([low[:2], top[:2]], rectangle[:, :2], atol=1e-6)
+        assert (low[2], top[2]) == (0.0, 1.0)
+        right = mesh.vertices[:, 0] > 0.51 * rectangle[1, 0]
+        assert (mesh.vertices[right, 2] == 1.0).all()
+        # trimesh counts v upwards from below.
+        middle = mesh.visual.uv - mesh.vertices[:, :2] / np.ptp(rectangle[:, :2], axis=0)
+        np.testing.assert_allclose(middle, np.tile([0.0, 1.0], (len(middle), 1)), atol=1e-5)
+        picture = mesh.visual.material.baseColorTexture
+        assert picture.size == flat[name].visual.material.baseColorTexture.size
 
 
 def test_another_program_finds_the_walls_where_they_are(written: Path) -> None:
@@ -89,20 +120,27 @@ def test_textures_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert np.abs(middle - whole).max() <= 2
 
 
-def test_accessors_stay_inside_their_views(written: Path) -> None:
-    told, binary = parts(written)
+@pytest.mark.parametrize("model", ["written", "carved"])
+def test_accessors_stay_inside_their_views(request: pytest.FixtureRequest, model: str) -> None:
+    told, binary = parts(request.getfixturevalue(model))
     assert told["buffers"] == [{"byteLength": len(binary)}]
     width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
     for entry in told["accessors"]:
         view = told["bufferViews"][entry["bufferView"]]
-        size = {5126: 4, 5123: 2}[entry["componentType"]] * width[entry["type"]] * entry["count"]
+        size = (
+            {5126: 4, 5125: 4, 5123: 2}[entry["componentType"]]
+            * width[entry["type"]]
+            * entry["count"]
+        )
         assert view["byteLength"] == size
         assert view["byteOffset"] % 4 == 0
     for view in told["bufferViews"]:
         assert view["byteOffset"] + view["byteLength"] <= len(binary)
 
 
-def test_a_page_shows_the_model_without_a_server(written: Path, tmp_path: Path) -> None:
+def test_a_page_shows_the_model_without_a_server(
+    written: Path, carved: Path, tmp_path: Path
+) -> None:
     page_file = tmp_path / "room.html"
     write_page(page_file, written)
     text = page_file.read_text()
@@ -130,6 +168,12 @@ def test_a_page_shows_the_model_without_a_server(written: Path, tmp_path: Path) 
             rows // 2 - 4 : rows // 2 + 4, columns // 2 - 4 : columns // 2 + 4
         ]
         assert np.abs(pixel - middle.mean(axis=(0, 1))).max() <= 12
+        write_page(tmp_path / "carved.html", carved)
+        page.open(tmp_path / "carved.html")
+        page.evaluate("new Promise(done => setTimeout(done, 1000))")
+        page.evaluate("show(0)")
+        drawn = "walls.map(w => [w.kind === gl.UNSIGNED_INT, w.count > 6, gl.getError()])"
+        assert page.evaluate(drawn) == [[True, True, 0]] * 2
         # What the browser says of a machine without a graphics card.
         of_machine = ("software WebGL", "ReadPixels")
         assert not [

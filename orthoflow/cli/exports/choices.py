@@ -31,6 +31,7 @@ class Choices:
         wall: number of the only wall that is meant.
         box: corners of the only part that is meant, as text.
         clean: without gross outliers.
+        relief: with the depths of walls.
     """
 
     cell: str | None = None
@@ -48,3 +49,4 @@ class Choices:
     wall: int | None = None
     box: str | None = None
     clean: bool = False
+    relief: bool = False

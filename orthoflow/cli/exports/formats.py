@@ -104,7 +104,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         writer="viewers:export_gltf",
         summary="the walls of the room with their orthoimages as a model that browsers open, "
         "room.glb",
-        options=frozenset({"cell", "wall"}),
+        options=frozenset({"cell", "wall", "relief"}),
     ),
     "tiles": Format(
         writer="viewers:export_tiles",
@@ -141,6 +141,7 @@ FLAGS: Final = {
     "wall": "--wall",
     "box": "--box",
     "clean": "--clean",
+    "relief": "--relief",
     "scale": "--scale",
     "paper": "--paper",
     "grid_m": "--grid",
