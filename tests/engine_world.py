@@ -14,8 +14,11 @@ from importlib.metadata import PathDistribution
 from importlib.util import cache_from_source
 from pathlib import Path
 
+import pytest
+
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, plan_run
+from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.engine.events import RunEvent
 from orthoflow.errors import OrthoflowError
 from orthoflow.workflow import expand_cells, load_workflow
@@ -75,17 +78,22 @@ class World:
 
 @contextmanager
 def toy_world(folder: Path) -> Iterator[World]:
-    """Install the toys below a folder and make them importable while the block runs."""
+    """Install the toys below a folder and make them importable while the block runs.
+
+    They need none of our kernels: their stores do not begin with all that tests have compiled.
+    """
     site = folder / "site"
     if not site.exists():
         install_toys(site)
-    sys.path.insert(0, str(site))
-    forget_toys()
-    try:
-        yield World(folder=folder, site=site)
-    finally:
-        sys.path.remove(str(site))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(KERNELS, str(site / "kernels"))
+        sys.path.insert(0, str(site))
         forget_toys()
+        try:
+            yield World(folder=folder, site=site)
+        finally:
+            sys.path.remove(str(site))
+            forget_toys()
 
 
 def digests(outcome: RunOutcome) -> dict[str, str]:

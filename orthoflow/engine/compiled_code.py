@@ -21,6 +21,8 @@ _SHARED: Final = f"*{CHECKED}*.nb[ci]"
 _ROOM_BYTES: Final = 500_000_000
 # Of the files that say of a method that its kernels are there; they hold no code.
 DONE: Final = ".foretold"
+# Written last when a folder begins with warm kernels: what is no younger lies there already.
+_BEGUN: Final = ".begun"
 
 
 def warm_folder() -> Path:
@@ -51,6 +53,7 @@ def begun_with_warm(folder: Path) -> Path:
         # Not their times: they are as young as the store.
         if warm.is_dir():
             shutil.copytree(warm, aside, copy_function=shutil.copyfile)
+            (aside / _BEGUN).touch()
         elif not _copy_state_before(aside):
             return folder
         place_folder(aside, folder)
@@ -99,6 +102,8 @@ def leave_for_others(folder: Path, since_ns: int) -> None:
         if "~" in shared.parts or (shared.exists() and shared.samefile(folder)):
             return
         found = [*folder.rglob(_SHARED), *folder.glob(f"*{DONE}")]
+        with suppress(FileNotFoundError):
+            since_ns = max(since_ns, (folder / _BEGUN).stat().st_mtime_ns + 1)
         new = [path for path in found if path.stat().st_mtime_ns >= since_ns]
         # Kernels, their indices, then what says of a method that all of its kernels are there.
         order = (".nbc", ".nbi", DONE)

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -132,6 +133,23 @@ def test_what_a_run_compiles_every_later_store_begins_with(tmp_path: Path, kerne
     assert found == {name: name.encode() for name in ("f.checked.nbi", "f.checked.1a.nbc")}
     other = begun_with_warm(tmp_path / "other" / "numba" / "abc")
     assert sorted(path.name for path in other.rglob("*.nb?")) == sorted(found)
+
+
+def test_what_a_store_began_with_is_not_left_once_more(tmp_path: Path, kernels: Path) -> None:
+    (kernels / "abc" / "plane_1").mkdir(parents=True)
+    names = ("f.checked.nbi", "f.checked.1a.nbc", "plane.x.foretold")
+    for name in names:
+        (kernels / "abc" / "plane_1" / name).write_bytes(b"here")
+    began = {path: path.stat().st_ino for path in kernels.rglob("*")}
+    folder = begun_with_warm(tmp_path / "store" / "numba" / "abc")
+    leave_for_others(folder, 0)
+    assert {path: path.stat().st_ino for path in kernels.rglob("*")} == began
+    # One that was damaged is compiled anew.
+    time.sleep(0.05)
+    (folder / "plane_1" / names[1]).write_bytes(b"anew")
+    leave_for_others(folder, 0)
+    assert (kernels / "abc" / "plane_1" / names[1]).read_bytes() == b"anew"
+    assert (kernels / "abc" / "plane_1" / names[0]).stat().st_ino in began.values()
 
 
 def test_the_conformance_suite_begins_with_kernels_of_runs_and_leaves_its_own(

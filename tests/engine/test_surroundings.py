@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.records import open_run, verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command
@@ -72,7 +73,8 @@ class Desk:
         return done.returncode, done.stderr
 
     def _variables(self, changed: Mapping[str, str | None] | None) -> dict[str, str]:
-        variables = {**os.environ, "PYTHONPATH": self.python_path, **(changed or {})}
+        own = {"PYTHONPATH": self.python_path, KERNELS: str(self.folder / "site" / "kernels")}
+        variables = {**os.environ, **own, **(changed or {})}
         return {name: value for name, value in variables.items() if value is not None}
 
     @property
