@@ -10,7 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -21,6 +21,7 @@ from ruamel.yaml.events import (
     SequenceEndEvent,
 )
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
+from ruamel.yaml.parser import Parser
 
 from orthoflow.products.product import JsonValue
 
@@ -179,8 +180,10 @@ def _compose(text: str, dialect: Dialect) -> Node:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
-            _check_size(text, dialect)
-            node: Node | None = YAML(typ="safe", pure=True).compose(text)
+            yaml = YAML(typ="safe", pure=True)
+            yaml.Parser = _LimitedParser
+            yaml.parser.most_values = dialect.most_values
+            node: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
         raise _unreadable(error) from error
     except YAMLError as error:
@@ -192,22 +195,40 @@ def _compose(text: str, dialect: Dialect) -> Node:
     return node
 
 
-def _check_size(text: str, dialect: Dialect) -> None:
-    # Events come one by one, so this stops early where composing would take minutes.
-    depth = n_nodes = 0
-    for event in YAML(typ="safe", pure=True).parse(text):
+class _LimitedParser(Parser):
+    """Hands events to the composer one by one; stops where composing would take minutes.
+
+    Attributes:
+        most_values: that a document may have.
+        depth: how many lists and mappings are open.
+        n_values: values so far, keys among them.
+    """
+
+    most_values = MOST_VALUES
+    depth = 0
+    n_values = 0
+
+    # Any: as in ruamel.yaml.
+    def get_event(self) -> Any:
+        """Give the next event.
+
+        Raises:
+            _UnreadableError: the document is too large or too deep.
+        """
+        event = super().get_event()
         if isinstance(event, MappingEndEvent | SequenceEndEvent):
-            depth -= 1
-            continue
-        n_nodes += isinstance(event, NodeEvent)
-        depth += isinstance(event, CollectionStartEvent)
-        if depth > DEEPEST or n_nodes > dialect.most_values:
+            self.depth -= 1
+            return event
+        self.n_values += isinstance(event, NodeEvent)
+        self.depth += isinstance(event, CollectionStartEvent)
+        if self.depth > DEEPEST or self.n_values > self.most_values:
             raise _UnreadableError(
                 _mark_position(event.start_mark),
                 f"the document is nested deeper than {DEEPEST} levels"
-                if depth > DEEPEST
-                else f"the document has more than {dialect.most_values} values",
+                if self.depth > DEEPEST
+                else f"the document has more than {self.most_values} values",
             )
+        return event
 
 
 def _mark_position(mark: object) -> Position:
