@@ -7,24 +7,30 @@ Loading takes most of the time of many a command. Reads orders from stdin, a JSO
 and `forgone`, numbers of rights of root that it gives up; answers each with the exit code. A
 command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
 what the interpreter reads from the environment when it starts is as it was when the first command
-was asked for.
+was asked for. Libraries that a command has loaded are loaded here before the next one, and the
+servers that steps are forked from serve all commands, unless they gave up rights.
 """
 
 from __future__ import annotations
 
 import atexit
 import ctypes
+import gc
+import importlib
 import json
 import os
 import select
+import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Final
 
+_LARGEST: Final = 4096
 _PR_CAPBSET_DROP: Final = 24
 _CAPABILITY_VERSION_3: Final = 0x20080522
 
@@ -52,7 +58,7 @@ def run_command(
             "streams": [*map(str, streams)],
             "forgone": [*forgone],
         }
-        server = _server(environment.get("PYTHONPATH", ""))
+        server = _server(_framework_path(environment.get("PYTHONPATH", "")))
         assert server.stdin is not None
         assert server.stdout is not None
         server.stdin.write(json.dumps(order) + "\n")
@@ -64,6 +70,13 @@ def run_command(
         code = int(server.stdout.readline())
         out, err = (path.read_text() for path in streams)
     return subprocess.CompletedProcess(words, code, out, err)
+
+
+def _framework_path(python_path: str) -> str:
+    """The folders of an import path that the framework comes from."""
+    names = ("orthoflow", "orthoflow_plugins", "orthoflow_provenance")
+    parts = python_path.split(os.pathsep)
+    return os.pathsep.join(p for p in parts if any(Path(p, name).is_dir() for name in names))
 
 
 @cache
@@ -88,20 +101,120 @@ def _serve() -> None:
     import orthoflow.cli
     import orthoflow.records
     import orthoflow.workflow
+    from orthoflow.report.pages import environment
 
+    for name in environment().list_templates(["j2"]):
+        environment().get_template(name)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    servers = _StepServers(ours)
     for line in sys.stdin:
+        gc.freeze()
         process = os.fork()
         if process == 0:
-            _become(json.loads(line))
+            ours.close()
+            _become(json.loads(line), theirs)
             # It ends through the interpreter, as any command does.
             orthoflow.cli.main()
-        code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        code = servers.serve_until_end(process)
         sys.stdout.write(f"{code}\n")
         sys.stdout.flush()
+        servers.load()
+
+
+@dataclass
+class _StepServers:
+    """The servers of steps that commands ask for.
+
+    Attributes:
+        asked: where commands ask.
+        wanted: libraries that commands have loaded.
+    """
+
+    asked: socket.socket
+    wanted: list[str] = field(default_factory=list)
+    _servers: dict[object, Any] = field(default_factory=dict)
+
+    def serve_until_end(self, command: int) -> int:
+        """Give a command what it asks for; its exit code."""
+        end = os.pidfd_open(command)
+        while True:
+            ready = select.select([end, self.asked], [], [])[0]
+            if self.asked in ready:
+                self._answer()
+            elif ready:
+                os.close(end)
+                return os.waitstatus_to_exitcode(os.waitpid(command, 0)[1])
+
+    def load(self) -> None:
+        """Load what commands have loaded, for those that follow."""
+        for name in self.wanted:
+            importlib.import_module(name)
+        self.wanted.clear()
+
+    def _answer(self) -> None:
+        from orthoflow.engine import step_processes
+
+        message, descriptors, _, _ = socket.recv_fds(self.asked, _LARGEST, 1)
+        if not descriptors:
+            self.wanted += [name for name in json.loads(message) if name not in sys.modules]
+            return
+        with os.fdopen(descriptors[0], "rb") as file:
+            variables = json.load(file)
+        key = step_processes._read_at_loading(variables)
+        server = self._servers.get(key)
+        if server is None or server.process.poll() is not None:
+            log = os.open(os.devnull, os.O_WRONLY)
+            server = self._servers[key] = step_processes._start_server(variables, log)
+            os.close(log)
+        pid = str(server.process.pid).encode()
+        socket.send_fds(self.asked, [pid], [server.control.fileno()])
+
+
+@dataclass(frozen=True)
+class _Elsewhere:
+    """The process of a server that others use, too, as `step_processes` sees its own."""
+
+    pid: int
+
+    def poll(self) -> int | None:
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return 0
+        return None
+
+    def kill(self) -> None:
+        """Leave it to others."""
+
+    def wait(self) -> int:
+        return 0
+
+
+def _share_servers(parent: socket.socket) -> None:
+    """Let this command ask its parent for servers of steps, and tell it at its end what it has."""
+    from orthoflow.engine import fork_server, step_processes
+
+    def ask(variables: Mapping[str, str], _: int) -> Any:
+        with os.fdopen(os.memfd_create("variables"), "w+") as file:
+            json.dump(dict(variables), file)
+            file.seek(0)
+            socket.send_fds(parent, [b"server"], [file.fileno()])
+        pid, descriptors, _, _ = socket.recv_fds(parent, _LARGEST, 1)
+        control = socket.socket(fileno=descriptors[0])
+        return step_processes._Server(_Elsewhere(int(pid)), control)  # type: ignore[arg-type]
+
+    def tell() -> None:
+        if os.getpid() == command:
+            names = [name for name in fork_server._LIBRARIES if name in sys.modules]
+            parent.send(json.dumps(names).encode())
+
+    command = os.getpid()
+    atexit.register(tell)
+    step_processes._start_server = ask
 
 
 # Any: an order is JSON that this module wrote itself.
-def _become(order: dict[str, Any]) -> None:
+def _become(order: dict[str, Any], parent: socket.socket) -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     out, err = (os.open(path, os.O_WRONLY | os.O_CREAT) for path in order["streams"])
     for descriptor, replaced in ((nothing, 0), (out, 1), (err, 2)):
@@ -109,10 +222,14 @@ def _become(order: dict[str, Any]) -> None:
         os.close(descriptor)
     if order["forgone"]:
         _forgo(order["forgone"])
+    else:
+        _share_servers(parent)
+    framework = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])
-    sys.path[0] = str(Path.cwd())
+    given = filter(None, order["environment"].get("PYTHONPATH", "").split(os.pathsep))
+    sys.path[:] = [str(Path.cwd()), *given, *sys.path[1 + len([*framework]) :]]
     sys.path_importer_cache.clear()
     sys.argv[:] = ["orthoflow", *order["arguments"]]
 

@@ -51,7 +51,9 @@ def test_the_process_that_a_method_forked_gives_no_result(world: World) -> None:
     assert result_of(outcome, "forks").cpu_s >= 0.0
 
 
-def test_what_a_method_says_is_bounded(world: World) -> None:
+def test_what_a_method_says_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    # One that never ends shall not go on long.
+    monkeypatch.setattr("orthoflow.engine.local_executor._GRACE_S", 0.3)
     outcome = all_of(world, "long_line", "never_silent", "prints_much", "replaces_log")
     flood = result_of(outcome, "never_silent")
     assert "ran past its timeout of 2 s" in flood.error_message

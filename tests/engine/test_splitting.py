@@ -178,7 +178,8 @@ def test_a_damaged_part_is_computed_again(world: World, file: str) -> None:
     assert in_parts(world, 5, into="run").outputs == whole.outputs
 
 
-def test_a_part_that_takes_too_long_is_named(world: World) -> None:
+def test_a_part_that_takes_too_long_is_named(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("orthoflow.engine.local_executor._GRACE_S", 0.3)
     steps = STEPS.replace("in: {rows: first.rows}}", "in: {rows: first.rows}, timeout: 1s}")
     outcome = world.run(steps, sets=("told.wait_s=9",), parts=2, jobs=2)
     said = outcome.results["told"].error_message

@@ -149,10 +149,8 @@ def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
     name = 'Стена «"Восток"», d\'été $HOME `x` %s {0} [1] *'
     desk = desk_in(tmp_path / name / name / name / name)
     assert len(str(desk.folder)) > 200
-    code, said = desk.run(environment={"HOME": str(desk.folder)})
-    assert code == 0, said
-    check_finished(desk)
     for command in (
+        ("run", "toy.yaml", "-o", "run"),
         ("report", "run"),
         ("verify", "run"),
         ("export", "run", "--to", "ro-crate", "-o", "crate"),
@@ -162,6 +160,7 @@ def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
     ):
         code, said = desk.forked(*command, environment={"HOME": str(desk.folder)})
         assert code == 0, said
+    check_finished(desk)
     check_finished(desk, "again")
 
 
@@ -235,7 +234,7 @@ def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None
     if code != 0:
         assert code in (1, 4), said
         check_sentence(said)
-        assert desk.run()[0] == 0
+        assert desk.forked("run", "toy.yaml", "-o", "run")[0] == 0
     check_finished(desk)
 
 
@@ -254,7 +253,7 @@ def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> 
         check_sentence(said.replace(" failed: ", "error: ") if has_ended else said)
         assert "memory" in said or not has_ended
         name = "again" if has_ended else "run"
-        assert desk.run(name)[0] == 0
+        assert desk.forked("run", "toy.yaml", "-o", name)[0] == 0
     check_finished(desk, name)
 
 
@@ -267,7 +266,7 @@ def test_files_from_the_future_are_taken_as_any_others(used_desk: Desk) -> None:
         if path.is_file():
             state = path.stat()
             os.utime(path, (state.st_atime + YEAR_S, state.st_mtime + YEAR_S))
-    code, said = desk.run("second")
+    code, said = desk.forked("run", "toy.yaml", "-o", "second")
     assert code == 0, said
     assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
     for command in (("cache", "verify"), ("cache", "list"), ("cache", "gc", "--older-than", "1")):
