@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import image_quality
 from orthoflow_plugins.inspect.image_quality import (
     OrthoimageGrey,
     cells_per_pixel,
@@ -168,3 +169,8 @@ def test_only_cells_that_a_photo_painted_are_asked() -> None:
     assert len(cells_per_pixel(made, wall(depth), ("a.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("b.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("c.jpg", view))) == 0
+
+
+def test_an_edge_is_looked_at_as_far_on_either_side_of_it() -> None:
+    np.testing.assert_allclose(image_quality._ALONG, -image_quality._ALONG[::-1], atol=1e-12)
+    np.testing.assert_allclose(np.diff(image_quality._ALONG), np.diff(image_quality._ALONG)[0])
