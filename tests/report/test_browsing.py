@@ -130,7 +130,9 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
     run = HeldRun(path=tmp_path / "run.h5", record=told)
     assert module._metrics(run)["rms_mm"] == module._metrics(run)["check.rms_mm"] == 2.0
-    facts = module._of_run(tmp_path, run).facts
+    summary = module._of_run(tmp_path, run)
+    facts, labels = summary.facts, summary.labels
+    assert labels["rms_mm"] == labels["check.rms_mm"] == "check points, RMS"
     assert {name: facts[name] for name in facts if name.endswith("tries")} == {
         "check@data=hall.tries": 0,
         "check@data=stairs.tries": 1,
