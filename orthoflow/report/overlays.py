@@ -78,7 +78,9 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
     """
     places = embedded_products(run, "cameras")
     n_places = len(places) + len(embedded_products(run, "inspection"))
-    frames = _Frames.of(run, walls, share=share / max(1, n_places))
+    if not n_places:
+        return
+    frames = _Frames.of(run, walls, share=share / n_places)
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         cameras = Cameras.from_payload(payload)
         if cameras.ties is not None:
