@@ -65,3 +65,13 @@ def test_the_nearest_wall_is_that_of_the_nearest_rectangle(
 
 def test_without_walls_no_wall_is_nearest() -> None:
     assert walls().nearest(np.zeros((3, 3))).tolist() == [-1, -1, -1]
+
+
+def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:
+    frame = samples.facing_east(0.5, 4, 2, (0.0, 0.0, 1.0))
+    rgb = np.zeros((*frame.shape, 3), dtype=np.uint8)
+    known = [
+        samples.orthoimage(frame, wall=2, rgb=rgb, plane_index=plane).number
+        for plane in (None, 0, 7)
+    ]
+    assert known == [2, 0, 7]

@@ -63,6 +63,13 @@ def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() ->
     assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "WORST"]
 
 
+def test_with_repeats_their_spread_alone_says_what_differs() -> None:
+    near, far = of(100.0, 0.1), of(200.0, 0.1)
+    # Half a hundredth, and five times as much as both scatter.
+    assert marks(near, of(100.5, 0.1), far) == ["BEST", "NONE", "WORST"]
+    assert marks(of(100.0), of(100.5), of(200.0)) == ["NEAR", "NEAR", "WORST"]
+
+
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
     for spread in (math.nan, 0.01):
         times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
