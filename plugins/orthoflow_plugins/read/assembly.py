@@ -92,6 +92,8 @@ class CloudAssembly:
         n_intensity_lost: intensities that are not finite.
     """
 
+    origin: NDArray[np.float64]
+
     def __init__(
         self,
         ctx: StepContext,
@@ -121,7 +123,6 @@ class CloudAssembly:
         self._grid = [self._new(name, np.uint32) for name in ("row", "column")] if grid else []
         self._scan: NDArray[Any] | None = None
         self._scans: list[ScanSummary] = []
-        self.origin: NDArray[np.float64] = np.zeros(3)
         self.n_points = 0
         self.files: list[FileCount] = []
         self.intensity_range = (np.inf, -np.inf)
