@@ -287,7 +287,7 @@ def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
     if params.gains != "none":
         cameras = {item.photo: item for item in inputs.cameras.cameras if item.status == "ok"}
         seen = [cameras.get(layer.source) for layer in painters]
-        balance = balance_of(painters, wall, seen)
+        balance = balance_of(painters, wall, seen, is_local=params.local_balance)
         if balance is not None:
             balance = with_seams(balance, image.source, wall, feather_cells=params.feather_cells)
     made = coloured(painters, image.source, balance, allocate=in_memory)
