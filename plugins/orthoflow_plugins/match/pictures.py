@@ -182,11 +182,18 @@ def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
     )
 
 
-def points_on_wall(wall: Wall, pixels_wall: NDArray[np.float64]) -> WallPoints:
+def points_on_wall(
+    wall: Wall, pixels_wall: NDArray[np.float64], *, usual_m: float | None = None
+) -> WallPoints:
     """Lift positions (n, 2) = (column, row) of a wall's raster onto its surface.
 
     Between cells the depth is interpolated where the surface is smooth; at an edge of the relief
     the nearest cell's depth holds, with the step in its standard deviation.
+
+    Args:
+        wall: the wall.
+        pixels_wall: the positions.
+        usual_m: what `usual_spread_m` says of the wall, where it has been asked before.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -199,18 +206,25 @@ def points_on_wall(wall: Wall, pixels_wall: NDArray[np.float64]) -> WallPoints:
     depth = np.where(np.isfinite(depth), depth, nearest)
     return WallPoints(
         points_world=wall.frame.world_from_wall(pixels_wall, depth),
-        sigma_m=_sigma_m(wall, (centre_row, centre_column), np.where(smooth, 0.0, spread)),
+        sigma_m=_sigma_m(
+            wall,
+            (centre_row, centre_column),
+            np.where(smooth, 0.0, spread),
+            usual_spread_m(wall) if usual_m is None else usual_m,
+        ),
         known=np.isfinite(nearest),
     )
 
 
 def _sigma_m(
-    wall: Wall, cell: tuple[NDArray[np.intp], NDArray[np.intp]], step_m: NDArray[np.float64]
+    wall: Wall,
+    cell: tuple[NDArray[np.intp], NDArray[np.intp]],
+    step_m: NDArray[np.float64],
+    usual: float,
 ) -> NDArray[np.float64]:
     gsd_m = wall.frame.gsd_m
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     spread = wall.sigma_m[cell].astype(np.float64)
-    usual = usual_spread_m(wall)
     spread = np.where(np.isfinite(spread) & (count > 1.0), spread, usual)
     # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
     noise = np.maximum(spread / np.sqrt(count), 0.3 * usual)

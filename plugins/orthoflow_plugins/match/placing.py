@@ -22,7 +22,7 @@ from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Photo, Wall
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
-from orthoflow_plugins.match.pictures import photo_rgb, points_on_wall
+from orthoflow_plugins.match.pictures import photo_rgb, points_on_wall, shrunk
 from orthoflow_plugins.match.structures import (
     PHOTO_SIDE_PX,
     Place,
@@ -181,15 +181,21 @@ def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
         walls: the walls.
     """
     rgb = photo_rgb(photo)
+    shot = (index, photo, shrunk(rgb, _shrinking(photo.width, photo.height)))
     upright = _QUARTERS.get(photo.exif_orientation, 0)
     best: list[Placed] = []
     for turn_deg in _turns_deg(photo):
-        found = _places_turned((index, photo, rgb), walls, turned(rgb, 90.0 * upright + turn_deg))
+        found = _places_turned(shot, walls, turned(rgb, 90.0 * upright + turn_deg))
         if not best or (found and found[0].share > best[0].share):
             best = found
         if best and best[0].is_clear:
             break
     return best
+
+
+def _shrinking(width: int, height: int) -> float:
+    """By how much a photo is shrunk, once, for all that is done with it."""
+    return min(1.0, PHOTO_SIDE_PX / max(width, height))
 
 
 def _turns_deg(photo: Photo) -> Sequence[float]:
@@ -204,8 +210,8 @@ def _turns_deg(photo: Photo) -> Sequence[float]:
 def _places_turned(
     shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, upright: TurnedPhoto
 ) -> list[Placed]:
-    """Places of a photo that stands upright when it is turned so."""
-    index, photo, rgb = shot
+    """Places of a photo, shrunk, that stands upright when it is turned so."""
+    index, photo, small = shot
     likely = [
         (at, structure, place)
         for at, structure in enumerate(walls.structures())
@@ -215,9 +221,9 @@ def _places_turned(
     found: list[Placed] = []
     for at, structure, place in sorted(likely, key=lambda each: -each[2].lead)[:_PLACES]:
         lens, freedom = _lens_before(photo)
-        camera = _camera_at(place, structure.wall, lens, upright)
+        camera = _camera_at(place, structure, lens, upright)
         if camera is not None:
-            placed = _tied((index, at), rgb, (camera, freedom), structure)
+            placed = _tied((index, at), small, (camera, freedom), structure)
             if placed is not None:
                 found.append(replace(placed, lead=place.lead))
     found.sort(key=lambda each: -each.share)
@@ -261,10 +267,10 @@ def _lens_before(photo: Photo) -> tuple[ViewingCamera, LensFreedom]:
 
 
 def _camera_at(
-    place: Place, wall: Wall, lens: ViewingCamera, upright: TurnedPhoto
+    place: Place, structure: WallStructure, lens: ViewingCamera, upright: TurnedPhoto
 ) -> ViewingCamera | None:
     """Pose by the places of the photo's parts, from straight before the wall."""
-    frame = wall.frame
+    wall, frame = structure.wall, structure.wall.frame
     axes = upright.axes @ np.array([frame.u_world, frame.v_world])
     # Right, down and into the wall.
     rotation = np.array([*axes, -frame.normal_world])
@@ -278,7 +284,7 @@ def _camera_at(
         translation=-rotation @ (middle + lens.fx / px_per_m * frame.normal_world),
     )
     pixels = place.parts_m / frame.gsd_m
-    lifted = points_on_wall(wall, pixels)
+    lifted = points_on_wall(wall, pixels, usual_m=structure.usual_spread_m)
     # On the plane where the wall is void.
     points = np.where(lifted.known[:, None], lifted.points_world, frame.world_from_wall(pixels))
     seen = SeenPoints(
@@ -295,24 +301,31 @@ def _camera_at(
 
 def _tied(
     at: tuple[int, int],
-    rgb: NDArray[np.uint8],
+    small: NDArray[np.uint8],
     start: tuple[ViewingCamera, LensFreedom],
     structure: WallStructure,
 ) -> Placed | None:
-    """Ties of a photo with a wall, its pose improved round by round."""
+    """Ties of a photo, given shrunk, with a wall, its pose improved round by round."""
     wall, origin = structure.wall, structure.wall.frame.origin_world
     camera, freedom = start
     prior = camera
+    scale = _shrinking(camera.width, camera.height)
     placed: Placed | None = None
     for radius in _RADII:
         projection = project_walls(camera, [wall])[0]
         if projection is None:
             return None
-        shown = warp_photo(rgb, projection)
+        in_small = replace(
+            projection,
+            u=projection.u * np.float32(scale),
+            v=projection.v * np.float32(scale),
+            pixels_per_cell=projection.pixels_per_cell * scale,
+        )
+        shown = warp_photo(small, in_small)
         other = structure_of(shown / np.float32(255.0), np.asarray(np.isfinite(shown).all(axis=2)))
         own = structure.channels.part(projection.part)
         moved = _measured(own, other, radius)
-        piece = _piece(at, wall, moved, projection)
+        piece = _piece(at, structure, moved, projection)
         if len(piece) < _FIT_LEAST:
             return None
         seen = SeenPoints(
@@ -363,11 +376,12 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
 
 
 def _piece(
-    at: tuple[int, int], wall: Wall, moved: Displacements, projection: Projection
+    at: tuple[int, int], structure: WallStructure, moved: Displacements, projection: Projection
 ) -> TiePiece:
     places = moved.places + moved.shift_cells
     pixels = np.column_stack([between(projection.u, places), between(projection.v, places)])
-    points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
+    cells = moved.places + projection.corner + np.float64(0.5)
+    points = points_on_wall(structure.wall, cells, usual_m=structure.usual_spread_m)
     piece = TiePiece(
         photo=at[0],
         wall=at[1],

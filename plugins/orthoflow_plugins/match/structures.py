@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.robust import NMAD_FACTOR
 from orthoflow.products import Wall
 from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.pictures import filled_smoothly
+from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
 # The shorter side of a wall has so many cells, unless it is rastered more coarsely.
 _CELLS: Final = 200.0
@@ -56,14 +56,29 @@ class WallStructure:
     Attributes:
         wall: in cells of this size.
         channels: its structure.
-        spectra: (c, ...) complex64 of the channels.
-        energy: likewise, of their squares' sum.
-        padded: rows and columns that the spectra were computed with.
+        layers: (c, rows, cols) float32 of the channels.
+        energy: (rows, cols) float32 of their squares' sum.
+        usual_spread_m: as `usual_spread_m` gives it.
     """
 
     wall: Wall
     channels: Channels
-    spectra: NDArray[np.complex64]
+    layers: NDArray[np.float32]
+    energy: NDArray[np.float32]
+    usual_spread_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Spectra:
+    """A wall's structure as parts of a size are correlated with it.
+
+    Attributes:
+        layers: (c, ...) complex64 of the channels, conjugated.
+        energy: likewise, of their squares' sum.
+        padded: rows and columns that they were computed with.
+    """
+
+    layers: NDArray[np.complex64]
     energy: NDArray[np.complex64]
     padded: tuple[int, int]
 
@@ -89,8 +104,6 @@ class Place:
 
 def wall_structure(wall: Wall) -> WallStructure | None:
     """Prepare a wall; None where it shows nothing."""
-    from scipy import fft
-
     if wall.intensity is None or not np.isfinite(wall.intensity).any():
         return None
     factor = max(1, round(min(wall.frame.shape) / _CELLS))
@@ -100,16 +113,13 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     known = np.isfinite(coarse.depth_m) & np.isfinite(coarse.intensity)
     relief = coarse.depth_m / np.float32(_STEP_M)
     channels = structure_of(np.stack([coarse.intensity, relief], axis=-1), known)
-    shape = coarse.frame.shape
-    padded = tuple(int(fft.next_fast_len(length + _PART_MOST_CELLS, real=True)) for length in shape)
-    layers = np.moveaxis(channels.values, -1, 0)
-    energy = np.einsum("cij,cij->ij", layers, layers)
+    layers = np.ascontiguousarray(np.moveaxis(channels.values, -1, 0))
     return WallStructure(
         wall=coarse,
         channels=channels,
-        spectra=np.asarray(fft.rfft2(layers, padded), dtype=np.complex64),
-        energy=np.asarray(fft.rfft2(energy, padded), dtype=np.complex64),
-        padded=(padded[0], padded[1]),
+        layers=layers,
+        energy=np.einsum("cij,cij->ij", layers, layers),
+        usual_spread_m=usual_spread_m(coarse),
     )
 
 
@@ -177,7 +187,7 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
     shrink = min(1.0, PHOTO_SIDE_PX / max(rgb.shape[:2]))
     small = cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     found = []
-    for width in _widths_cells(rgb.shape, wall.wall.frame.shape):
+    for width in _widths_cells(rgb.shape, wall.energy.shape):
         height = round(width * rgb.shape[0] / rgb.shape[1])
         picture = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
         found.append(_best_at(picture.astype(np.float32) / np.float32(255.0), wall))
@@ -188,7 +198,7 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
     return places
 
 
-def _widths_cells(photo: Sequence[int], wall: tuple[int, int]) -> list[int]:
+def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
     """Widths in cells that a photo is tried at."""
     height, width = photo[0], photo[1]
     least = _SIZES[0] * min(wall) * width / max(height, width)
@@ -216,36 +226,37 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
+    spectra = _padded(wall, (side[0] + 2 * slip, side[1] + 2 * slip))
     # Of all parts alike.
-    under = _energy_under(side, wall)
+    under = _energy_under(side, spectra)
     maps = [
-        _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
+        _part_map(channels[:, top : top + side[0], left : left + side[1]], under, spectra)
         for top, left in corners
     ]
-    kernel = np.ones((2 * slip + 1, 2 * slip + 1), dtype=np.uint8)
-    total = np.zeros(wall.padded, dtype=np.float32)
-    for part, corner in zip(maps, corners, strict=True):
-        total += np.roll(cv2.dilate(part, kernel), (-corner[0], -corner[1]), (0, 1))
     # Where the photo's corner is when its centre is on the wall.
     rows, columns = (
         np.arange(n) - m // 2 for n, m in zip(wall.wall.frame.shape, (height, width), strict=True)
     )
-    scores = total[np.ix_(rows % wall.padded[0], columns % wall.padded[1])]
+    kernel = np.ones((2 * slip + 1, 2 * slip + 1), dtype=np.uint8)
+    scores = np.zeros(wall.wall.frame.shape, dtype=np.float32)
+    for part, (top, left) in zip(maps, corners, strict=True):
+        at = np.ix_((rows + top) % spectra.padded[0], (columns + left) % spectra.padded[1])
+        scores += cv2.dilate(part, kernel)[at]
     usual = float(np.median(scores))
     spread = NMAD_FACTOR * float(np.median(np.abs(scores - usual)))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
-    at = (int(rows[row]), int(columns[column]))
+    best = (int(rows[row]), int(columns[column]))
     half = 0.5 * np.array([side[1], side[0]])
     found = np.array(
         [
-            _slipped(part, (at[0] + corner[0], at[1] + corner[1]), slip) + half
+            _slipped(part, (best[0] + corner[0], best[1] + corner[1]), slip) + half
             for part, corner in zip(maps, corners, strict=True)
         ]
     )
     middles = np.array([[left, top] for top, left in corners]) + half
     return Place(
         centre_m=wall.wall.frame.gsd_m
-        * (np.array([at[1], at[0]]) + 0.5 * np.array([width, height])),
+        * (np.array([best[1], best[0]]) + 0.5 * np.array([width, height])),
         width_m=wall.wall.frame.gsd_m * width,
         lead=(float(scores.max()) - usual) / max(spread, 1e-9),
         parts_photo=middles / [width, height],
@@ -253,7 +264,23 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
     )
 
 
-def _energy_under(side: tuple[int, int], wall: WallStructure) -> NDArray[np.float32]:
+def _padded(wall: WallStructure, side: tuple[int, int]) -> _Spectra:
+    """Spectra of a wall, so wide that parts of a size lie beside it before they meet it again."""
+    from scipy import fft
+
+    rows, columns = (
+        int(fft.next_fast_len(length + more + 1, real=True))
+        for length, more in zip(wall.energy.shape, side, strict=True)
+    )
+    layers = _spectrum(wall.layers, (rows, columns))
+    return _Spectra(
+        layers=np.conj(layers, out=layers),
+        energy=_spectrum(wall.energy[None], (rows, columns))[0],
+        padded=(rows, columns),
+    )
+
+
+def _energy_under(side: tuple[int, int], wall: _Spectra) -> NDArray[np.float32]:
     """Energy of the wall under a part of a size, at every place of its corner (wrapped)."""
     from scipy import fft
 
@@ -262,15 +289,15 @@ def _energy_under(side: tuple[int, int], wall: WallStructure) -> NDArray[np.floa
 
 
 def _part_map(
-    part: NDArray[np.float32], under: NDArray[np.float32], wall: WallStructure
+    part: NDArray[np.float32], under: NDArray[np.float32], wall: _Spectra
 ) -> NDArray[np.float32]:
     """Correlation of a part of a photo with the wall, at every place of its corner (wrapped)."""
     from scipy import fft
 
     own = float(np.einsum("cij,cij->", part, part))
     spectra = _spectrum(part, wall.padded)
-    spectrum = np.einsum("cij,cij->ij", wall.spectra, np.conj(spectra, out=spectra))
-    cross = fft.irfft2(spectrum, wall.padded)
+    spectrum = np.multiply(spectra, wall.layers, out=spectra).sum(axis=0)
+    cross = fft.irfft2(np.conj(spectrum, out=spectrum), wall.padded)
     norm = np.sqrt(max(own, 1e-9) * np.maximum(under, max(_ENERGY_LEAST * own, 1e-9)))
     return np.asarray(cross / norm, dtype=np.float32)
 

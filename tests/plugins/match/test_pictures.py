@@ -70,12 +70,13 @@ def test_the_accuracy_of_a_point_is_that_of_its_cell_and_its_place_in_it() -> No
     places = np.array([[5.5, 7.5], [6.5, 7.5], [7.5, 7.5], [8.5, 7.5]])
     in_cell_m = 0.5 * GSD_M / math.sqrt(12.0)
     # The usual spread is 2 mm; the mean of many is no better than 0.3 of it.
-    noises_m = (0.008 / 4.0, 0.002, 0.002 / 2.0, 0.3 * 0.002)
-    np.testing.assert_allclose(
-        pictures.points_on_wall(of, places).sigma_m,
-        [math.hypot(noise_m, in_cell_m) for noise_m in noises_m],
-        rtol=1e-6,
-    )
+    for usual_m, told_m in ((0.002, None), (0.002, 0.002), (0.005, 0.005)):
+        noises_m = (0.008 / 4.0, usual_m, usual_m / 2.0, 0.3 * usual_m)
+        np.testing.assert_allclose(
+            pictures.points_on_wall(of, places, usual_m=told_m).sigma_m,
+            [math.hypot(noise_m, in_cell_m) for noise_m in noises_m],
+            rtol=1e-6,
+        )
 
 
 def test_a_wall_of_unknown_spread_is_as_accurate_as_half_a_cell() -> None:

@@ -15,6 +15,7 @@ from orthoflow_plugins.match.structures import (
     _coarser,
     _energy_under,
     _is_elsewhere,
+    _padded,
     _part_map,
     _slipped,
     _widths_cells,
@@ -119,16 +120,21 @@ def test_a_part_is_compared_with_what_lies_under_it_everywhere(structure: WallSt
     channels = np.moveaxis(structure.channels.values, -1, 0).astype(np.float64)
     height, width = channels.shape[1:]
     part = channels[:, 40:75, 60:110] + RNG.normal(0.0, 0.2, (5, 35, 50))
-    under_it = _energy_under((35, 50), structure)
-    found = _part_map(part.astype(np.float32), under_it, structure)
+    spectra = _padded(structure, (35, 50))
+    under_it = _energy_under((35, 50), spectra)
+    found = _part_map(part.astype(np.float32), under_it, spectra)
+    # Hardly larger than the wall and a part: each place once.
+    assert np.all(found.shape > np.array([height + 35, width + 50]))
+    assert found.size < 1.3 * (height + 35) * (width + 50)
     own = float((part**2).sum())
     places = [(40, 60), (0, 0), (11, 7), (height - 35, width - 50), (height - 9, 5)]
-    for row, column in places:
-        under = channels[:, row : row + 35, column : column + 50]
-        mine = part[:, : under.shape[1], : under.shape[2]]
+    # Beside the wall, too.
+    around = np.pad(channels, ((0, 0), (35, 35), (50, 50)))
+    for row, column in [*places, (-20, 30), (-35, -50), (-7, width), (height, 12)]:
+        under = around[:, row + 35 : row + 70, column + 50 : column + 100]
         # What lies beside the wall counts as a quarter of the part itself, at least.
         energy = max(float((under**2).sum()), 0.25 * own)
-        expected = float((mine * under).sum()) / math.sqrt(own * energy)
+        expected = float((part * under).sum()) / math.sqrt(own * energy)
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
     assert np.unravel_index(found.argmax(), found.shape) == (40, 60)
 
