@@ -249,3 +249,31 @@ def test_a_rough_hypothesis_is_polished_to_the_points_near_it(model: str) -> Non
     offset_m = float(polished.offsets_m[0]) * np.sign(polished.normals[0, 1])
     assert offset_m + float(fine @ over._centre_m) == pytest.approx(2.0, abs=1e-3)
     assert 0.003 < own_m < 0.012
+
+
+def test_good_hypotheses_stay_for_the_next_plane_and_half_as_many_are_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = unassigned()
+    over = ConsensusProposer(left, search(n_hypotheses=200, family="any"), np.random.default_rng(0))
+    over._draw(left)
+    before = over._pool
+    assert before is not None
+    asked: list[int] = []
+
+    def none_drawn(_points: object, count: int, *_: object) -> Hypotheses:
+        asked.append(count)
+        return Hypotheses(normals=np.zeros((0, 3)), offsets_m=np.zeros(0))
+
+    monkeypatch.setattr(consensus, "draw_hypotheses", none_drawn)
+    # What lies on the wall is gone: others are worth more now.
+    left.claims[:] = np.where(np.abs(left.sample.offsets_m[:, 1] - 2.0) < 0.02, 0, -1)
+    over._draw(left)
+    after = over._pool
+    assert after is not None
+    assert asked == [100]
+    assert {tuple(row) for row in after.hypotheses.rows().tolist()} <= {
+        tuple(row) for row in before.hypotheses.rows().tolist()
+    }
+    assert len(after.asked_m) < 0.5 * len(before.asked_m)
+    assert after.scores.value[0] < before.scores.value[0]
