@@ -277,3 +277,20 @@ def test_good_hypotheses_stay_for_the_next_plane_and_half_as_many_are_drawn(
     }
     assert len(after.asked_m) < 0.5 * len(before.asked_m)
     assert after.scores.value[0] < before.scores.value[0]
+
+
+def test_what_was_rejected_is_looked_at_again_by_the_points_that_are_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = unassigned()
+    over = ConsensusProposer(left, search(n_hypotheses=60), np.random.default_rng(0))
+    told: list[np.ndarray] = []
+    monkeypatch.setattr(over._rejections, "take", told.append)
+    monkeypatch.setattr(over, "_best", lambda _: "found")
+    left.claims[::3] = 0
+    assert over.propose(left) == "found"
+    assert over.propose(left) == "found"
+    # Once, as long as nothing is taken.
+    (free,) = told
+    np.testing.assert_array_equal(free, left.claims[over._witnesses] < 0)
+    assert free.mean() == pytest.approx(2 / 3, abs=1e-3)
