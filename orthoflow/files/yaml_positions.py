@@ -22,6 +22,7 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 from ruamel.yaml.parser import Parser
+from ruamel.yaml.scanner import Scanner
 
 from orthoflow.products.product import JsonValue
 
@@ -29,6 +30,8 @@ DEEPEST: Final = 60
 MOST_DIGITS: Final = 1000
 MOST_VALUES: Final = 10_000
 _LONGEST_SHOWN: Final = 100
+# Letters, by YAML's own rule.
+_LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
 _MERGE: Final = "<<"
 
@@ -181,7 +184,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
             yaml = YAML(typ="safe", pure=True)
-            yaml.Parser = _LimitedParser
+            yaml.Scanner, yaml.Parser = _QuickScanner, _LimitedParser
             yaml.parser.most_values = dialect.most_values
             node: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
@@ -193,6 +196,18 @@ def _compose(text: str, dialect: Dialect) -> Node:
     if node is None:
         raise _UnreadableError(_START, dialect.empty)
     return node
+
+
+class _QuickScanner(Scanner):
+    """Looks only once per token how far it has read, however many brackets are open."""
+
+    def stale_possible_simple_keys(self) -> None:
+        """Forget what cannot be a key any more."""
+        line, index = self.reader.line, self.reader.index
+        for key in self.possible_simple_keys.values():
+            if key.line != line or index - key.index > _LONGEST_KEY:
+                super().stale_possible_simple_keys()
+                return
 
 
 class _LimitedParser(Parser):
