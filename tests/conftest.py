@@ -7,11 +7,10 @@ import hashlib
 import os
 import sys
 import tempfile
-from base64 import b64decode
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import pytest
 from _pytest.doctest import DoctestModule
@@ -21,6 +20,7 @@ from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.long_loops import IS_LONG
 from tests.memory_folder import has_room, in_memory
+from tests.undrawn_charts import FIGURE, keep_dot
 
 if TYPE_CHECKING:
     from tests.engine_world import World
@@ -72,13 +72,6 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("everywhere")
-
-# A PNG of one pixel.
-_DOT: Final = b64decode(
-    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
-)
-
-_FIGURE: Final = StepContext.figure
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -163,20 +156,15 @@ def _open3d() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _undrawn_charts() -> Iterator[None]:
-    """Keep a dot in the place of every chart: drawing takes longer than what most tests look at."""
-
-    def figure(self: StepContext, name: str, content: bytes | Drawing, caption: str = "") -> None:
-        _FIGURE(self, name, content if isinstance(content, bytes) else _DOT, caption)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(StepContext, "figure", figure)
+        patch.setattr(StepContext, "figure", keep_dot)
         yield
 
 
 @pytest.fixture
 def charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw charts in this test all the same."""
-    monkeypatch.setattr(StepContext, "figure", _FIGURE)
+    monkeypatch.setattr(StepContext, "figure", FIGURE)
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@
 
 Loading takes most of the time of many a command. Reads orders from stdin, a JSON object per line:
 `arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
-and `forgone`, numbers of rights of root that it gives up; answers each with the exit code. A
-command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
+`forgone`, numbers of rights of root that it gives up, and `draws`; answers each with the exit code.
+A command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
 what the interpreter reads from the environment when it starts is as it was when the first command
 was asked for. Libraries that a command has loaded are loaded here before the next one, and the
 servers that steps are forked from serve all commands, unless they gave up rights.
@@ -42,8 +42,11 @@ def run_command(
     timeout_s: float = 300,
     *,
     forgone: Sequence[int] = (),
+    draws: bool = True,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, without some of the rights of root, and wait for its end.
+
+    Where it does not draw, steps in its own process keep a dot in the place of each chart.
 
     Raises:
         TimeoutExpired: it has not ended; it is killed with the process that it came from.
@@ -57,6 +60,7 @@ def run_command(
             "environment": dict(environment),
             "streams": [*map(str, streams)],
             "forgone": [*forgone],
+            "draws": draws,
         }
         server = _server(_framework_path(environment.get("PYTHONPATH", "")))
         assert server.stdin is not None
@@ -224,6 +228,11 @@ def _become(order: dict[str, Any], parent: socket.socket) -> None:
         _forgo(order["forgone"])
     else:
         _share_servers(parent)
+    if not order["draws"]:
+        sys.path[0] = str(Path(__file__).resolve().parents[1])
+        from tests.undrawn_charts import keep_dots_for_charts
+
+        keep_dots_for_charts()
     framework = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     os.environ.clear()
     os.environ.update(order["environment"])

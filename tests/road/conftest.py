@@ -68,7 +68,7 @@ class Shell:
 
     def __call__(self, *arguments: object, timeout_s: float = 300) -> Ended:
         words = self.command(*arguments)[3:]
-        done = run_command(self.folder, words, self.variables(), timeout_s)
+        done = run_command(self.folder, words, self.variables(), timeout_s, draws=False)
         return Ended(done.returncode, done.stdout, done.stderr)
 
     def anew(self, *arguments: object, timeout_s: float = 300) -> Ended:
