@@ -46,6 +46,7 @@ _REAL = {
         "scandir",
         "posix_fallocate",
     ]
+    if hasattr(os, name)
 }
 _REAL_OPEN = io.open
 

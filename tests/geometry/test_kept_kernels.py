@@ -17,6 +17,11 @@ from numba.core import config
 
 from orthoflow.geometry import kept_kernels
 from orthoflow.geometry.kernel_news import heard_by
+from orthoflow.system import HAS_STEP_PROCESSES
+
+LOCKED_BY_LINUX = pytest.mark.skipif(
+    not HAS_STEP_PROCESSES, reason="holds a lock as Linux does"
+)
 
 KERNELS = """
 from orthoflow.geometry.compiling import compiled, inlined, kernel_part, typed_kernel_part
@@ -93,6 +98,7 @@ def test_what_an_edit_left_alone_is_loaded_and_nothing_else(
     assert counts(again.asked) == counts(again.most) == (1, 0)
 
 
+@LOCKED_BY_LINUX
 def test_a_kernel_that_another_process_compiles_is_waited_for_and_loaded(
     load: Callable[[], Any], tmp_path: Path
 ) -> None:
@@ -116,6 +122,7 @@ def test_a_kernel_that_another_process_compiles_is_waited_for_and_loaded(
     assert heard == ["waiting for another process that compiles asked", ""]
 
 
+@LOCKED_BY_LINUX
 def test_who_takes_too_long_to_compile_is_waited_for_once(
     load: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,11 @@ from orthoflow.errors import InputError
 from orthoflow.files.points import PointBlock, ScanFile, ahead, open_scan
 from orthoflow.files.points.ahead import read_ahead
 from orthoflow.files.points.columns import columns_of_text
+from orthoflow.files.points.decoders import can_share_memory
 from tests import scan_files
+
+
+READS_AHEAD = pytest.mark.skipif(not can_share_memory(), reason="reads in one process here")
 
 
 @pytest.fixture(autouse=True)
@@ -67,6 +71,7 @@ def blocks_of(file: ScanFile) -> list[dict[str, object]]:
     ]
 
 
+@READS_AHEAD
 def test_blocks_and_notes_of_several_files_are_those_of_this_process(tmp_path: Path) -> None:
     text = tmp_path / "c.xyz"
     text.write_text("".join(f"{k} 2 3 0.5\n" for k in range(50)))
@@ -118,6 +123,7 @@ def test_names_of_many_files_may_be_longer_than_an_argument(tmp_path: Path) -> N
         assert sum(len(block["points"]) for file in read for block in blocks_of(file)) == 900
 
 
+@READS_AHEAD
 def test_a_reader_that_dies_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     worker = tmp_path / "worker.py"
     worker.write_text("import os\nos.abort()\n")
