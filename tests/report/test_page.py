@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import axe_core_python
 import pytest
@@ -292,6 +293,42 @@ def test_the_viewer_goes_into_a_picture_down_to_its_cells(page: Page) -> None:
     assert page.evaluate(width) == pytest.approx(before * 1.5**3, rel=1e-3)
     told = page.evaluate(f"{VIEWER}.querySelector('[data-part=scale]').innerText")
     assert re.fullmatch(r"\d+ %, 10 cm are \d+ px", told)
+    page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
+
+
+def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
+    rows = "document.querySelectorAll('.points [data-part=list] > div')"
+    before = page.evaluate(f"{rows}.length")
+    page.evaluate("document.querySelector('.first .enlarge').click()")
+    # In large cells, the middle of the picture stays in the middle of the stage.
+    for _ in range(3):
+        page.evaluate(f"{VIEWER}.querySelector('[data-part=in]').click()")
+    image = f"{VIEWER}.querySelector('.viewer-stage img').getBoundingClientRect()"
+    left, top, width, height = page.evaluate(
+        f"(() => {{ const box = {image}; return [box.left, box.top, box.width, box.height]; }})()"
+    )
+    # The middle of cell (57, 43) of 120 x 80.
+    at = {"x": left + width * 57.5 / 120, "y": top + height * 43.5 / 80}
+    hand: dict[str, Any] = {"button": "left", "clickCount": 1}
+    page.ask("Input.dispatchMouseEvent", type="mouseMoved", **at)
+    readout = page.evaluate(f"{VIEWER}.querySelector('[data-part=readout]').innerText")
+    assert readout.startswith("u 57.5 px, v 43.5 px")
+    assert page.evaluate(f"{rows}.length") == before
+    page.ask("Input.dispatchMouseEvent", type="mousePressed", **at, **hand)
+    page.ask("Input.dispatchMouseEvent", type="mouseReleased", **at, **hand)
+    assert page.evaluate(f"{rows}.length") == before + 1
+    assert f"wall 0, {readout}" in page.evaluate(f"[...{rows}].pop().innerText")
+    # A drag moves the picture and collects nothing.
+    page.ask("Input.dispatchMouseEvent", type="mousePressed", **at, **hand)
+    for _ in range(2):
+        at["x"] += 20.0
+        page.ask("Input.dispatchMouseEvent", type="mouseMoved", **at, button="left", buttons=1)
+    page.ask("Input.dispatchMouseEvent", type="mouseReleased", **at, **hand)
+    assert page.evaluate(f"{image}.left") > left + 10.0
+    assert page.evaluate(f"{rows}.length") == before + 1
+    caption = page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText")
+    assert "." in caption
+    assert not re.search(r"[a-z]\.products/", caption)
     page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
 
 

@@ -273,6 +273,7 @@
   }
 
   // Orthoimages tell what lies under the cursor, and clicks are collected as check points or ties.
+  const pointing = new Map();
   for (const panel of document.querySelectorAll("[data-points]")) {
     const places = JSON.parse(document.getElementById(panel.dataset.points).textContent);
     const photos = panel.querySelector("datalist").id;
@@ -280,9 +281,10 @@
       [...panel.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
     const points = [];
     const under = (place, image, event) => {
-      const box = image.getBoundingClientRect();
-      const x = (event.clientX - box.left - image.clientLeft) / image.clientWidth;
-      const y = (event.clientY - box.top - image.clientTop) / image.clientHeight;
+      // The enlarged view scales the box, but not what the picture says of its own size.
+      const box = image.getBoundingClientRect(), across = box.width / image.offsetWidth, down = box.height / image.offsetHeight;
+      const x = ((event.clientX - box.left) / across - image.clientLeft) / image.clientWidth;
+      const y = ((event.clientY - box.top) / down - image.clientTop) / image.clientHeight;
       if (!(x >= 0 && x < 1 && y >= 0 && y < 1)) return null;
       const u = x * place.width, v = y * place.height;
       const known = place.mm.length > 0
@@ -329,6 +331,7 @@
       part.list.append(row);
       points.push(entry);
       update();
+      return name.value;
     };
     const cell = (value) => {
       const text = typeof value === "number" ? String(Number(value.toFixed(4))) : value.trim();
@@ -379,6 +382,11 @@
         const point = under(place, image, isIts ? pointer : event);
         if (point) collect(point);
       });
+      pointing.set(figure, (copy, event, isClick) => {
+        const point = under(place, copy, event);
+        if (!point) return "";
+        return isClick ? `${collect(point)} collected: ${words(point)}` : words(point);
+      });
     }
   }
 
@@ -428,6 +436,10 @@
       .map((part) => part.textContent.trim().replace(/\s+/g, " ")).join(": ");
     const pages = unfolded();
     view.place.textContent = `${pages.indexOf(figure) + 1} of ${pages.length}`;
+    const isPointed = pointing.has(figure);
+    view.readout.textContent = isPointed ? "move for coordinates, click to collect a point" : "";
+    view.readout.parentElement.hidden = !isPointed;
+    view.stage.style.cursor = isPointed ? "crosshair" : "";
     const file = figure.querySelector("a.file");
     view.file.replaceChildren(...(file ? [Object.assign(file.cloneNode(), { textContent: "open the file" })] : []));
     if (!viewer.open) viewer.showModal();
@@ -466,9 +478,25 @@
     const box = view.stage.getBoundingClientRect();
     zoom(Math.exp(-event.deltaY / 400), event.clientX - box.left, event.clientY - box.top);
   }, { passive: false });
-  view.stage.addEventListener("pointerdown", (event) => view.stage.setPointerCapture(event.pointerId));
+  const point = (event, isClick) => {
+    const told = pointing.get(now)?.(view.stage.querySelector("img"), event, isClick);
+    if (told) view.readout.textContent = told;
+  };
+  // Where the pointer went down, as long as it may become a click; beyond a hand's tremble it drags.
+  const TREMBLE_PX = 3;
+  let pressed = null;
+  view.stage.addEventListener("pointerdown", (event) => {
+    view.stage.setPointerCapture(event.pointerId);
+    pressed = event.button === 0 ? { x: event.clientX, y: event.clientY } : null;
+  });
+  view.stage.addEventListener("pointerup", (event) => {
+    if (pressed) point(event, true);
+    pressed = null;
+  });
   view.stage.addEventListener("pointermove", (event) => {
-    if (!view.stage.hasPointerCapture(event.pointerId)) return;
+    if (!view.stage.hasPointerCapture(event.pointerId)) { point(event, false); return; }
+    if (pressed && Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) <= TREMBLE_PX) return;
+    pressed = null;
     place = { ...place, x: place.x + event.movementX, y: place.y + event.movementY };
     lie();
   });
