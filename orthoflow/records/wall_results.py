@@ -32,7 +32,7 @@ _ACCURACY: Final = (
 
 # The same of the photos, all walls together.
 _PHOTOS: Final = {
-    "sigma_wall_mm_worst": "expected error on the wall",
+    "sigma_wall_mm_worst": "expected error of its orientation against the scan",
     "check_rmse_mm_worst": "ties that only check, RMS per axis",
 }
 
@@ -297,7 +297,9 @@ def _photo_accuracy(run: Run, upstream: tuple[str, ...]) -> Iterator[str]:
         own = {metric.name: metric.value for metric in run.cells[address].metrics}
         said = [f"{text} {own[name]:.1f} mm" for name, text in _PHOTOS.items() if name in own]
         if said:
-            yield f"{address}, worst photo: {', '.join(said)}"
+            yield (
+                f"{address}, worst photo: {', '.join(said)}; errors of depth and scan add to these"
+            )
             return
 
 

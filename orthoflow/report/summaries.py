@@ -34,14 +34,20 @@ QUALITY: Final[Mapping[str, str]] = {
     )
 }
 
+# What a reader may take such a number for, and it is not.
+_NOT_HELD: Final[Mapping[str, str]] = {
+    "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One number of the first screen: what, how much, from which cell."""
+    """One number of the first screen: what, how much, from which cell, and what it leaves out."""
 
     what: str
     value: str
     cell: str
+    not_held: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +80,8 @@ def answers(run: Run) -> tuple[Answer, ...]:
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
             what = words_of(wanted, row.method, row.words)
-            found.append(Answer(what=what, value=value, cell=row.cell))
+            not_held = _NOT_HELD.get(wanted, "")
+            found.append(Answer(what=what, value=value, cell=row.cell, not_held=not_held))
     return tuple(found)
 
 

@@ -235,10 +235,17 @@ def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
         cell("second", metrics=metrics(n_oriented=7.0)),
         cell("check", metrics=metrics(completeness=0.5, completeness_seen_by_both=0.75)),
         cell("other", metrics=metrics(n_photos=4.0, n_oriented=3.0, depth_rmse_mm=2.0)),
+        cell("orient", metrics=metrics(sigma_wall_mm_worst=1.5)),
     )
     assert answers(told) == (
         Answer(what="painted, of what a station and a photo see", value="75.0 %", cell="check"),
         Answer(what="photos oriented", value="3 of 4", cell="other"),
+        Answer(
+            what="expected error of the orientation on the wall, worst photo",
+            value="1.5",
+            cell="orient",
+            not_held="against the scan; errors of depth and scan add to it",
+        ),
         Answer(what="error of the depth, RMS", value="2 mm", cell="other"),
         Answer(what="points to their plane, RMS", value="1.25 mm", cell="plane"),
     )

@@ -167,8 +167,8 @@ def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> N
     assert wall.plane_index == WALL
     # The column of a sheet had the plane's noise only, where the report had these.
     assert wall.accuracy[-1] == (
-        "orient, worst photo: expected error on the wall 4.0 mm, ties that only check, RMS per "
-        "axis 2.5 mm"
+        "orient, worst photo: expected error of its orientation against the scan 4.0 mm, ties that "
+        "only check, RMS per axis 2.5 mm; errors of depth and scan add to these"
     )
 
 
