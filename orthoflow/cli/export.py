@@ -154,6 +154,7 @@ _HELP: Final = "\n\n".join(
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
     """Write the results of a run for other programs."""
+    from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records import open_run
 
@@ -163,7 +164,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    with whole_folder(folder) as aside:
+    with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             said = FORMATS[target].load()(opened, aside, chosen)
         else:

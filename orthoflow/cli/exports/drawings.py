@@ -79,6 +79,7 @@ def _drawing(
             f"{2e-3 * scale:g}, or 0 for none"
         )
     planes = results.planes
+    depths = stretch_of(wall.rasters["depth"]) if "depth" in kinds else None
     return WallDrawing(
         number=wall.number,
         rasters={kind: wall.rasters[kind] for kind in kinds},
@@ -87,7 +88,8 @@ def _drawing(
         text=text,
         scale=scale,
         grid_m=grid_m if math.isfinite(grid_m) else 0.0,
-        interval_m=stretch_of(wall.rasters["depth"]).interval if "depth" in kinds else 0.0,
+        interval_m=0.0 if depths is None else depths.interval,
+        depth_range_m=None if depths is None else (depths.low, depths.high),
         areas=_areas(results, wall),
     )
 

@@ -149,6 +149,9 @@ def _notes(drawing: WallDrawing, sheet: Sheet) -> Iterator[str]:
             f"depth contours {first_mm:g}, {next_mm:g} ... mm from the wall's plane: red before "
             "it, towards the viewer, blue behind it"
         )
+        if drawing.depth_range_m is not None:
+            black_mm, white_mm = (1e3 * value for value in drawing.depth_range_m)
+            yield f"its grey: black {black_mm:+.0f} mm and below, white {white_mm:+.0f} mm and above"
     if drawing.grid_m > 0.0:
         yield f"grid {drawing.grid_m:g} m: {drawing.axes.said}"
 

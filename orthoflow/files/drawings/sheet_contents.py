@@ -74,6 +74,7 @@ class WallDrawing:
         scale: n of 1 : n.
         grid_m: distance of the crosses, 0 for none.
         interval_m: of the contours of depth.
+        depth_range_m: depths that the grey of the depth picture shows as black and as white.
         areas: openings of the wall.
     """
 
@@ -85,6 +86,7 @@ class WallDrawing:
     scale: int
     grid_m: float
     interval_m: float = 0.0
+    depth_range_m: tuple[float, float] | None = None
     areas: tuple[MarkedArea, ...] = ()
 
 

@@ -56,10 +56,18 @@ def axes_of(frame: WallFrame, up: NDArray[np.float64] | None) -> Axes:
         )
     if up is not None and float(frame.v_world @ up) < -math.cos(math.radians(1.0)):
         height = float(frame.origin_world @ up)
-        said = "X along the wall from its left edge, H height in the scan's coordinates, m"
+        said = f"X along the wall from its left edge, H height: {_axis_words(up)}, m"
         return Axes(across=(0.0, 1.0), down=(height, float(frame.v_world @ up)), said=said)
     said = "X to the right and Y upwards from the top-left corner of the orthoimage, m"
     return Axes(across=(0.0, 1.0), down=(0.0, -1.0), said=said)
+
+
+def _axis_words(up: NDArray[np.float64]) -> str:
+    """Say which of the scan's axes heights count along, backwards or not."""
+    axis = int(np.argmax(np.abs(up)))
+    if abs(float(up[axis])) < 1.0 - 1e-9:
+        return f"along ({', '.join(f'{value:.3f}' for value in up.tolist())}) of the scan"
+    return f"{'minus ' if up[axis] < 0.0 else ''}{'xyz'[axis]} of the scan"
 
 
 def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet) -> None:

@@ -141,12 +141,13 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
 def test_notes_say_what_contours_and_crosses_are() -> None:
     plain = list(module._notes(drawing(), sheet("ortho")))
     assert plain == ["first note", "second note"]
-    told = drawing(interval_m=0.02, grid_m=0.5)
+    told = drawing(interval_m=0.02, grid_m=0.5, depth_range_m=(-0.1234, 0.0512))
     assert list(module._notes(told, sheet("ortho", "depth")))[2:] == [
         (
             "depth contours 10, 30 ... mm from the wall's plane: red before it, towards the "
             "viewer, blue behind it"
         ),
+        "its grey: black -123 mm and below, white +51 mm and above",
         "grid 0.5 m: X to the right, m",
     ]
 

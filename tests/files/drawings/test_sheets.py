@@ -151,7 +151,7 @@ def test_heights_are_told_of_walls_that_are_upright_to_a_degree() -> None:
     found = axes_of(wall, up)
     assert found.across == (0.0, 1.0)
     np.testing.assert_allclose(found.down, (30.0, -1.0))
-    assert "H height" in found.said
+    assert found.said.endswith("H height: z of the scan, m")
     for degrees, is_upright in ((0.9, True), (1.1, False)):
         angle = np.radians(degrees)
         tilted = np.array([np.sin(angle), 0.0, np.cos(angle)])
@@ -164,6 +164,12 @@ def test_heights_are_told_of_walls_that_are_upright_to_a_degree() -> None:
             assert (leaning.across, leaning.down) == ((0.0, 1.0), (0.0, -1.0))
     assert axes_of(wall, None).down == (0.0, -1.0)
     assert axes_of(wall, -up).down == (0.0, -1.0)
+    # A scan whose up is down: heights are minus its z.
+    turned = axes_of(replace(wall, v_world=-wall.v_world, u_world=-wall.u_world), -up)
+    np.testing.assert_allclose(turned.down, (-30.0, -1.0))
+    assert turned.said.endswith("H height: minus z of the scan, m")
+    oblique = axes_of(wall, np.array([np.sin(0.01), 0.0, np.cos(0.01)]))
+    assert oblique.said.endswith("H height: along (0.010, 0.000, 1.000) of the scan, m")
 
 
 def test_a_raster_in_a_map_has_the_coordinates_of_the_map() -> None:
