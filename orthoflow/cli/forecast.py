@@ -65,7 +65,7 @@ class CellState:
 
 
 def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
-    """Say how long a run still takes; empty when nobody knows.
+    """Say how long a run still takes; empty when nobody knows of more than half of its cells.
 
     Args:
         cells: all of them.
@@ -75,7 +75,8 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
     open_cells = [cell for cell in cells if cell.state in ("waiting", "running")]
     left = [cell.left_s(now_s) for cell in open_cells]
     known = [seconds for seconds in left if seconds is not None]
-    if not known:
+    # The few seconds of the known ones would be true, and mislead.
+    if not known or 2 * len(known) < len(left):
         return ""
     seconds = max(*known, sum(known) / jobs, 0.0)
     return f"{'about' if len(known) == len(left) else 'at least'} {about(seconds)} left"

@@ -30,7 +30,8 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
 
     Recomputes the seal, the digest of every product and input file in the record, every cache
     key and the digest of the workflow, and compares the published files beside the record with
-    theirs; one that is not there is noted. With --signer the record must be signed with that key.
+    theirs; one that is not there is noted. The report and its figures are not covered: `orthoflow
+    report` makes them anew from the record. With --signer the record must be signed with that key.
     Ends with 3 when something differs.
     """
     from orthoflow.records import verify_run
@@ -58,7 +59,7 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     else:
         for finding in findings:
             echo(finding)
-        say_error(f"error: {verification.path} is not as it was written, see above")
+        say_error(f"error: {verification.wrong}, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 
 

@@ -26,6 +26,7 @@ from orthoflow.records.published import PRODUCTS_FOLDER, published_files
 REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; take another copy of it, `orthoflow verify` says whether that one is whole"
+FIGURES_FOLDER: Final = "figures"
 # Of a run on several datasets, a page for each.
 PAGES_FOLDER: Final = "pages"
 

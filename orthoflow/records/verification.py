@@ -18,8 +18,18 @@ from orthoflow.alike import first_few
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.runs import Run, find_record, record_errors
+from orthoflow.records.runs import (
+    FIGURES_FOLDER,
+    PAGES_FOLDER,
+    REPORT_FILE,
+    Run,
+    find_record,
+    record_errors,
+)
 from orthoflow.records.signatures import check_signature, read_signature
+
+# What shows the record; its digests would have to be in it.
+_VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 
 PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
@@ -36,6 +46,7 @@ class Verification:
     Attributes:
         path: the record file.
         findings: one sentence per difference; empty when all is as it was written.
+        wrong: what the findings are of, in words; empty without any.
         notes: what could not be checked, a sentence each.
         n_products: products whose arrays lie in the record and were compared with their digest.
         n_inputs: input files that lie in the record and were compared with their digest.
@@ -46,6 +57,7 @@ class Verification:
 
     path: Path
     findings: tuple[str, ...]
+    wrong: str = ""
     notes: tuple[str, ...] = ()
     n_products: int = 0
     n_inputs: int = 0
@@ -75,7 +87,8 @@ def verify_run(
         f"{finding.place}: {finding.problem}" for finding in verify_record(record_path)
     )
     if findings:
-        return Verification(path=record_path, findings=findings)
+        wrong = f"{record_path} is not as it was written"
+        return Verification(path=record_path, findings=findings, wrong=wrong)
     with record_errors(record_path):
         record = read_record(record_path)
     check = _check_published(record_path.parent, record) if also_published else _PublishedCheck()
@@ -83,6 +96,7 @@ def verify_run(
     return Verification(
         path=record_path,
         findings=(*signature.findings, *check.changed),
+        wrong=_wrong_beside(record_path, signature, check),
         notes=(*signature.notes, *check.notes),
         signed_with=signature.signed_with,
         n_products=sum(
@@ -91,6 +105,15 @@ def verify_run(
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=check.n_same,
     )
+
+
+def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck) -> str:
+    """Name what differs beside a record that is whole."""
+    wrong = [
+        *(["its signature is not the one asked for"] if signature.findings else []),
+        *(["published files beside it are not as they were written"] if check.changed else []),
+    ]
+    return f"{record} is as it was written, but {' and '.join(wrong)}" if wrong else ""
 
 
 def _check_signature(record: Path, signer: Path | None) -> Verification:
@@ -126,7 +149,9 @@ def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
-    notes = (_missing_note(missing, len(checked)),) if missing else ()
+    notes: tuple[str, ...] = (_missing_note(missing, len(checked)),) if missing else ()
+    if views := [name for name in _VIEWS if os.path.lexists(folder / name)]:
+        notes += (_views_note(folder, views),)
     return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
 
 
@@ -177,6 +202,13 @@ def require_unchanged(run: Run, *paths: Path) -> None:
             )
         if state != "same":
             raise RecordError(f"{path} cannot be read: {state}")
+
+
+def _views_note(folder: Path, views: list[str]) -> str:
+    return (
+        f"not covered: {', '.join(views)}, which show the record; `orthoflow report {folder}` "
+        "makes them anew"
+    )
 
 
 def _missing_note(missing: list[str], n_published: int) -> str:

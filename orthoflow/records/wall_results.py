@@ -92,28 +92,34 @@ def content_digest(run: Run) -> str:
         return opened.content_sha256
 
 
-def room_results(run: Run, cell: str | None = None) -> RoomResults:
+def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> RoomResults:
     """Gather what a run gives of its walls.
 
     Args:
         run: a finished run, whose published files are beside its record as it names them.
         cell: address of the cell whose orthoimages, or else rasters of walls, are meant; without
             it the last one that gave orthoimages, or else walls.
+        wall: number of the only wall that is wanted, so that no file of another is needed; all
+            where there is no such wall.
 
     Raises:
         ArgumentError: there is no such cell, or nothing to draw.
         RecordError: a published file is not what the record says, or an orthoimage is gone.
     """
     address = _pictured(run, cell)
-    _require_orthoimages(run, address)
+    _require_orthoimages(run, address, wall)
     upstream = tuple(cell.address for cell in run.upstream(address))
     files: dict[int, dict[str, Path]] = {}
+    pictured = [
+        name
+        for name in upstream
+        if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}
+    ]
     # What lies behind is looked at first, so that what the chosen cell itself gave counts.
-    for name in reversed(upstream):
-        if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}:
-            for path in published_files(run.folder, name):
-                if found := _RASTER.fullmatch(path.name):
-                    files.setdefault(int(found[1]), {})[found[2]] = path
+    for name in reversed(pictured):
+        for path in published_files(run.folder, name):
+            if found := _RASTER.fullmatch(path.name):
+                files.setdefault(int(found[1]), {})[found[2]] = path
     if not files:
         raise ArgumentError(
             f"no rasters of walls lie beside {run.path}, below {run.products_folder}: give the "
@@ -122,7 +128,9 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
     planes = _upstream_product(run, upstream, "planes")
     points = _upstream_product(run, (*upstream, *run.cells), "checkpoints")
     # Rasters are made in the order of the planes, so places in `Walls` are places among them.
-    numbers = sorted(number for number, found in files.items() if "depth" in found)
+    numbers = sorted(
+        {number for name in pictured for number, kind in _rasters(run, name) if kind == "depth"}
+    )
     inspections = {
         name: _numbered(inspection, numbers or sorted(files))
         for name, inspection in _inspections(run, address)
@@ -133,9 +141,9 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
     return RoomResults(
         address=address,
         walls=tuple(
-            replace(wall, accuracy=(*wall.accuracy, *oriented))
-            for number in sorted(files)
-            for wall in [_wall_result(run, number, files[number], kept, inspections, colours)]
+            replace(result, accuracy=(*result.accuracy, *oriented))
+            for number in ([wall] if wall in files else sorted(files))
+            for result in [_wall_result(run, number, files[number], kept, inspections, colours)]
         ),
         planes=kept,
         checkpoints=CheckPoints.from_payload(run.payload(*points)) if points else None,
@@ -144,14 +152,23 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
     )
 
 
-def _require_orthoimages(run: Run, address: str) -> None:
-    """Refuse to go on without an orthoimage that was published: another raster would stand in."""
+def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
+    """Rasters that a cell published, by wall and kind; below the folder of the run."""
     folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
-    for file in run.record.published:
-        found = _RASTER.fullmatch(file.path.removeprefix(folder))
-        if found and found[2] == "ortho" and not (run.folder / file.path).exists():
+    return {
+        (int(found[1]), found[2]): file.path
+        for file in run.record.published
+        if (found := _RASTER.fullmatch(file.path.removeprefix(folder)))
+    }
+
+
+def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
+    """Refuse to go on without an orthoimage that was published: another raster would stand in."""
+    for (number, kind), path in _rasters(run, address).items():
+        is_wanted = kind == "ortho" and wall in {None, number}
+        if is_wanted and not (run.folder / path).exists():
             raise RecordError(
-                f"{file.path} is gone from {run.folder}, where the run left it: copy it back, or "
+                f"{path} is gone from {run.folder}, where the run left it: copy it back, or "
                 f"make it anew by `orthoflow replay {run.folder} -o NEW`"
             )
 

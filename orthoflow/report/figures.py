@@ -13,11 +13,11 @@ from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.files.plain_svg import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure, Run, figure_files, write_files
+from orthoflow.records.runs import FIGURES_FOLDER
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
 
-FIGURES_FOLDER: Final = "figures"
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
 # What the baseline may take of it as it is, before the others share the rest.
 _BASELINE_SHARE: Final = 0.7

@@ -151,7 +151,7 @@ WORDS: Final[Mapping[str, str]] = {
     "within_2_sigma": "distances within two sigmas",
     "within_3_sigma": "distances within three sigmas",
     "thickness_mm": "thickness of the cloud",
-    "thickness_width_mm": "width of the middle 68 % of the distances",
+    "thickness_width_mm": "width that holds 95 % of the distances",
     "thickness_scan_steps": "thickness over the scan step",
     "thickest_mm": "thickness of the cloud where it is thickest",
     "own_tolerance_mm": "tolerance taken from the cloud",

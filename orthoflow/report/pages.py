@@ -24,6 +24,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
 from orthoflow.records import COSTS, RecordedCell, Run, compare_runs, figure_files
 from orthoflow.records.datasets import pages_of, parts_of
+from orthoflow.records.runs import FIGURES_FOLDER
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
 from orthoflow.report.cursors import cursor_places
@@ -32,7 +33,6 @@ from orthoflow.report.dataset_tables import DatasetTable, dataset_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
 from orthoflow.report.figures import (
-    FIGURES_FOLDER,
     FigureGroup,
     baseline_addresses,
     figure_groups,

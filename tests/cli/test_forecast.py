@@ -71,6 +71,8 @@ def test_a_run_takes_as_long_as_its_longest_cell_or_its_share_of_all() -> None:
 
 def test_a_run_of_which_part_is_not_known_takes_at_least_the_rest() -> None:
     assert left_of_run([CellState(took_s=40.0), CellState()], 100.0) == "at least 40 s left"
+    # Of a few seconds of one cell a run of minutes would look short.
+    assert left_of_run([CellState(took_s=4.0), CellState(), CellState()], 100.0) == ""
     assert left_of_run([CellState(), running()], 100.0) == ""
     assert left_of_run([CellState(state="ok")], 100.0) == ""
     assert left_of_run([], 100.0) == ""

@@ -19,9 +19,7 @@ from orthoflow.geometry import kept_kernels
 from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.system import HAS_STEP_PROCESSES
 
-LOCKED_BY_LINUX = pytest.mark.skipif(
-    not HAS_STEP_PROCESSES, reason="holds a lock as Linux does"
-)
+LOCKED_BY_LINUX = pytest.mark.skipif(not HAS_STEP_PROCESSES, reason="holds a lock as Linux does")
 
 KERNELS = """
 from orthoflow.geometry.compiling import compiled, inlined, kernel_part, typed_kernel_part

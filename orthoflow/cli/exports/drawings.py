@@ -35,7 +35,7 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
 
     paper = paper_of(chosen.paper or _DEFAULT_PAPER)
     block = read_title_block(chosen.title_block) if chosen.title_block else TitleBlock()
-    results = room_results(run, chosen.cell)
+    results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     scale = chosen.scale or fitting_scale([_size_m(wall) for wall in walls], paper)
     digest = content_digest(run)
@@ -181,7 +181,7 @@ def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
     from orthoflow.records.wall_results import room_results
 
-    results = room_results(run, chosen.cell)
+    results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     lines = _lines(results)
     make_empty(folder)
@@ -207,7 +207,7 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     )
     from orthoflow.records.wall_results import room_results
 
-    results = room_results(run, chosen.cell)
+    results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     lines = _lines(results)
     make_empty(folder)

@@ -35,18 +35,20 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
             f"the orthoimages of {address} come of no planes of this run, so nothing says which "
             "way is up"
         )
-    depths = _depths(run, address, orthos) if chosen.relief else None
+    depths = _depths(run, address, orthos, chosen.wall) if chosen.relief else None
     make_empty(folder)
     write_room(folder / "room.glb", orthos, planes.up, depths)
     write_page(folder / "room.html", folder / "room.glb")
     return f"room.glb and room.html: {counted(len(orthos), 'wall')} of {address}"
 
 
-def _depths(run: Run, address: str, orthos: Sequence[OrthoFile]) -> dict[int, Path]:
+def _depths(
+    run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
+) -> dict[int, Path]:
     """The published depths of walls, by number."""
     from orthoflow.records.wall_results import room_results
 
-    walls = room_results(run, address).walls
+    walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
         if ortho.wall not in found:

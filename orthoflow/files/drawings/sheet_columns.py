@@ -151,7 +151,9 @@ def _notes(drawing: WallDrawing, sheet: Sheet) -> Iterator[str]:
         )
         if drawing.depth_range_m is not None:
             black_mm, white_mm = (1e3 * value for value in drawing.depth_range_m)
-            yield f"its grey: black {black_mm:+.0f} mm and below, white {white_mm:+.0f} mm and above"
+            yield (
+                f"its grey: black {black_mm:+.0f} mm and below, white {white_mm:+.0f} mm and above"
+            )
     if drawing.grid_m > 0.0:
         yield f"grid {drawing.grid_m:g} m: {drawing.axes.said}"
 

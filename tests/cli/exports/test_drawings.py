@@ -237,7 +237,8 @@ def test_sheets_are_counted_and_have_one_scale(
     walls = (wall(3.8, 2.3, "ortho"), wall(9.0, 3.0, "ortho"))
     walls[1].number = 9
     monkeypatch.setattr(
-        "orthoflow.records.wall_results.room_results", lambda _run, _cell: results(walls=walls)
+        "orthoflow.records.wall_results.room_results",
+        lambda _run, _cell, _wall: results(walls=walls),
     )
     monkeypatch.setattr("orthoflow.records.wall_results.content_digest", lambda _run: "d" * 64)
     run: Any = SimpleNamespace(record=SimpleNamespace(run_id="r", name="hall", created_by="o"))
@@ -302,7 +303,9 @@ def of_room(monkeypatch: pytest.MonkeyPatch, *, has_planes: bool) -> Any:
         inspections={},
         openings=(),
     )
-    monkeypatch.setattr("orthoflow.records.wall_results.room_results", lambda _run, _cell: told)
+    monkeypatch.setattr(
+        "orthoflow.records.wall_results.room_results", lambda _run, _cell, _wall: told
+    )
     images = [
         SimpleNamespace(number=7, sources=("a.jpg", "b.jpg")),
         SimpleNamespace(number=9, sources=("a.jpg",)),

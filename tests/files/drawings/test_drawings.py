@@ -13,10 +13,12 @@ import pdfplumber
 import pytest
 from click import BadParameter
 from click.testing import CliRunner, Result
+from orthoflow_provenance.model import PublishedFile
 from PIL import Image
 
 from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
+from orthoflow.errors import RecordError
 from orthoflow.records import Run, open_run
 from orthoflow.records.wall_results import content_digest, room_results
 from tests.drawing_runs import (
@@ -205,6 +207,20 @@ def test_no_other_raster_stands_in_for_an_orthoimage_that_is_gone(tmp_path: Path
         assert f"products/mosaic/{gone.name} is gone from" in done.output
         assert "orthoflow replay" in done.output
         assert not (tmp_path / target).exists()
+
+
+def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
+    whole = open_run(run)
+    gone = PublishedFile(
+        path=f"products/mosaic/wall_{WALL + 1}_ortho.tif", size_bytes=9, sha256="0" * 64
+    )
+    published = (*whole.record.published, gone)
+    partly = replace(whole, record=replace(whole.record, published=published))
+    with pytest.raises(RecordError, match=f"wall_{WALL + 1}_ortho.tif is gone from"):
+        room_results(partly)
+    (wall,) = room_results(partly, wall=WALL).walls
+    assert wall.number == WALL
+    assert wall.accuracy == room_results(whole).walls[0].accuracy
 
 
 @pytest.mark.parametrize(

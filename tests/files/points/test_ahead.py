@@ -17,7 +17,6 @@ from orthoflow.files.points.columns import columns_of_text
 from orthoflow.files.points.decoders import can_share_memory
 from tests import scan_files
 
-
 READS_AHEAD = pytest.mark.skipif(not can_share_memory(), reason="reads in one process here")
 
 
