@@ -3,14 +3,15 @@
 markiewicz2015 (section 6) lets each plane define the range before and behind it that is rastered.
 Here both it and the rectangle follow from the points that hang together with the wall: voxels of a
 sample of the cloud, step by step along the wall and in depth, from those on the plane. A detected
-plane that adjoins the wall ends it; where none was detected, it ends with the points.
+plane that adjoins the wall ends it, where it comes nearest: farther on, a rectangle would show that
+plane, too. Where none was detected, it ends with the points.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from orthoflow_plugins.raster.sampled_points import PointsInside, SampledPoints,
 from orthoflow_plugins.raster.selection import area_m2, frame_of
 
 Side = Literal["left", "right", "top", "bottom"]
+_SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 
 # How far a rectangle may grow on each side, and how far from the plane relief is looked for.
 _GROWTH_MOST_M: Final = 1.0
@@ -69,11 +71,13 @@ class Extent:
         growth_m: how far beyond the rectangle of its points, to the left, right, top and bottom.
         front_m: from the plane towards the viewer.
         behind_m: behind the plane.
+        cut_m: how much farther a plane that runs askew leaves the wall than it ends it, by side.
     """
 
     growth_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     front_m: float
     behind_m: float
+    cut_m: Mapping[Side, float] = field(default_factory=dict)
 
     @property
     def buffer_m(self) -> tuple[float, float]:
@@ -145,10 +149,18 @@ def extent_of(
     if reach.behind_m is None:
         relief_m = _relief_m(-surface.behind_m, _BEHIND_MOST_M, search)
         behind_m = max(behind_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _BEHIND_MOST_M))
-    left, right, top, bottom = (
-        _growth_m(side, surface, inside, search) for side in ("left", "right", "top", "bottom")
+    left, right, top, bottom = (_growth_m(side, surface, inside, search) for side in _SIDES)
+    growth_m = dict(zip(_SIDES, (left, right, top, bottom), strict=True))
+    return Extent(
+        growth_m=(left, right, top, bottom),
+        front_m=front_m,
+        behind_m=behind_m,
+        cut_m={
+            bound.side: bound.askew_m
+            for bound in search.bounds
+            if 0.0 < growth_m[bound.side] == bound.line_m
+        },
     )
-    return Extent(growth_m=(left, right, top, bottom), front_m=front_m, behind_m=behind_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +173,7 @@ class _Bound:
         offset_m: distance at the top-left corner of the rectangle of the points.
         noise_m: how far from it its points lie.
         beyond_m: how far beyond the rectangle's side it lies, where it lies nearest.
+        askew_m: how much farther, where it lies farthest.
     """
 
     side: Side
@@ -168,6 +181,13 @@ class _Bound:
     offset_m: float
     noise_m: float
     beyond_m: float
+    askew_m: float
+
+    @property
+    def line_m(self) -> float:
+        """How far a wall that it ends reaches beyond the rectangle's side."""
+        # What lies nearer to the adjoining surface belongs to either.
+        return self.beyond_m - self.noise_m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,10 +373,8 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
         return 0.0
     grown_m = float(np.quantile(outer_m, 1.0 - _STRAY_SHARE))
     for bound in search.bounds:
-        line_m = bound.beyond_m - bound.noise_m
-        if bound.side == side and grown_m > line_m - side_m:
-            # What lies nearer to the adjoining surface belongs to either.
-            grown_m = line_m
+        if bound.side == side and grown_m > bound.line_m - side_m:
+            grown_m = bound.line_m
     return max(0.0, grown_m)
 
 
@@ -413,7 +431,8 @@ def _bound(
     along = 1 - axis
     ends_m = np.array([0.0, size_m[along]])
     line_m = -(offset_m + slopes[along] * ends_m) / slopes[axis]
-    beyond_m = float((-line_m if is_first else line_m - size_m[axis]).min())
+    distances_m = -line_m if is_first else line_m - size_m[axis]
+    beyond_m = float(distances_m.min())
     if not -_WITHIN_M <= beyond_m <= _GROWTH_MOST_M:
         return None
     noise_m = min(_NOISE_SIGMAS * _sigma_m(planes, other), _NOISE_MOST_M)
@@ -423,6 +442,7 @@ def _bound(
         offset_m=offset_m,
         noise_m=noise_m,
         beyond_m=beyond_m,
+        askew_m=float(distances_m.max()) - beyond_m,
     )
 
 

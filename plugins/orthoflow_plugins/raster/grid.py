@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
@@ -105,7 +106,8 @@ class RasterGrid(Method):
         rectangle: RectangleRule = Field(
             default="room",
             description="room: the wall as far as its surface goes, cornices and pilasters in, up "
-            "to adjoining walls, floor and ceiling; points: the rectangle of its plane's points.",
+            "to adjoining walls, floor and ceiling, where they run askew to where they come "
+            "nearest; points: the rectangle of its plane's points.",
         )
         surface: Surface = Field(
             default="median",
@@ -288,9 +290,25 @@ def _extents(
     @cache
     def extent(index: int) -> Extent:
         found = extent_of(points, planes, index, reach, threads=ctx.cores)
-        return found if params.rectangle == "room" else replace(found, growth_m=(0.0,) * 4)
+        return (
+            found if params.rectangle == "room" else replace(found, growth_m=(0.0,) * 4, cut_m={})
+        )
 
     return extent
+
+
+def _log_cuts(
+    frames: Mapping[int, WallFrame], planes: Planes, extent_of: ExtentOf, ctx: StepContext
+) -> None:
+    """Say what of a wall lies beyond its rectangle because what adjoins it runs askew."""
+    for index, frame in frames.items():
+        for side, cut_m in extent_of(index).cut_m.items():
+            if cut_m > frame.gsd_m:
+                ctx.log(
+                    f"{planes.names[index]}: what adjoins it at its {side} runs askew, and its "
+                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of the wall "
+                    "are left out there; margin_m adds them"
+                )
 
 
 def _crops(
@@ -317,6 +335,7 @@ def _crops(
     if params.crs is not None:
         reach_m = max(max(extent_of(index).buffer_m) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
+    _log_cuts(frames, planes, extent_of, ctx)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
     for place in params.near:
         index = nearest_plane(planes, list(frames), np.array(place))

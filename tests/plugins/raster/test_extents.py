@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,31 @@ def test_a_wall_reaches_over_cornice_and_pilaster_to_what_adjoins_it(tmp_path: P
     assert np.nanmedian(found.depth_m[60:200, 2:20]) == pytest.approx(0.10, abs=0.003)
     # Nothing of the adjoining walls is taken for the wall's relief.
     assert np.nanmax(found.depth_m) < 0.13
+
+
+def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said(
+    tmp_path: Path,
+) -> None:
+    rise = 0.02
+    surface = wall()
+    surface = surface[surface[:, 2] > rise * surface[:, 0]]
+    floor = patch((0.0, WIDTH_M), (0.0, 3.0), (0.0, 0.0))
+    floor[:, 2] += rise * floor[:, 0]
+    _, corners = level(0.0, (0.0, 3.0), towards=1.0)
+    corners[:, 2] += rise * corners[:, 0]
+    normal = np.array([-rise, 0.0, 1.0]) / np.hypot(rise, 1.0)
+    said: list[str] = []
+    ctx = replace(scenes.context(tmp_path), listen=lambda event: said.append(event.text))
+    planes = planes_of((0.0, WIDTH_M), (0.3, HEIGHT_M), (normal, corners))
+    inputs = RasterGrid.In(cloud=scanned(surface, floor), planes=planes)
+    chosen = RasterGrid.Params(gsd_m=GSD_M, ranks=(0,))
+    walls = RasterGrid().run(inputs, chosen, ctx).walls
+    assert edges_m(walls)[2] == pytest.approx(rise * WIDTH_M, abs=CORNER_M)
+    (told,) = [text for text in said if "askew" in text]
+    assert told == (
+        "plane 0: what adjoins it at its bottom runs askew, and its raster ends where that comes "
+        "nearest: up to 80 mm of the wall are left out there; margin_m adds them"
+    )
 
 
 def test_growth_adds_whole_cells_and_moves_none(tmp_path: Path) -> None:
