@@ -67,12 +67,14 @@ class Sweep:
 
     Attributes:
         step: name of the step.
+        method: what its variants call, `plane.ransac`.
         parameter: name of the parameter.
         values: variant -> value.
         others: variant -> what else it sets otherwise, in words.
     """
 
     step: str
+    method: str
     parameter: str
     values: Mapping[str, float]
     others: Mapping[str, str]
@@ -85,7 +87,7 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
         variant = cell.assignment.get(cell.step)
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
-    for (step, _), variants in by_method.items():
+    for (step, method), variants in by_method.items():
         names = sorted({name for cell in variants.values() for name in cell.params})
         differ = [
             name
@@ -110,7 +112,9 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
                 for variant in known
             }
             if max(Counter(others.values()).values(), default=0) >= _FEWEST_VALUES:
-                yield Sweep(step=step, parameter=parameter, values=known, others=others)
+                yield Sweep(
+                    step=step, method=method, parameter=parameter, values=known, others=others
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +132,13 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     chosen = [one for one in columns if one.is_key or one.sense is not Sense.NEITHER]
     cells = [cell for part in parts for cell in part.record.cells]
     found = list(sweeps(cells))
+    swept = Counter((one.step, one.parameter) for one in found)
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for sweep in found:
             lines = _lines(combinations, sweep, column, is_over=len(parts) > 1)
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
-                yield _curve(sweep, column, lines, n_datasets=len(parts))
+                is_alone = swept[sweep.step, sweep.parameter] == 1
+                yield _curve(sweep, column, lines, is_alone=is_alone, n_datasets=len(parts))
 
 
 class _Value(NamedTuple):
@@ -195,9 +201,15 @@ def _behind(points: Sequence[_Point], n_datasets: int) -> str:
 
 
 def _curve(
-    sweep: Sweep, column: Column, lines: Mapping[str, Sequence[_Point]], *, n_datasets: int
+    sweep: Sweep,
+    column: Column,
+    lines: Mapping[str, Sequence[_Point]],
+    *,
+    is_alone: bool,
+    n_datasets: int,
 ) -> Curve:
-    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
+    of = "" if is_alone else f" of {sweep.method}"
+    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}{of}"
     has_spread = any(
         math.isfinite(point.spread) and point.spread > 0
         for points in lines.values()
@@ -217,7 +229,7 @@ def _curve(
         svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
             lines,
             label=title,
-            below=f"{sweep.step}.{sweep.parameter}",
+            below=f"{sweep.step}.{sweep.parameter}{of}",
             beside=column.label,
         ),
         caption=(

@@ -59,7 +59,7 @@ class MethodOverDatasets:
         n: datasets with a value.
         failed: datasets on which the combination failed; they have no part in any number.
         n_absent: datasets that have no value though nothing failed, or were left out.
-        median: over the datasets; NaN without any.
+        median: over the datasets, of signed errors of their sizes; NaN without any.
         spread: 1.4826 times the median absolute deviation from it; NaN without any.
         paired: against the reference; None for itself, and where neither more nor less is better.
     """
@@ -145,6 +145,9 @@ def _methods(
         values = measured[method]
         failed = tuple(name for name, one in by_name.items() if one.failure is not None)
         numbers = np.array([value.value for value in values.values()])
+        if sense is Sense.LESS:
+            # Errors of both signs would make each other small.
+            numbers = np.abs(numbers)
         compared = method != reference and sense is not Sense.NEITHER
         rows.append(
             MethodOverDatasets(

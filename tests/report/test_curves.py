@@ -48,6 +48,23 @@ def test_two_values_other_differences_and_words_are_none(tmp_path: Path) -> None
     assert list(sweeps(held(tmp_path, words).record.cells)) == []
 
 
+def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path) -> None:
+    one = swept(0.02, 0.05, 0.1)
+    other = [
+        cell(
+            f"plane@plane=region-{value:g}",
+            method="plane.region",
+            params={"tolerance_m": value},
+            metrics=metrics(rms_mm=value),
+        )
+        for value in (0.02, 0.05, 0.1)
+    ]
+    titles = [curve.title for curve in curves(held(tmp_path, [*one, *other]))]
+    assert len(titles) == 2
+    assert titles[0].endswith("over plane.tolerance_m of plane.toy")
+    assert titles[1].endswith("over plane.tolerance_m of plane.region")
+
+
 def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
     # A record may hold any; these ended with an error, or with nan for a place.
     values = (0.02, 10**400, math.nan, 0.05, -1e308, 0.1)

@@ -88,6 +88,12 @@ def methods(run: Run) -> dict[str, MethodOverDatasets]:
     return {method.name: method for method in metric.methods}
 
 
+def test_errors_of_both_signs_do_not_make_each_other_small(tmp_path: Path) -> None:
+    signed = {"hall": (6.0, 1.0), "stairs": (-3.0, 1.0), "cellar": (0.5, 1.0)}
+    slow = methods(run_of(tmp_path, signed))["plane=slow"]
+    assert (slow.median, slow.spread) == (3.0, pytest.approx(1.4826 * 2.5))
+
+
 def test_a_failure_is_counted_beside_and_has_no_part_in_a_number(rooms: Run) -> None:
     quick = methods(rooms)["plane=quick"]
     assert (quick.n, quick.failed, quick.n_absent) == (6, ("attic",), 0)
