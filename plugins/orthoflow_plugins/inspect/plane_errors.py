@@ -43,6 +43,12 @@ def inspect_planes(
     ctx.metric("main_found", float(main is not None), "1")
     if main is not None:
         findings += _plane_findings(main, 0)
+    else:
+        ctx.warn(
+            f"the main wall of the scene, {truth.planes.names[0]}, is none of the {len(planes)} "
+            f"planes that were found within {_FOUND_ANGLE_DEG:g} deg and {_FOUND_OFFSET_M:g} m: "
+            "errors of planes are told without it"
+        )
     seen = [distance for distance in nearest if distance is not None]
     if seen:
         worst = _PlaneDistance(
