@@ -80,6 +80,11 @@ _HELP: Final = "\n\n".join(
     help="ro-crate: the license of the results, its URL or name.",
 )
 @click.option(
+    "--author",
+    metavar="NAME",
+    help="ro-crate: who made the results, a name or https://orcid.org/...",
+)
+@click.option(
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import mimetypes
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -45,6 +46,8 @@ _BIOSCHEMAS: Final = "https://bioschemas.org/profiles/ComputationalWorkflow/1.0-
 _REQUIREMENTS: Final = "https://pip.pypa.io/en/stable/reference/requirements-file-format/"
 _LANGUAGE: Final = "#orthoflow-workflow-format"
 _ENGINE: Final = "#engine"
+_DISTRIBUTION: Final = "orthoflow-tls"
+_ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]")
 _RUN: Final = "#run"
 _CONTEXT: Final[list[JsonValue]] = [
     f"{_CRATE}/context",
@@ -55,7 +58,12 @@ _MEDIA_TYPES: Final = {".h5": "application/x-hdf5", ".tif": "image/tiff", ".yaml
 
 
 def write_crate(
-    run: Run, folder: Path, *, license_text: str = NO_LICENSE, record: Run | None = None
+    run: Run,
+    folder: Path,
+    *,
+    license_text: str = NO_LICENSE,
+    author: str = "",
+    record: Run | None = None,
 ) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their description.
 
@@ -66,6 +74,7 @@ def write_crate(
         run: the run.
         folder: existing folder, empty but for `record`.
         license_text: URL or name of the license of the results.
+        author: who made the results, by name or ORCID; empty where nobody says it.
         record: the run with another record, which lies in the folder already.
 
     Returns:
@@ -89,7 +98,7 @@ def write_crate(
     for name, text in texts.items():
         _write(folder, name, text)
     names = [*texts, *_copy_files(run, folder, record or run)]
-    crate = crate_metadata((record or run).record, names, license_text=license_text)
+    crate = crate_metadata((record or run).record, names, license_text=license_text, author=author)
     _write(folder, METADATA_FILE, json.dumps(crate, indent=1, ensure_ascii=False) + "\n")
     return (folder / METADATA_FILE, *(path_inside(folder, name) for name in names))
 
@@ -118,7 +127,7 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
 
 
 def crate_metadata(
-    record: RunRecord, files: list[str], *, license_text: str
+    record: RunRecord, files: list[str], *, license_text: str, author: str = ""
 ) -> dict[str, JsonValue]:
     """Describe a run and the files of its crate as JSON-LD.
 
@@ -126,9 +135,12 @@ def crate_metadata(
         record: of the run.
         files: paths in the crate, with `/`.
         license_text: URL or name of the license of the results.
+        author: who made the results, by name or ORCID; empty where nobody says it.
     """
-    graph = list(_Crate(record=record, files=tuple(files), license_text=license_text).graph())
-    return {"@context": _CONTEXT, "@graph": list(graph)}
+    crate = _Crate(
+        record=record, files=tuple(files), license_text=license_text, author=author.strip()
+    )
+    return {"@context": _CONTEXT, "@graph": list(crate.graph())}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +150,7 @@ class _Crate:
     record: RunRecord
     files: tuple[str, ...]
     license_text: str
+    author: str
 
     def graph(self) -> Iterator[Entity]:
         """Give all entities, the descriptor and the root first."""
@@ -148,6 +161,8 @@ class _Crate:
             "conformsTo": refs((_CRATE, _WORKFLOW_CRATE)),
         }
         yield self._root()
+        if self.author:
+            yield {"@id": self._author_id, "@type": "Person", "name": self.author}
         for profile, name in _PROFILES.items():
             version = profile.rpartition("/")[2]
             yield {"@id": profile, "@type": "CreativeWork", "name": name, "version": version}
@@ -173,12 +188,13 @@ class _Crate:
 
     def _root(self) -> Entity:
         record = self.record
-        return {
+        root: Entity = {
             "@id": "./",
             "@type": "Dataset",
             "name": f"{record.name}, run {record.run_id}",
             "description": f"Run of the workflow {record.name} with {record.created_by}: "
-            f"{len(record.cells)} cells, {record.status}.",
+            f"{len(record.cells)} cells, {record.status}. {RECORD_FILE} is the record of all of "
+            f"it. {_how_to_read(record)}",
             "datePublished": record.ended,
             "license": self.license_text,
             "conformsTo": refs(tuple(_PROFILES)),
@@ -186,6 +202,13 @@ class _Crate:
             "mainEntity": ref(WORKFLOW_FILE),
             "mentions": refs((_RUN, *(entities.action_id(cell) for cell in self._cells))),
         }
+        if self.author:
+            root["author"] = root["creator"] = ref(self._author_id)
+        return root
+
+    @property
+    def _author_id(self) -> str:
+        return self.author if _ORCID.fullmatch(self.author) else "#author"
 
     def _input_ids(self) -> tuple[str, ...]:
         return tuple(entities.file_id(file) for entry in self.record.inputs for file in entry.files)
@@ -298,6 +321,8 @@ class _Crate:
             if name in lists:
                 entity["conformsTo"] = ref(_REQUIREMENTS)
                 entity["name"] = "Python packages that were installed"
+            if name == RECORD_FILE:
+                entity["description"] = _how_to_read(self.record)
             if name in published:
                 entity["contentSize"] = str(published[name].size_bytes)
                 entity["sha256"] = published[name].sha256
@@ -407,7 +432,19 @@ class _Crate:
             "@type": "SoftwareApplication",
             "name": name,
             "softwareVersion": version,
+            "description": f"Python package: pip install {_DISTRIBUTION}=={version}",
         }
+
+
+def _how_to_read(record: RunRecord) -> str:
+    """Say how somebody who has the crate alone looks at the record and checks the files."""
+    version = record.created_by.partition(" ")[2]
+    return (
+        f"With the Python package {_DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
+        "this folder says whether record and products are as they were written, `orthoflow show "
+        f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
+        "anew from the input files; any HDF5 reader opens it, too."
+    )
 
 
 def _input_id(name: str) -> str:

@@ -415,11 +415,12 @@ TARGETS = (*FORMATS, None)
             "--cell belongs to --to colmap",
         ),
         ({"license_text": ""}, {"ro-crate"}, "--license belongs to --to ro-crate"),
+        ({"author": "A"}, {"ro-crate"}, "--author belongs to --to ro-crate"),
         ({"embed": True}, {"ro-crate", None}, "writes no record"),
         ({"inputs": ("a=b",), "embed": True}, {"ro-crate", None}, "writes no record"),
         ({"inputs": ("a=b",)}, set(), "--input belongs to --embed"),
     ],
-    ids=["cell", "license", "embed", "embedded inputs", "inputs"],
+    ids=["cell", "license", "author", "embed", "embedded inputs", "inputs"],
 )
 def test_options_belong_to_formats(
     option: dict[str, Any], belongs_to: set[str | None], says: str

@@ -214,6 +214,37 @@ def test_a_license_can_be_given(studio: Studio) -> None:
     assert "--license belongs to --to ro-crate" in refused.stderr
 
 
+@pytest.mark.parametrize(
+    ("author", "identifier"),
+    [("A. Nemo", "#author"), ("https://orcid.org/0000-0002-1825-0097",) * 2],
+)
+def test_who_made_it_is_told_where_it_is_given(
+    studio: Studio, crate: dict[str, Any], author: str, identifier: str
+) -> None:
+    assert "author" not in entities(crate, "Dataset")[0]
+    assert entities(crate, "Person") == []
+    record = open_run(studio.folder / "first").record
+    told: dict[str, Any] = crate_metadata(record, [], license_text="CC0", author=f" {author} ")
+    assert entities(told, "Person") == [{"@id": identifier, "@type": "Person", "name": author}]
+    assert entities(told, "Dataset")[0]["author"] == {"@id": identifier}
+
+
+def test_who_has_the_crate_alone_is_told_how_to_read_and_verify_it(
+    studio: Studio, crate: dict[str, Any]
+) -> None:
+    (record,) = (entity for entity in entities(crate, "File") if entity["@id"] == "run.h5")
+    told = record["description"]
+    assert told in entities(crate, "Dataset")[0]["description"]
+    commands = [part for part in told.split("`") if part.startswith("orthoflow ")]
+    assert commands[0] == "orthoflow verify run.h5"
+    for command in commands[:2]:
+        _, name, file = command.split()
+        done = studio(name, str(studio.folder / "crate" / file))
+        assert done.exit_code == 0, done.output
+    (engine,) = (entity for entity in crate["@graph"] if entity["@id"] == "#engine")
+    assert f"orthoflow-tls=={engine['softwareVersion']}" in engine["description"]
+
+
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:
     import csv
 

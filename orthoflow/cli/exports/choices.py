@@ -18,6 +18,7 @@ class Choices:
     Attributes:
         cell: address of the cell that is meant.
         license_text: of a crate.
+        author: of a crate.
         scale: of sheets, n of 1 : n.
         paper: of sheets.
         grid_m: distance of the crosses on sheets, 0 for none.
@@ -36,6 +37,7 @@ class Choices:
 
     cell: str | None = None
     license_text: str | None = None
+    author: str | None = None
     scale: int | None = None
     paper: str | None = None
     grid_m: float | None = None

@@ -123,7 +123,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     "ro-crate": Format(
         writer="results:export_crate",
         summary="record, report and products as a Provenance Run Crate, for archives",
-        options=frozenset({"license_text"}),
+        options=frozenset({"license_text", "author"}),
     ),
     "sheet": Format(
         writer="drawings:export_sheets",
@@ -137,6 +137,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 FLAGS: Final = {
     "cell": "--cell",
     "license_text": "--license",
+    "author": "--author",
     "colour": "--colour",
     "wall": "--wall",
     "box": "--box",

@@ -66,8 +66,15 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
     record = embedded(run, folder, chosen) if chosen.embed else None
-    files = write_crate(run, folder, license_text=license_text, record=record)
-    return f"{counted(len(files), 'file')}, described in {files[0].name}"
+    author = (chosen.author or "").strip()
+    files = write_crate(run, folder, license_text=license_text, author=author, record=record)
+    lacking = [
+        flag
+        for flag, said in (("--license", chosen.license_text), ("--author", author))
+        if not said
+    ]
+    told = f"; it does not say what {' and '.join(lacking)} would" if lacking else ""
+    return f"{counted(len(files), 'file')}, described in {files[0].name}{told}"
 
 
 def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
