@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError
 
@@ -26,8 +26,10 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
 
     Without -o it lies in the run's folder, with figures/ beside it: the figures as PNG or
     SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
+    Where a record's seal does not hold, the page says so, and this ends with 3.
     """
     from orthoflow.records import REPORT_FILE, open_run
+    from orthoflow.records.verification import broken_seal
     from orthoflow.report import write_page, write_report
 
     opened = [open_run(run) for run in runs]
@@ -38,9 +40,11 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
     target = output if output is not None else opened[0].folder / REPORT_FILE
     if not target.parent.is_dir():
         raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
+    doubts = {run.path: doubt for run in opened if (doubt := broken_seal(run))}
     if output is None:
-        write_page(opened[0], target)
+        write_page(opened[0], target, doubts=doubts)
     else:
-        write_report(opened, target)
+        write_report(opened, target, doubts=doubts)
     echo(f"report: {target}")
-    return EXIT_GOOD
+    say_error(*(f"error: {doubt}; the page says so" for doubt in doubts.values()))
+    return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD

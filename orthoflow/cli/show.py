@@ -10,7 +10,7 @@ import click
 
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.diagnosis import LIBRARIES
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
@@ -36,9 +36,11 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 def show(run: Path, *, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment.
 
-    Of a folder that runs lie in, their table, as `orthoflow runs` has it.
+    Of a folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the
+    seal of the record does not hold.
     """
     from orthoflow.records import RECORD_FILE, open_run
+    from orthoflow.records.verification import broken_seal
 
     if run.is_dir() and not (run / RECORD_FILE).exists():
         found = list_runs([run])
@@ -58,6 +60,9 @@ def show(run: Path, *, as_json: bool) -> int:
         _print_environments(opened)
         _print_files(opened)
         echo("", f"whether all of it is as it was written, says `orthoflow verify {run}`")
+    if doubt := broken_seal(opened):
+        say_error(f"error: {doubt}; rely on nothing that is said of it here")
+        return EXIT_RECORD_DIFFERS
     return EXIT_GOOD
 
 

@@ -12,7 +12,7 @@ from orthoflow_provenance.errors import UnsafeFileError
 from orthoflow_provenance.inner_files import open_below
 from orthoflow_provenance.model import PublishedFile, RunRecord
 from orthoflow_provenance.reader import read_record
-from orthoflow_provenance.verify import verify_record
+from orthoflow_provenance.verify import verify_record, verify_seal
 
 from orthoflow.alike import first_few
 from orthoflow.errors import RecordError
@@ -30,6 +30,9 @@ from orthoflow.records.signatures import check_signature, read_signature
 
 # What shows the record; its digests would have to be in it.
 _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
+
+# Every number and text of a record is smaller; large are only arrays of products and input files.
+_SEALED_BYTES: Final = 1 << 20
 
 PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
@@ -105,6 +108,22 @@ def verify_run(
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=check.n_same,
     )
+
+
+def broken_seal(run: Run) -> str:
+    """Say what of a record was changed since it was sealed; empty where nothing is seen.
+
+    Large arrays are not looked at, so that this costs little: `verify_run` looks at everything.
+
+    Raises:
+        RecordError: the record is damaged.
+    """
+    with record_errors(run.path):
+        findings = verify_seal(run.path, largest_bytes=_SEALED_BYTES)
+    if not findings:
+        return ""
+    places = first_few([finding.place for finding in findings])
+    return f"{run.path} is not as it was written: its seal does not hold for {places}"
 
 
 def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck) -> str:

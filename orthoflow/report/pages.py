@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 from urllib.parse import quote
 
@@ -124,11 +125,14 @@ class _Section:
     viewers: Mapping[str, str]
     title: str = ""
     whole: str = ""
+    doubt: str = ""
     datasets: DatasetTable | None = None
     over: tuple[MetricOverDatasets, ...] = ()
 
 
-def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
+def write_page(
+    run: Run, path: Path, *, go_on: str = "", doubts: Mapping[Path, str] = MappingProxyType({})
+) -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
     Of a comparison these are the figures of the baseline; `write_figures` writes those of any cell.
@@ -138,6 +142,7 @@ def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
         run: the run.
         path: file to write.
         go_on: of a run that was broken off, the command that goes on with it.
+        doubts: record -> why nobody should rely on it.
 
     Raises:
         StoreError: a file cannot be written.
@@ -154,29 +159,43 @@ def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
         for name, page in pages.items():
             target = path.parent / page
             title = f"{run.record.name}: {name}"
-            place = _Place(folder=target.parent, title=title, whole=f"../{path.name}")
+            place = _Place(
+                folder=target.parent, title=title, whole=f"../{path.name}", doubts=doubts
+            )
             _write([parts[name]], target, place)
         place = _Place(
-            folder=path.parent, title=run.record.name, go_on=go_on, pages=pages, has_figures=True
+            folder=path.parent,
+            title=run.record.name,
+            go_on=go_on,
+            doubts=doubts,
+            pages=pages,
+            has_figures=True,
         )
         _write([opened], path, place)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
-def write_report(runs: Sequence[Run], path: Path, *, go_on: str = "") -> None:
+def write_report(
+    runs: Sequence[Run],
+    path: Path,
+    *,
+    go_on: str = "",
+    doubts: Mapping[Path, str] = MappingProxyType({}),
+) -> None:
     """Write one self-contained HTML file about one or more runs.
 
     Args:
         runs: opened with `orthoflow.open_run`; of two, the page also says what differs.
         path: file to write; replaced as a whole, never half.
         go_on: of a run that was broken off, the command that goes on with it.
+        doubts: record -> why nobody should rely on it.
 
     Raises:
         StoreError: the file cannot be written.
         RecordError: a record is damaged.
     """
     title = ", ".join(dict.fromkeys(run.record.name for run in runs))
-    _write(runs, path, _Place(folder=path.parent, title=title, go_on=go_on))
+    _write(runs, path, _Place(folder=path.parent, title=title, go_on=go_on, doubts=doubts))
 
 
 def _make_folder(folder: Path) -> None:
@@ -197,6 +216,7 @@ class _Place:
         folder: that the page lies in.
         title: of the page.
         go_on: of a run that was broken off, the command that goes on with it.
+        doubts: record -> why nobody should rely on it.
         pages: dataset -> its own page; empty for a page that leads to none.
         whole: the page of all datasets, for the one of a single dataset.
         has_figures: the figures' own files are written beside it.
@@ -205,6 +225,7 @@ class _Place:
     folder: Path
     title: str
     go_on: str = ""
+    doubts: Mapping[Path, str] = field(default_factory=dict)
     pages: Mapping[str, str] = field(default_factory=dict)
     whole: str = ""
     has_figures: bool = False
@@ -390,6 +411,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         },
         title=place.title if place.whole else run.record.name,
         whole=place.whole,
+        doubt=place.doubts.get(run.path, ""),
     )
 
 

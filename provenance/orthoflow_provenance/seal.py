@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -34,11 +35,13 @@ class ContentDigests:
         objects: path -> digest of the object with its attributes.
         arrays: path -> fingerprint, for datasets that are arrays of numbers.
         unreadable: path -> why it could not be digested.
+        left_out: paths of datasets larger than was asked for.
     """
 
     objects: Mapping[str, str] = field(default_factory=dict)
     arrays: Mapping[str, ArrayFingerprint] = field(default_factory=dict)
     unreadable: Mapping[str, str] = field(default_factory=dict)
+    left_out: frozenset[str] = frozenset()
 
 
 def seal_file(file: h5py.File) -> str:
@@ -80,17 +83,25 @@ def read_seal(file: h5py.File) -> dict[str, str]:
     return sealed
 
 
-def digest_contents(file: h5py.File) -> ContentDigests:
+def digest_contents(file: h5py.File, *, largest_bytes: float = math.inf) -> ContentDigests:
     """Digest every group and dataset of a file that `safe_open` opened, except the notes.
 
     Damaged places end up in `unreadable`; nothing is raised for them.
+
+    Args:
+        file: the record.
+        largest_bytes: larger datasets are left out.
     """
     objects: dict[str, str] = {}
     arrays: dict[str, ArrayFingerprint] = {}
     unreadable: dict[str, str] = {}
+    left_out: set[str] = set()
     for path, item in _objects(file, unreadable):
         try:
             with reading(path):
+                if isinstance(item, h5py.Dataset) and item.nbytes > largest_bytes:
+                    left_out.add(path)
+                    continue
                 data = _fingerprint(item) if isinstance(item, h5py.Dataset) else None
                 objects[path] = _object_digest(item, path, data)
         except RecordFormatError as error:
@@ -98,7 +109,9 @@ def digest_contents(file: h5py.File) -> ContentDigests:
             continue
         if data is not None and item.dtype.kind in "biuf":
             arrays[path] = data
-    return ContentDigests(objects=objects, arrays=arrays, unreadable=unreadable)
+    return ContentDigests(
+        objects=objects, arrays=arrays, unreadable=unreadable, left_out=frozenset(left_out)
+    )
 
 
 def _objects(

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import pytest
 
 from orthoflow import engine
@@ -80,6 +81,20 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
     assert "is not as it was written, see above\n" in said("verify", path, code=3)
     told = json.loads(said("verify", path, "--json", code=3))
     assert (told["ok"], len(told["findings"])) == (False, 1)
+
+
+def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
+    path, _, _ = write_sample(tmp_path)
+    page = tmp_path / "page.html"
+    said("report", path, "-o", page)
+    warning = "The record of this run was changed after it was written"
+    assert warning not in page.read_text()
+    with h5py.File(path, "r+") as file:
+        file.attrs["seed"] = type(file.attrs["seed"])(b"8")
+    doubt = f"{path} is not as it was written: its seal does not hold for /; "
+    assert doubt in said("show", path, code=3)
+    assert doubt in said("report", path, "-o", page, code=3)
+    assert warning in page.read_text()
 
 
 @pytest.mark.parametrize(
