@@ -50,8 +50,9 @@ def folded(line: str, width: int) -> list[str]:
 def echo_warnings(cells: Iterable[RecordedCell]) -> None:
     """Print what limits the results of cells, a line per sense: the ones that help first."""
     from orthoflow.alike import alike
+    from orthoflow.records.warnings import standing_warnings
 
-    for item in alike((cell.address, text) for cell in cells for text in cell.warnings):
+    for item in alike(standing_warnings(cells)):
         echo_folded(f"warning, {item.where}: {item.sentence}")
 
 

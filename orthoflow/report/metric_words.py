@@ -171,8 +171,8 @@ WORDS: Final[Mapping[str, str]] = {
     "label_recall_mean": "points that are labelled, mean of the planes",
     "label_f1_mean": "labels (F1), mean of the planes",
     "label_iou_mean": "labels (overlap), mean of the planes",
-    "n_planes_guessed": "planes whose side was guessed",
-    "n_planes_seen": "planes seen by photos",
+    "n_planes_guessed": "planes whose side the photos were asked for",
+    "n_planes_seen": "planes whose side photos decided",
     "n_planes_turned": "planes turned to the photos",
     # Clouds and rasters.
     "n_points": "points",

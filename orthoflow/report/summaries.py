@@ -8,6 +8,7 @@ from typing import Final
 
 from orthoflow.alike import alike
 from orthoflow.records import MetricRow, Run, cell_metrics
+from orthoflow.records.warnings import standing_warnings
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
@@ -88,14 +89,15 @@ def answers(run: Run) -> tuple[Answer, ...]:
 def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, those of one sense together.
 
-    Of the warnings those that help stand first, then the frequent ones, then the baseline's.
+    Of the warnings that no later step has settled those that help stand first, then the frequent
+    ones, then the baseline's.
     """
     failures = alike(
         (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
     )
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
-    warnings = alike((cell.address, text) for cell in by_baseline for text in cell.warnings)
+    warnings = alike(standing_warnings(by_baseline))
     return (
         *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),

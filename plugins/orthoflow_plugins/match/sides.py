@@ -100,6 +100,7 @@ class FaceByPhotos(Method):
         shown = cloud.intensity is not None or cloud.rgb is not None
         if not asked or not shown:
             ctx.metric("n_planes_turned", 0, "1")
+            _warn_of_guesses(planes, planes.side_from, ctx)
             return self.Out(planes=planes)
         pictures = [_features(planes, index, cloud, ctx.cores) for index in asked]
         counts = self._counts(inputs.photos, pictures, params, ctx)
@@ -118,6 +119,7 @@ class FaceByPhotos(Method):
                 )
         ctx.metric("n_planes_turned", n_turned, "1")
         ctx.metric("n_planes_seen", sources.count("photos"), "1")
+        _warn_of_guesses(planes, sources, ctx)
         if "photos" not in sources:
             return self.Out(planes=planes)
         return self.Out(planes=replace(planes, side_from=tuple(sources)))
@@ -168,6 +170,18 @@ def _seen_sides(
     if picture is None:
         return np.zeros((len(pictures), 2), dtype=np.intp)
     return side_matches(picture, pictures, USUAL_RULE)
+
+
+def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
+    """Say of which planes the side stays a guess, as the detector said of more of them."""
+    named = sources or [planes.side_source(index) for index in range(len(planes))]
+    guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
+    if guessed:
+        ctx.warn(
+            f"neither stations nor photos say from which side {', '.join(guessed)} of "
+            f"{len(planes)} planes were seen; the side with more of the other points was taken: if "
+            "an image comes out mirrored, set view_from of read.scan"
+        )
 
 
 def _is_asked(planes: Planes, index: int) -> bool:

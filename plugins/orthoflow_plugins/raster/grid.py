@@ -29,7 +29,13 @@ from orthoflow_plugins.raster.crops import (
 from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
 from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.maps import mapped
-from orthoflow_plugins.raster.reporting import report, report_empty, warn, warn_of_wide_gaps
+from orthoflow_plugins.raster.reporting import (
+    report,
+    report_empty,
+    warn,
+    warn_of_covered,
+    warn_of_wide_gaps,
+)
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
 from orthoflow_plugins.raster.sampled_points import SampledPoints, sampled
 from orthoflow_plugins.raster.selection import (
@@ -37,6 +43,7 @@ from orthoflow_plugins.raster.selection import (
     Place,
     WallChoice,
     chosen_planes,
+    covered_planes,
     distance_m,
     frame_of,
     nearest_plane,
@@ -328,9 +335,11 @@ def _crops(
         ranks=params.ranks,
         near=params.near,
     )
+    chosen = chosen_planes(planes, choice)
+    warn_of_covered(ctx, planes.names, covered_planes(planes, choice, chosen))
     frames = {
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
-        for index in chosen_planes(planes, choice)
+        for index in chosen
     }
     if params.crs is not None:
         reach_m = max(max(extent_of(index).buffer_m) for index in frames)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, TypeVar
 
 import numpy as np
@@ -44,6 +44,22 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
                 f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
                 "cells have a point"
             )
+
+
+def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
+    """Tell which planes are not rastered though smaller ones are: a larger wall shows them.
+
+    Args:
+        ctx: of the step.
+        names: of all planes.
+        covered: place of such a plane -> place of the wall that shows it.
+    """
+    for wall in sorted(set(covered.values())):
+        left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
+        ctx.warn(
+            f"no raster, and so no orthoimage, is made of {', '.join(left_out)}: {names[wall]} "
+            "shows this as its relief (set skip_covered to false to have both)"
+        )
 
 
 def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:

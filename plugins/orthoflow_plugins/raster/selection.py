@@ -84,6 +84,27 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
     return chosen
 
 
+def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
+    """Planes left out though they have more support than a chosen one -> the wall they lie on.
+
+    Args:
+        planes: by support.
+        choice: what decided.
+        chosen: what `chosen_planes` chose of them by it.
+    """
+    if not choice.skip_covered or choice.ranks or choice.near:
+        return {}
+    found: dict[int, int] = {}
+    for index in sorted(set(range(max(chosen))) - set(chosen)):
+        is_large = area_m2(planes.corners[index]) >= choice.min_area_m2
+        if not is_large or not _fits(planes, index, choice.constraint):
+            continue
+        walls = (wall for wall in chosen if wall < index and _covers(planes, wall, index, choice))
+        if (wall := next(walls, None)) is not None:
+            found[index] = wall
+    return found
+
+
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
     """Index of the plane nearest to a point (3,), of equally near ones the better supported."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import selection
-from orthoflow_plugins.raster.selection import WallChoice, chosen_planes
+from orthoflow_plugins.raster.selection import WallChoice, chosen_planes, covered_planes
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Planes
@@ -85,6 +85,17 @@ def test_a_plane_inside_a_walls_buffer_is_its_relief(
 ) -> None:
     chosen = chosen_planes(planes(MAIN, other), CHOICE)
     assert chosen == ([0] if is_covered else [0, 1])
+
+
+def test_covered_planes_with_more_support_than_a_wall_are_named_with_what_shows_them() -> None:
+    relief, other, small = (0.08, 1.0, 3.0, 0.0), (0.0, 6.0, 3.0, 0.0), (0.1, 2.0, 1.0, 0.0)
+    four = planes(MAIN, relief, other, small)
+    chosen = chosen_planes(four, CHOICE)
+    assert chosen == [0, 2]
+    assert covered_planes(four, CHOICE, chosen) == {1: 0}
+    # Two that are too small for a wall, or not asked for, are no riddle.
+    assert covered_planes(four, replace(CHOICE, min_area_m2=6.5), chosen) == {}
+    assert covered_planes(four, replace(CHOICE, ranks=(0, 2)), [0, 2]) == {}
 
 
 def test_covered_planes_are_kept_when_asked_for() -> None:
