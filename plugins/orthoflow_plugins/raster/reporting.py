@@ -57,8 +57,8 @@ def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int
     for wall in sorted(set(covered.values())):
         left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
         ctx.warn(
-            f"no raster, and so no orthoimage, is made of {', '.join(left_out)}: {names[wall]} "
-            "shows this as its relief (set skip_covered to false to have both)"
+            f"no raster, and so no orthoimage, is made of {', '.join(left_out)}, which "
+            f"{names[wall]} shows as its relief (set skip_covered to false to have both)"
         )
 
 

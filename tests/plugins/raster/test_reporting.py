@@ -140,7 +140,7 @@ def test_planes_that_another_shows_are_told_in_a_line_per_wall(listener: Listene
     reporting.warn_of_covered(listener.context, names, {})
     (told,) = listener.warnings
     assert told == (
-        "no raster, and so no orthoimage, is made of wall 1, wall 2: wall 0 shows this as its "
+        "no raster, and so no orthoimage, is made of wall 1, wall 2, which wall 0 shows as its "
         "relief (set skip_covered to false to have both)"
     )
 
