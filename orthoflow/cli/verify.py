@@ -46,6 +46,7 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
                 "products": verification.n_products,
                 "inputs": verification.n_inputs,
                 "published": verification.n_published,
+                "seal": verification.seal,
                 "signed_with": verification.signed_with,
                 "findings": list(findings),
                 "notes": list(verification.notes),
@@ -54,6 +55,8 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
         return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
     for note in verification.notes:
         echo(f"note: {note}")
+    if verification.seal:
+        echo(f"seal: sha256:{verification.seal}")
     if not findings:
         echo(_summary(verification))
     else:

@@ -11,7 +11,7 @@ from typing import Final, Literal, TypeAlias
 from orthoflow_provenance.errors import UnsafeFileError
 from orthoflow_provenance.inner_files import open_below
 from orthoflow_provenance.model import PublishedFile, RunRecord
-from orthoflow_provenance.reader import read_record
+from orthoflow_provenance.reader import open_record
 from orthoflow_provenance.verify import verify_record, verify_seal
 
 from orthoflow.alike import first_few
@@ -51,6 +51,8 @@ class Verification:
         findings: one sentence per difference; empty when all is as it was written.
         wrong: what the findings are of, in words; empty without any.
         notes: what could not be checked, a sentence each.
+        seal: the digest that seals the record, 64 hexadecimal digits, as sheets show it; empty
+            where the record itself is not as it was written.
         n_products: products whose arrays lie in the record and were compared with their digest.
         n_inputs: input files that lie in the record and were compared with their digest.
         n_published: files beside the record that are as they were published.
@@ -62,6 +64,7 @@ class Verification:
     findings: tuple[str, ...]
     wrong: str = ""
     notes: tuple[str, ...] = ()
+    seal: str = ""
     n_products: int = 0
     n_inputs: int = 0
     n_published: int = 0
@@ -92,8 +95,8 @@ def verify_run(
     if findings:
         wrong = f"{record_path} is not as it was written"
         return Verification(path=record_path, findings=findings, wrong=wrong)
-    with record_errors(record_path):
-        record = read_record(record_path)
+    with record_errors(record_path), open_record(record_path) as opened:
+        record, seal = opened.record, opened.content_sha256
     check = _check_published(record_path.parent, record) if also_published else _PublishedCheck()
     signature = _check_signature(record_path, signer)
     return Verification(
@@ -101,6 +104,7 @@ def verify_run(
         findings=(*signature.findings, *check.changed),
         wrong=_wrong_beside(record_path, signature, check),
         notes=(*signature.notes, *check.notes),
+        seal=seal,
         signed_with=signature.signed_with,
         n_products=sum(
             product.embedded for cell in record.cells for product in cell.outputs.values()

@@ -9,6 +9,7 @@ from typing import Any
 
 import h5py
 import pytest
+from orthoflow_provenance.reader import open_record
 
 from orthoflow import engine
 from orthoflow.cli.plan import _as_json, _summary
@@ -66,7 +67,9 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
 
 def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
-    assert said("verify", path) == "verified: 1 product, seal ok\n"
+    with open_record(path) as opened:
+        seal = opened.content_sha256
+    assert said("verify", path) == f"seal: sha256:{seal}\nverified: 1 product, seal ok\n"
     assert json.loads(said("verify", path, "--json")) == {
         "record": str(path),
         "ok": True,
@@ -75,6 +78,7 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
         "published": 0,
         "findings": [],
         "notes": [],
+        "seal": seal,
         "signed_with": "",
     }
     path.write_bytes(path.read_bytes()[:-1])
