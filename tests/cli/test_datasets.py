@@ -151,7 +151,9 @@ def test_each_dataset_becomes_a_run_folder_that_stands_alone(folder: Path, tmp_p
     assert open_run(tmp_path / "split" / "attic").record.status == "failed"
     for name in ("hall", "attic"):
         found = verify_run(tmp_path / "split" / name)
-        assert (found.findings, found.notes) == ((), ())
+        assert found.findings == ()
+        # The report is made anew from the record, so that no digest holds it.
+        assert all(note.startswith("not covered: report.html") for note in found.notes)
     done = orthoflow(
         tmp_path, "replay", "split/hall", "-o", "again", "--input", f"number={folder}/data"
     )
