@@ -171,7 +171,6 @@ class _News:
     def __init__(self, listen: Listener) -> None:
         self._listen = listen
         self._last = StepEvent(kind="progress", text="", fraction=0.0)
-        self._n_kernels = 0
 
     def listen(self, event: StepEvent) -> None:
         """Pass on what the method says."""
@@ -180,13 +179,8 @@ class _News:
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """Say what is compiled, and how many of the step's so far; then what was said before.
-
-        How many there will be, nobody knows: which ones are needed hangs on the data.
-        """
-        self._n_kernels += bool(text)
-        told = f"{text} ({self._n_kernels} in this step so far)" if text else self._last.text
-        self._listen(dataclasses.replace(self._last, text=told))
+        """Say what is compiled; when that is over, what was said before."""
+        self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
 class _Call:
