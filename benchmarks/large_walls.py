@@ -175,15 +175,7 @@ def run_openings(folder: Path, side: int) -> None:
     for first in range(0, side, ROWS_AT_ONCE):
         part = slice(first, first + ROWS_AT_ONCE)
         mask[part], count[part] = SurfaceMask.MEASURED, 1
-    wall = Wall(
-        frame=raster,
-        plane_index=0,
-        name="wall",
-        depth_m=depth_m,
-        sigma_m=depth_m,
-        count=count,
-        mask=mask,
-    )
+    wall = made_wall(raster, depth_m, count, mask)
     walls = Walls(
         walls=(wall,), up=UP, intensity_source="none", buffer_front_m=0.1, buffer_behind_m=0.3
     )
@@ -197,6 +189,19 @@ def run_openings(folder: Path, side: int) -> None:
     expect("the niche is found", is_met=bool(metrics["n_found_openings"] == 1))
     off = metrics["side_max_mm"]
     expect(f"its sides are within a cell, not {off:.2f} mm off", is_met=bool(off <= 1e3 * GSD_M))
+
+
+def made_wall(cells: WallFrame, depth_m: NDArray, count: NDArray, mask: NDArray) -> Wall:
+    """A wall of these cells."""
+    return Wall(
+        frame=cells,
+        plane_index=0,
+        name="wall",
+        depth_m=depth_m,
+        sigma_m=depth_m,
+        count=count,
+        mask=mask,
+    )
 
 
 def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
@@ -213,16 +218,7 @@ def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
         rgb[rows] = np.rint(waves(right - SHIFT_CELLS, down))[:, :, np.newaxis]
         intensity[rows] = (waves(right, down) / 255.0) ** 2
         mask[rows], count[rows] = 1, 1
-    wall = Wall(
-        frame=frame(side),
-        plane_index=0,
-        name="wall",
-        depth_m=depth_m,
-        sigma_m=depth_m,
-        count=count,
-        mask=mask,
-        intensity=intensity,
-    )
+    wall = replace(made_wall(frame(side), depth_m, count, mask), intensity=intensity)
     walls = Walls(
         walls=(wall,),
         up=UP,

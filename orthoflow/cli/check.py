@@ -71,5 +71,7 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
 
 def _baseline_text(workflow: Workflow) -> str:
     """Which variants the others are compared with: of a sweep, nobody named it."""
-    named = ", ".join(f"{step}={variant}" for step, variant in workflow.baseline.items())
+    from orthoflow.workflow import variants_text
+
+    named = variants_text(workflow.baseline)
     return f"; baseline {named}" if named else ""

@@ -33,15 +33,15 @@ class Library:
         module: what is imported.
         use: what needs it.
         is_core: nothing works without it.
-        is_extra: it is no part of a plain installation; `pip install` gets it by this name, with
-            the extras of its own that are used.
+        extra: by what `pip install` gets it, with the extras of its own that are used; empty
+            for a part of a plain installation.
     """
 
     distribution: str
     module: str
     use: str
     is_core: bool = False
-    is_extra: str = ""
+    extra: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,13 +122,13 @@ LIBRARIES: Final = (
         distribution="cryptography",
         module="cryptography",
         use="signatures of records: sign, verify --signer",
-        is_extra="cryptography[ssh]",
+        extra="cryptography[ssh]",
     ),
     Library(
         distribution="distributed",
         module="distributed",
         use="clusters: --executor dask",
-        is_extra="distributed",
+        extra="distributed",
     ),
 )
 
@@ -169,11 +169,11 @@ def diagnose_library(library: Library) -> Diagnosis:
     if version:
         found, way_out = f"{version}, but {problem}", _way_out(problem)
     else:
-        wanted = f"'{library.is_extra}'" if "[" in library.is_extra else library.distribution
+        wanted = f"'{library.extra}'" if "[" in library.extra else library.distribution
         found, way_out = "not installed", f"pip install {wanted}"
     return replace(
         good,
-        verdict="limited" if library.is_extra and not version else "missing",
+        verdict="limited" if library.extra and not version else "missing",
         found=found,
         cost=f"not to be had: {library.use} ({way_out})",
     )

@@ -228,8 +228,9 @@ def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> Non
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))
     from orthoflow.report.combinations import baseline_of
+    from orthoflow.workflow import variants_text
 
-    if baseline := ", ".join(f"{step}={name}" for step, name in baseline_of(run).items()):
+    if baseline := variants_text(baseline_of(run)):
         echo(f"baseline: {baseline}, with which the others are compared")
     echo(f"products: {run.products_folder}")
     echo(f"report: {report}")

@@ -25,12 +25,12 @@ from orthoflow.errors import PluginError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import MappedPort, Method, mapped_port, port_specs
+from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.cells import Cell
 
 _WHAT: Final = "orthoflow/cell"
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
-_DISTRIBUTION: Final = "orthoflow-tls"
 # What a method's result can depend on in the framework; engine and command line cannot change it.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
@@ -180,7 +180,7 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 def is_framework_released() -> bool:
     """Whether the framework came from an index, so that its version stands for its code."""
     try:
-        distribution = metadata.distribution(_DISTRIBUTION)
+        distribution = metadata.distribution(DISTRIBUTION)
     except metadata.PackageNotFoundError:
         return False
     if distribution.read_text("direct_url.json") is not None:
@@ -191,7 +191,7 @@ def is_framework_released() -> bool:
 def framework_tag() -> str:
     """What stands for the framework's code: the version of a release, else the digest."""
     if is_framework_released():
-        return metadata.version(_DISTRIBUTION)
+        return metadata.version(DISTRIBUTION)
     return files_digest(framework_files())
 
 

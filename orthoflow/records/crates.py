@@ -31,6 +31,7 @@ from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating, path_inside
 from orthoflow.records.runs import REPORT_FILE, Run
 from orthoflow.records.signatures import SIGNATURE_SUFFIX
+from orthoflow.version import DISTRIBUTION
 
 NO_LICENSE: Final = "not stated: ask who made these results"
 METADATA_FILE: Final = "ro-crate-metadata.json"
@@ -46,7 +47,6 @@ _BIOSCHEMAS: Final = "https://bioschemas.org/profiles/ComputationalWorkflow/1.0-
 _REQUIREMENTS: Final = "https://pip.pypa.io/en/stable/reference/requirements-file-format/"
 _LANGUAGE: Final = "#orthoflow-workflow-format"
 _ENGINE: Final = "#engine"
-_DISTRIBUTION: Final = "orthoflow-tls"
 _ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]")
 _RUN: Final = "#run"
 _CONTEXT: Final[list[JsonValue]] = [
@@ -432,7 +432,7 @@ class _Crate:
             "@type": "SoftwareApplication",
             "name": name,
             "softwareVersion": version,
-            "description": f"Python package: pip install {_DISTRIBUTION}=={version}",
+            "description": f"Python package: pip install {DISTRIBUTION}=={version}",
         }
 
 
@@ -440,7 +440,7 @@ def _how_to_read(record: RunRecord) -> str:
     """Say how somebody who has the crate alone looks at the record and checks the files."""
     version = record.created_by.partition(" ")[2]
     return (
-        f"With the Python package {_DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
+        f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
         "anew from the input files; any HDF5 reader opens it, too."

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthoflow.files.json_texts import parse_json
 from orthoflow.records import NOT_YET, RecordedCell, Run, cell_metrics
+from orthoflow.workflow.cells import variants_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ class Combination:
     @property
     def name(self) -> str:
         """The variants in words, e.g. `plane=ransac, orient=pnp`."""
-        return ", ".join(f"{step}={variant}" for step, variant in self.assignment.items())
+        return variants_text(self.assignment)
 
     @property
     def failure(self) -> RecordedCell | None:

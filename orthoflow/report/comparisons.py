@@ -14,6 +14,7 @@ from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
+from orthoflow.workflow.cells import variants_text
 
 _NOTHING: Final = "-"
 _NAMED: Final = 3  # numbers that a combination is best in
@@ -131,10 +132,12 @@ class ComparisonTable:
     def _names(self) -> list[str]:
         """What tells each row from the others."""
         variants = (
-            ", ".join(
-                f"{step}={chosen}"
-                for step, chosen in zip(self.steps, row.variants, strict=True)
-                if chosen != _NOTHING
+            variants_text(
+                {
+                    step: chosen
+                    for step, chosen in zip(self.steps, row.variants, strict=True)
+                    if chosen != _NOTHING
+                }
             )
             for row in self.rows
         )

@@ -14,6 +14,7 @@ from orthoflow.records import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.rankings import Sense, badness
+from orthoflow.workflow.cells import variants_text
 from orthoflow.workflow.format import DATA
 
 # The datasets that decide make up at least this share of all differences.
@@ -121,8 +122,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
 
 
 def _method(one: Combination) -> str:
-    pairs = (f"{step}={variant}" for step, variant in one.assignment.items() if step != DATA)
-    return ", ".join(pairs)
+    return variants_text({k: v for k, v in one.assignment.items() if k != DATA})
 
 
 def _methods(

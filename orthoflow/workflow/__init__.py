@@ -10,6 +10,7 @@ from orthoflow.workflow.cells import (
     check_step_names,
     derive_seed,
     expand_cells,
+    variants_text,
 )
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.doubts import doubts_about
@@ -59,5 +60,6 @@ __all__ = [
     "shipped_workflow",
     "shipped_workflows",
     "topological_steps",
+    "variants_text",
     "workflow_schema",
 ]

@@ -153,6 +153,11 @@ def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
 
 
+def variants_text(assignment: Mapping[str, str]) -> str:
+    """Say which variants are chosen, `plane=ransac, orient=pnp`; empty for none."""
+    return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
+
+
 def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
     """Refuse names of steps that are not there, e.g. of `--force`.
 

@@ -46,7 +46,7 @@ def test_a_missing_library_costs_what_it_is_used_for() -> None:
 
 def test_a_missing_extra_is_a_restriction_only() -> None:
     extra = Library(
-        distribution="no-such", module="no_such", use="signatures", is_extra="no-such[ssh]"
+        distribution="no-such", module="no_such", use="signatures", extra="no-such[ssh]"
     )
     found = diagnose_library(extra)
     assert (found.verdict, found.found, found.use) == ("limited", "not installed", "signatures")
@@ -64,7 +64,7 @@ def test_every_library_that_an_installation_brings_is_looked_at_and_said_what_it
     # The wheel of open3d has another name on Linux; laspy[lazrs] brings lazrs.
     assert looked_at.keys() - {"lazrs"} == brought - {"open3d"}
     assert all(library.use for library in looked_at.values())
-    assert {name for name, library in looked_at.items() if library.is_extra} == {
+    assert {name for name, library in looked_at.items() if library.extra} == {
         *("cryptography", "distributed")
     }
 

@@ -93,8 +93,9 @@ def write_on_white(
     )
 
 
-def text_width_mm(text: str, high_mm: float) -> float:
-    """How wide a line of bold text is on the paper; of plain text a little less."""
+def text_width_mm(text: str, high_mm: float, *, is_bold: bool = True) -> float:
+    """How wide a line of text is on the paper."""
     from reportlab.pdfbase.pdfmetrics import stringWidth
 
-    return float(stringWidth(shown(text), f"{FONT}-Bold", font_points(high_mm))) / POINTS_PER_MM
+    font = f"{FONT}-Bold" if is_bold else FONT
+    return float(stringWidth(shown(text), font, font_points(high_mm))) / POINTS_PER_MM

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import MARGIN_MM, Part
 from orthoflow.files.drawings.pens import (
-    FONT,
     LABEL_MM,
     POINTS_PER_MM,
-    font_points,
     line,
     text_width_mm,
     write_on_white,
@@ -64,13 +62,10 @@ class _Column:
 
     def rows(self, text: str, high_mm: float) -> list[str]:
         """Break a text into rows as wide as the column; words that are wider are broken too."""
-        from reportlab.pdfbase.pdfmetrics import stringWidth
-
         # As wide as bold letters are.
-        limit, size = 0.98 * self.width * POINTS_PER_MM, font_points(high_mm)
         rows, row = [], ""
         for word in _pieces(shown(text)):
-            if row and stringWidth((row + word).rstrip(), f"{FONT}-Bold", size) > limit:
+            if row and text_width_mm((row + word).rstrip(), high_mm) > 0.98 * self.width:
                 rows.append(row.strip())
                 row = ""
             row += word

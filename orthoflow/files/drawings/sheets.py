@@ -24,7 +24,6 @@ from orthoflow.files.drawings.pens import (
     LABEL_MM,
     POINTS_PER_MM,
     THIN_MM,
-    font_points,
     line,
     text_width_mm,
     write_on_white,
@@ -179,11 +178,9 @@ def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
 
 def _write_inside(canvas: Canvas, text: str, limits_mm: tuple[float, float, float]) -> None:
     """Write the parts of a text on white, from the top, where left and right are far enough."""
-    from reportlab.pdfbase.pdfmetrics import stringWidth
-
     left, right, top = limits_mm
     rows = shown(text).split(", ")
-    wide = max(stringWidth(row, FONT, font_points(LABEL_MM)) for row in rows) / POINTS_PER_MM
+    wide = max(text_width_mm(row, LABEL_MM, is_bold=False) for row in rows)
     if right - left < wide + 2.0 * LABEL_MM:
         return
     high = 1.7 * LABEL_MM * len(rows)
