@@ -13,7 +13,7 @@ from typing import Any, Final, NoReturn
 import click
 
 from orthoflow.cli.commands import LazyCommand, LazyGroup, Session, debug_parameter
-from orthoflow.cli.failures import explain, say_error, silence_stdout
+from orthoflow.cli.failures import EXIT_CELL_FAILED, explain, say_error, silence_stdout
 from orthoflow.cli.tables import echo
 from orthoflow.version import __version__
 
@@ -70,7 +70,8 @@ class Program(LazyGroup):
             code = error.exit_code
         except Exception as error:  # noqa: BLE001 - the last stop before the user
             code = explain(error, session)
-        sys.exit(code if isinstance(code, int) else 0)
+        # A command that does not say how it ended did not end well.
+        sys.exit(code if isinstance(code, int) else EXIT_CELL_FAILED)
 
     def invoke(self, ctx: click.Context) -> object:
         """Run the chosen command; a reader that closed the pipe early is no error."""

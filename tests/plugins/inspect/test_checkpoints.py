@@ -18,6 +18,7 @@ from orthoflow_plugins.inspect.findings import (
     outliers_iterated,
 )
 from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.point_places import ShownPoint
 from orthoflow_plugins.inspect.targets import find_crossing
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.raster.grid import RasterGrid
@@ -332,3 +333,41 @@ def test_the_log_names_the_points_that_are_furthest_off_and_not_thousands(
     assert len(told) == 200
     assert told[0] == "check point p299: +2.99 mm right, -1.00 mm down"
     assert told[-1].startswith("check point p100: ")
+
+
+def test_a_point_that_is_not_found_has_no_place_in_the_table() -> None:
+    gone, found = (
+        ShownPoint(
+            how=how,
+            wall=wall,
+            expected=np.array([10.0, 20.0]),
+            place=np.array(place),
+            point_world=np.full(3, np.nan),
+        )
+        for how, wall, place in (
+            ("not found", 0, [np.nan, 5.0]),
+            ("target", 2, [11.25, 19.5]),
+        )
+    )
+    surveyed = CheckPoints(
+        names=("a", "b"),
+        points_world=np.zeros((2, 3)),
+        classes=("wall", "niche"),
+        wall=np.array([0, 2], dtype=np.int32),
+        pixels_wall=np.zeros((2, 2)),
+    )
+    rows = checkpoints._table([gone, found], surveyed, {0: 0.01, 2: 0.004}, {0: 7, 2: 9})
+    assert rows == [
+        {"name": "a", "class": "wall", "how": "not found"},
+        {
+            "name": "b",
+            "class": "niche",
+            "how": "target",
+            "wall": 9,
+            "u_px": 11.25,
+            "v_px": 19.5,
+            # 4 mm a cell.
+            "x_mm": 5.0,
+            "y_mm": -2.0,
+        },
+    ]

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.assignment_kernels import assign_points, sum_assigned
-from orthoflow_plugins.plane.block_kernels import each_part, piece_of
-from orthoflow_plugins.plane.sample import Claim, PreparedCloud, Unassigned, prepare
+from orthoflow_plugins.plane.block_kernels import PlanGrid, each_part, piece_of
+from orthoflow_plugins.plane.sample import (
+    Claim,
+    PreparedCloud,
+    Unassigned,
+    draw_sample,
+    plan_grid,
+    prepare,
+    thinned,
+)
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, wall_axes
 from tests.plane_scenes import cloud_of
 
@@ -109,3 +121,159 @@ def test_a_plane_alone_has_the_same_sums_in_both_passes(parts: int) -> None:
     assert np.abs(steps - alone.steps).max() <= n_fit.max()
     apart = np.abs(squares - alone.squared_steps)
     assert (apart <= 2 * STEPS_PER_TOLERANCE * np.maximum(n_fit, 1)).all()
+
+
+# --- which points stand for all, and where the scene ends ---
+
+
+def test_one_point_of_each_of_200000_stretches_is_drawn_at_places_of_the_golden_ratio() -> None:
+    stretch = 3.5
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (700_000, 3))
+    cloud = cloud_of(points)
+    sample = draw_sample(cloud)
+    assert sample.n_represented == stretch
+    ordinal = np.arange(200_000)
+    golden = np.modf(ordinal * (np.sqrt(5.0) - 1.0) / 2.0)[0]
+    np.testing.assert_array_less(np.abs(sample.index / stretch - ordinal - golden), 1.0 / stretch)
+    np.testing.assert_array_equal(sample.offsets_m, points[sample.index].astype(np.float32))
+    np.testing.assert_array_equal(sample.points.z, points[sample.index, 2].astype(np.float32))
+
+
+@pytest.mark.parametrize("n_points", [3, 7])
+def test_of_a_small_cloud_all_points_are_drawn(n_points: int) -> None:
+    sample = draw_sample(cloud_of(np.arange(3.0 * n_points).reshape(-1, 3)))
+    np.testing.assert_array_equal(sample.index, np.arange(n_points))
+    assert sample.n_represented == 1.0
+
+
+@pytest.mark.parametrize(
+    ("n_points", "every", "n_kept"),
+    [(12, 1, 12), (12, 2, 6), (12, 4, 3), (12, 5, 3), (2, 2, 2), (0, 3, 0)],
+)
+def test_thinning_keeps_every_nth_point_and_three_at_least(
+    n_points: int, every: int, n_kept: int
+) -> None:
+    points = np.arange(3.0 * n_points).reshape(-1, 3)
+    bare = replace(
+        cloud_of(points),
+        intensity=np.zeros(n_points, dtype=np.float32),
+        scan=np.arange(n_points, dtype=np.uint16),
+    )
+    kept = thinned(bare, every)
+    assert len(kept) == n_kept
+    assert kept.scan is not None
+    np.testing.assert_array_equal(kept.scan, kept.x / 3.0)
+    assert (kept.intensity is None) == (every > 1)
+    stretch = n_points / max(n_kept, 1)
+    np.testing.assert_array_equal(kept.scan // max(stretch, 1.0), np.arange(n_kept))
+
+
+def boxed_scene(
+    low: tuple[float, float, float], high: tuple[float, float, float], *, n: int = 4_000
+) -> NDArray[np.float64]:
+    """Points in a box, its corners among them."""
+    points = np.random.default_rng(2).uniform(low, high, (n, 3))
+    points[0], points[1] = low, high
+    return points
+
+
+def grid_of(
+    points: NDArray[np.float64], *, cell_m: float = 0.1, outside_share: float = 0.0
+) -> PlanGrid:
+    return plan_grid(
+        draw_sample(cloud_of(points)), np.eye(3), cell_m=cell_m, outside_share=outside_share
+    )
+
+
+def test_a_plan_has_five_cells_and_a_fiftieth_about_the_scene() -> None:
+    grid = grid_of(boxed_scene((-2.0, 1.0, 0.0), (4.0, 4.0, 2.0)))
+    np.testing.assert_allclose(grid.low_m, [-2.62, 0.44, -0.54], atol=1e-6)
+    assert grid.cell_m == 0.1
+    # 7.24 x 4.12 x 3.08 m.
+    assert grid.shape == (73, 42, 31)
+    np.testing.assert_allclose(
+        prepare(
+            cloud_of(boxed_scene((-2.0, 1.0, 0.0), (4.0, 4.0, 2.0))),
+            np.eye(3),
+            cell_m=0.1,
+            least_share=0.0,
+            parts=1,
+        ).box_corners()[[0, -1]],
+        [[-2.62, 0.44, -0.54], [4.68, 4.64, 2.56]],
+        atol=1e-6,
+    )
+
+
+def test_what_is_farther_off_than_the_scene_is_long_does_not_widen_the_plan() -> None:
+    points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0))
+    # Nine tenths of the points lie within 9 m.
+    points[2:4] = [[18.0, 2.0, 1.0], [-8.0, 2.0, 1.0]]
+    beside = grid_of(points)
+    points[2:4] = [[20.5, 2.0, 1.0], [-10.5, 2.0, 1.0]]
+    stray = grid_of(points)
+    assert beside.low_m[0] == pytest.approx(-8.0 - 0.5 - 0.02 * 26.0, abs=1e-6)
+    assert stray.low_m[0] == pytest.approx(-0.5 - 0.02 * 10.0, abs=1e-6)
+    # 26 and 10 m with their margins, to a cell.
+    assert beside.shape[0] == pytest.approx(281, abs=1)
+    assert stray.shape[0] == pytest.approx(114, abs=1)
+
+
+def test_some_points_may_lie_outside_the_plan_on_each_side() -> None:
+    points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0), n=10_001)
+    points[:, 0] = np.linspace(0.0, 10.0, 10_001)
+    # A hundredth at either end, and a fiftieth of the rest and a cell's worth besides.
+    grid = grid_of(points, outside_share=0.01)
+    assert grid.low_m[0] == pytest.approx(0.1 - 0.5 - 0.02 * 9.8, abs=1e-5)
+    assert grid.shape[0] == math.ceil((9.8 * 1.04 + 1.0) / 0.1)
+
+
+@pytest.mark.parametrize(
+    ("high", "cell_m"),
+    [
+        # Eight million cells of the plan, and as many storeys, at most.
+        ((10_000.0, 8_000.0, 2.0), math.sqrt((10_400.0 + 1.0) * (8_320.0 + 1.0) / 8e6)),
+        ((1e6, 1.0, 2.0), (1.04e6 + 1.0) / 8e6),
+    ],
+    ids=["wide", "long"],
+)
+def test_cells_grow_where_a_plan_would_have_too_many(
+    high: tuple[float, float, float], cell_m: float
+) -> None:
+    wanted = 0.1 if high[0] < 1e5 else 0.01
+    grid = grid_of(boxed_scene((0.0, 0.0, 0.0), high), cell_m=wanted)
+    margins = {0.1: cell_m, 0.01: (1.04e6 + 0.1) / 8e6}
+    assert grid.cell_m == pytest.approx(
+        max(margins[wanted], math.sqrt(1.04e6 * (1.04 + 0.1) / 8e6) if wanted == 0.01 else 0.0),
+        rel=1e-6,
+    )
+
+
+def test_of_more_than_20000_points_every_nth_shows_where_the_scene_ends() -> None:
+    points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0), n=40_000)
+    points[1] = (5.0, 2.0, 1.0)
+    points[1::2] += (3.0, 0.0, 0.0)
+    assert grid_of(points).shape[0] == grid_of(points[::2]).shape[0] < grid_of(points[2:]).shape[0]
+
+
+@pytest.mark.parametrize(
+    ("spread_m", "sentence"),
+    [
+        ((0.0, 0.0, 0.0), "coincide"),
+        ((1.0, 0.0, 0.0), "lie on one line"),
+        ((1.0, 5e-5, 5e-5), "lie on one line"),
+        ((5e-5, 5e-5, 5e-5), "coincide"),
+    ],
+)
+def test_points_that_fix_no_plane_are_refused(
+    spread_m: tuple[float, float, float], sentence: str
+) -> None:
+    points = np.random.default_rng(0).normal(size=(100, 3)) * spread_m
+    with pytest.raises(MethodError, match=f"the 100 points of the cloud {sentence}"):
+        prepare(cloud_of(points), np.eye(3), cell_m=0.1, least_share=0.1, parts=1)
+
+
+@pytest.mark.parametrize(("asked", "parts"), [(0, 1), (3, 3), (8, 8), (9, 8)])
+def test_passes_have_eight_parts_at_most(asked: int, parts: int) -> None:
+    points = np.random.default_rng(0).normal(size=(100, 3)) * (1.0, 2e-4, 0.0)
+    found = prepare(cloud_of(points), np.eye(3), cell_m=0.1, least_share=0.1, parts=asked)
+    assert found.parts == parts
