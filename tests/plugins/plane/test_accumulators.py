@@ -88,6 +88,18 @@ def test_edges_of_the_density_vote_alone() -> None:
     assert not vote_counts(np.zeros((5, 5), dtype=np.int64), "canny").any()
 
 
+@pytest.mark.parametrize(("step_grey", "is_edge"), [(38, False), (42, True), (120, True)])
+def test_densities_of_which_one_is_much_the_denser_have_an_edge_between_them(
+    step_grey: int, is_edge: bool
+) -> None:
+    """Grey is the logarithm of the points, white the densest; steps of 40 stand out."""
+    counts = np.full((30, 40), 100_000, dtype=np.int64)
+    counts[:, :20] = round(np.expm1(np.log1p(100_000) * (255 - step_grey) / 255))
+    rows, columns = np.nonzero(vote_counts(counts, "canny"))
+    assert set(columns.tolist()) <= {19, 20}
+    assert len(rows) >= 28 if is_edge else not len(rows)
+
+
 def test_voters_stand_in_the_middle_of_their_cells() -> None:
     votes = np.zeros((6, 4), dtype=np.int64)
     votes[0, 0], votes[5, 1] = 3, -2
