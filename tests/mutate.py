@@ -18,7 +18,8 @@ A place is a line with something to mutate. What is done to it:
 Left alone is what no test should hold: docstrings, annotations, decorators, what only type checkers
 read, messages and whatever else an exception is raised with, log and progress lines, `__repr__`,
 assertions of what cannot happen, version numbers of results, what changes speed or looks alone
-(threads, sizes of parts, bands and caches, from how many on, a hundred thousand or more, a part is
+(threads, sizes of parts, bands and caches, the room of arrays that kernels make for themselves and
+that tables which grow begin with, from how many on, a hundred thousand or more, a part is
 looked at in place of all, arguments, margins and sizes of drawings, colours and paints, floats
 below a millionth that guard a division), which seed samples begin with, how long another process is
 waited for at most, and how often a search goes on at most: one that has converged moves no more.

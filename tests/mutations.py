@@ -73,10 +73,13 @@ _UNSEEN_NAMES: Final = re.compile(
     r"|BAND_(CELLS|PX)|_BLOCK(_ROWS|_ENTRIES)?$|_(LONGEST|SMALLEST|MAP)_PX$|PIXELS_MOST$"
     r"|_RGB$|_BGR$|_SEED$|^_?(INK|PAPER)$"
     r"|(TIMEOUT|PATIENCE|CONNECT|STOPPING|CLOSE|GRACE|LOOK|LOOK_EVERY|SILENT|PAUSE|RETRY)_S$"
-    r"|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|THREADS$|^(result_version|citations|cores|threads)$"
+    r"|(ROWS|VOXELS)_FIRST$|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|THREADS$|^(result_version|citations|cores|threads)$"
 )
 # What lays out a drawing, and how a made-up surface looks.
 _LOOKS: Final = re.compile(r"^(Margins|Paint)$")
+# Decorators of compiled functions, and what makes the arrays that they write their sums to.
+_COMPILED: Final = frozenset({"compiled", "kernel_part"})
+_ROOM: Final = frozenset({"empty", "zeros"})
 # From how many on a part is looked at in place of all: no quick test has so many.
 _SIZES: Final = re.compile(r"(MOST|TOLD|ASKED|FIRST)$")
 _MANY: Final = 100_000
@@ -138,6 +141,7 @@ class _Finder(ast.NodeVisitor):
         self.mutations: list[Mutation] = []
         self._path = path
         self._source = source
+        self._is_compiled = False
         self._starts = [0]
         for text in source.splitlines(keepends=True):
             self._starts.append(self._starts[-1] + len(text))
@@ -162,8 +166,15 @@ class _Finder(ast.NodeVisitor):
         # Any negative length means the one that is left.
         is_flat = name == "reshape" and any(ast.unparse(item) == "-1" for item in node.args)
         is_told = _TOLD.match(name) or name.endswith(("Error", "Warning"))
-        if not is_told and not _LOOKS.match(name) and not is_flat:
-            self.generic_visit(node)
+        if is_told or _LOOKS.match(name) or is_flat:
+            return
+        if self._is_compiled and name in _ROOM:
+            # Of arrays that a kernel makes for itself one more row is more room, and no more.
+            for part in _shape_of(node):
+                if not isinstance(part, ast.Constant):
+                    self.visit(part)
+            return
+        self.generic_visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
         if not _UNSEEN_KEYWORDS.match(node.arg or ""):
@@ -182,8 +193,10 @@ class _Finder(ast.NodeVisitor):
         for named, default in zip(names, [*args.defaults, *args.kw_defaults], strict=True):
             if default is not None and not _UNSEEN_NAMES.search(named.arg):
                 self.visit(default)
+        self._is_compiled = any(_name_of(item) in _COMPILED for item in node.decorator_list)
         for item in node.body:
             self.visit(item)
+        self._is_compiled = False
 
     def visit_Assign(self, node: ast.Assign) -> None:
         if not any(_is_unseen(target, node.value) for target in node.targets):
@@ -296,6 +309,12 @@ def _name_of(node: ast.expr) -> str:
     if isinstance(node, ast.Attribute):
         return node.attr
     return node.id if isinstance(node, ast.Name) else ""
+
+
+def _shape_of(node: ast.Call) -> list[ast.expr]:
+    """The sides of the array that a call makes."""
+    shape = node.args[0]
+    return list(shape.elts) if isinstance(shape, ast.Tuple) else [shape]
 
 
 def _is_unseen(target: ast.expr, value: ast.expr) -> bool:

@@ -95,6 +95,9 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "def f(*, cores: int = 1): ...",
         "class A:\n    cores: int = 1",
         "b.reshape(-1)",
+        "_ROWS_FIRST: Final = 4_096",
+        "@compiled\ndef f(): a = np.empty((3, n), dtype=np.int32)",
+        "@kernel_part\ndef f(): a = np.zeros(10)",
         "return None",
     ],
 )
@@ -110,6 +113,11 @@ def test_what_no_test_should_hold_is_left_alone(source: str) -> None:
         "_BITS: Final = 1 << 22",
         "N_FIRST = (1, 2)",
         "LONGEST_SIDE_PX: Final = 1200",
+        "_CELLS_FIRST: Final = 4_096",
+        "@compiled\ndef f(): a = np.empty(n + 4)",
+        "@compiled\ndef f(): a = np.full(3, 1)",
+        "@compiled\ndef f(): b = a[3]",
+        "def f(): a = np.zeros((0, 3))",
     ],
 )
 def test_what_small_data_meets_is_changed(source: str) -> None:
