@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 import re
@@ -11,9 +12,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli import diagnosis, program
+from orthoflow.cli import diagnosis, doctor, program
 from orthoflow.cli.diagnosis import Library, diagnose_library, diagnose_machine
 from orthoflow.engine import memory
+from orthoflow.version import __version__
 
 GIB = 1 << 30
 CLICK = Library(distribution="click", module="click", use="everything", is_core=True)
@@ -210,3 +212,28 @@ def test_every_library_of_the_core_is_one() -> None:
         *("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich"),
         "ruamel.yaml",
     }
+
+
+@pytest.mark.parametrize(
+    ("costs", "broken_core", "last"),
+    [
+        ([], False, "everything works"),
+        (["", "slow"], False, "orthoflow works, with 1 restriction"),
+        (["no E57", "slow"], False, "orthoflow works, with 2 restrictions"),
+        (["nothing"], True, "something that everything needs is missing"),
+    ],
+)
+def test_the_last_line_says_whether_it_works(
+    costs: list[str], broken_core: bool, last: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    findings = [
+        dataclasses.replace(diagnose_library(CLICK), name=f"part{k}", cost=cost)
+        for k, cost in enumerate(costs)
+    ]
+    doctor._print(findings, broken_core=broken_core)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == f"orthoflow {__version__}"
+    assert said[-1] == last
+    told = [f"- part{k}: {cost}" for k, cost in enumerate(costs) if cost]
+    assert [line for line in said if line.startswith("- ")] == told
+    assert ("What that costs:" in said) == bool(told)

@@ -101,6 +101,21 @@ def test_the_live_table_keeps_warnings_readable_and_shows_every_state(
     assert "plane: warning: the side is a [guess]" in capsys.readouterr().err
 
 
+def test_times_are_told_of_what_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    progress = LiveProgress(planned("waits", "runs", "done"))
+    cells = {
+        "waits": CellState(state="waiting"),
+        "runs": CellState(state="running", started=100.0, took_s=40.0, fraction=0.25),
+        "done": CellState(state="ok", wall_s=75.0, took_s=40.0),
+    }
+    monkeypatch.setattr(progress._state, "cells", lambda: cells)
+    monkeypatch.setattr(time, "monotonic", lambda: 120.0)
+    columns = [[str(cell) for cell in column.cells] for column in progress.table().columns]
+    assert columns[1] == ["waiting", " 50 %", "ok"]
+    assert columns[2] == ["", "20.0 s", "1 min 15 s"]
+    assert columns[3] == ["", "20 s", ""]
+
+
 def test_what_does_not_fit_is_what_matters_least() -> None:
     states = ["ok", "cached", "running", "failed", "waiting", "waiting"]
     cells = {f"step{i}": CellState(state=state) for i, state in enumerate(states)}

@@ -89,6 +89,9 @@ PACKAGE = {
     "near/inner/fifth.py": "",
     "near/next_door.py": "from near import kernel",
     "near/inner/next_door.py": "",
+    # Names that begin with a dot mean no others of the same name.
+    "far/third.py": "",
+    "far/inner/fourth.py": "",
 }
 
 
@@ -105,7 +108,8 @@ def test_whatever_a_module_with_kernels_imports_counts_however_it_is_written(pac
     found = kernel_sources([*package.rglob("*.py")], ())
     left = {path.relative_to(package).as_posix() for path in {*package.rglob("*.py")} - found}
     # What a package itself holds counts where a name is taken out of it.
-    assert left == {"near/next_door.py", "near/inner/next_door.py", "near/inner/__init__.py"}
+    next_door = {"near/next_door.py", "near/inner/next_door.py", "near/inner/__init__.py"}
+    assert left == {*next_door, "far/third.py", "far/inner/fourth.py"}
 
 
 def test_where_strangers_may_compile_each_of_their_files_counts(package: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -10,9 +12,9 @@ import pytest
 
 from orthoflow.engine import collect_garbage
 from orthoflow.engine.failures import Failures
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest
 from orthoflow.engine.plan import explain
-from orthoflow.engine.results import ProductRef
+from orthoflow.engine.results import ProductRef, RecordedFile
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.workflow.cells import Cell, WorkflowInput
@@ -106,6 +108,38 @@ DIFFERENT = {
         inputs={"left": LEFT, "right": dataclasses.replace(RIGHT, type_name="heights")}
     ),
 }
+
+
+def test_a_key_is_the_digest_of_what_is_said_of_a_cell() -> None:
+    key = cell_key(CELL, FACTS, INPUTS)
+    assert key.key == hashlib.sha256(key.preimage.encode()).hexdigest()
+    assert json.loads(key.preimage) == {
+        "what": "orthoflow/cell",
+        "v": 1,
+        "method": "work.noise",
+        "result_version": 1,
+        "code": {"plugin": "aa"},
+        "params": {"amount": 1.0},
+        "seed": 5,
+        "tools": {"tool": "1"},
+        "inputs": {
+            "left": f"numbers@1:sha256:{'1' * 64}",
+            "right": f"numbers@1:sha256:{'2' * 64}",
+        },
+    }
+
+
+def test_an_input_is_known_by_names_sizes_and_contents_of_its_files_in_their_order() -> None:
+    files = [
+        RecordedFile(name=name, size_bytes=size, sha256=name * 64)
+        for name, size in (("b", 7), ("a", 9))
+    ]
+    listing = [
+        f'{{"name":"{name}","sha256":"{name * 64}","size_bytes":{size}}}'
+        for name, size in (("b", 7), ("a", 9))
+    ]
+    text = f'{{"files":[{",".join(listing)}],"v":1,"what":"orthoflow/files"}}'
+    assert input_digest(files) == f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def test_whatever_decides_a_result_changes_the_key() -> None:

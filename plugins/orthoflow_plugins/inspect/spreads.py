@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
-from orthoflow_plugins.inspect.findings import rms
 
 # More values lie in files and are looked at so many at once.
 _AT_ONCE: Final = 1 << 22
@@ -41,14 +40,10 @@ class Spread:
 
     def rms(self) -> float:
         """Root mean square."""
-        if not self.is_large:
-            return rms(self._whole())
         return math.sqrt(sum(float(np.square(part).sum()) for part in self._parts()) / self._count)
 
     def mean(self) -> float:
         """Mean."""
-        if not self.is_large:
-            return float(self._whole().mean())
         return sum(float(part.sum()) for part in self._parts()) / self._count
 
     def median(self) -> float:

@@ -262,3 +262,13 @@ def test_photos_colour_a_cloud_where_any_is_oriented(
     assert about["points_of_the_cloud_unseen"] == 0
     # What was mapped for it is gone.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
+
+
+def test_cells_that_give_cameras_are_known_by_what_they_give() -> None:
+    def cell(*types: str) -> Any:
+        return SimpleNamespace(
+            outputs={f"port{k}": SimpleNamespace(type_name=name) for k, name in enumerate(types)}
+        )
+
+    cells = {"a": cell("cloud"), "b": cell("ties", "cameras"), "c": cell(), "d": cell("cameras")}
+    assert list(module._makers_of_cameras(cells)) == ["b", "d"]

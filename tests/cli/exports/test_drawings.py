@@ -16,6 +16,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.papers import Paper, paper_of
 from orthoflow.files.drawings.sheet_contents import Axes, Sheet, WallDrawing
 from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.products import Orthoimages
 from tests import samples
 
 PAPER = paper_of("A4")
@@ -354,3 +355,23 @@ def test_a_wall_is_drawn_with_its_picture_and_its_openings() -> None:
     told = module._drawn(results(openings_of=lambda _: ("door",)), one, "a.png")
     assert (told.number, told.name, told.plane_index) == (7, "wall 7", 7)
     assert (told.frame, told.image, told.openings) == (one.frame, "a.png", ("door",))
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_seams_are_those_of_the_orthoimages_that_a_cell_gave_and_kept(embedded: bool) -> None:
+    frame = samples.facing_east(0.1, 3, 4, (0.0, 0.0, 0.0))
+    rgb = np.zeros((*frame.shape, 3), dtype=np.uint8)
+    images = Orthoimages(images=(samples.orthoimage(frame, wall=7, rgb=rgb),))
+    outputs = {
+        "walls": SimpleNamespace(type_name="walls", embedded=True),
+        "images": SimpleNamespace(type_name="orthoimages", embedded=embedded),
+    }
+    run: Any = SimpleNamespace(
+        cell=lambda address: SimpleNamespace(outputs=outputs if address == "mosaic" else {}),
+        payload=lambda _, port: images.to_payload() if port == "images" else None,
+    )
+    found = module._images(run, "mosaic")
+    assert [one.number for one in found] == (
+        [one.number for one in images.images] if embedded else []
+    )
+    assert module._images(run, "walls") == ()

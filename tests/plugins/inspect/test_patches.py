@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect import patches
-from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.patches import PATCH_CELLS, GreyImage
 from scipy.ndimage import gaussian_filter, shift
 
 ROWS, COLUMNS = 9, 12
@@ -194,3 +194,19 @@ def test_least_squares_move_until_they_hardly_do(
     found = patches.refine_shifts(image(texture()), image(texture()), start, sigma_most_cells=0.5)
     expected = [] if moved_by is None else [[1.0 + moved_by, 2.0]]
     np.testing.assert_allclose(found.shift, np.reshape(expected, (-1, 2)), atol=1e-12)
+
+
+@pytest.mark.parametrize("corner", [(-1, 3), (0, 0), (7, 8), (8, 7), (40, -40)])
+def test_a_cell_between_others_is_valid_where_all_four_are_there(corner: tuple[int, int]) -> None:
+    shape = (PATCH_CELLS + 8, PATCH_CELLS + 8)
+    valid = np.ones(shape, dtype=np.bool_)
+    valid[20, 13] = False
+    image = GreyImage(grey=np.zeros(shape), valid=valid, region=valid)
+    _, found = patches._Sampler(image)._windows(np.array([corner]))
+    padded = np.pad(valid, 100)
+    places = 100 + np.array(corner)[:, None] + np.arange(PATCH_CELLS)
+    expected = np.ones((PATCH_CELLS, PATCH_CELLS), dtype=np.bool_)
+    for down in (0, 1):
+        for right in (0, 1):
+            expected &= padded[np.ix_(places[0] + down, places[1] + right)]
+    np.testing.assert_array_equal(found[0], expected)

@@ -31,6 +31,8 @@ def test_parts_give_the_numbers_of_the_whole(
         whole.median_deviation(0.5),
         whole.percentile_of_size(99.0),
     )
+    assert expected[0] == np.sqrt(np.mean(np.square(1e3 * values)))
+    assert expected[1] == np.mean(1e3 * values)
     assert expected[2] == np.median(1e3 * values)
     assert expected[3] == median_deviation(1e3 * values)
     assert expected[5] == np.percentile(np.abs(1e3 * values), 99)

@@ -114,9 +114,7 @@ def test_points_beside_the_rectangle_are_counted_where_all_could_span_it(
 ) -> None:
     # Few echoes two metres off.
     echoes = evenly([4.0, 2.0, 0.0], [4.2, 2.0, 0.1], 7)
-    reference = placed(
-        cloud_of(np.vstack([ON_WALL, echoes])), buffer_m=buffer_m, keeps_side=True
-    )
+    reference = placed(cloud_of(np.vstack([ON_WALL, echoes])), buffer_m=buffer_m, keeps_side=True)
     np.testing.assert_allclose(reference.corners_m.max(axis=0), [2.0, 2.0, 1.0], atol=1e-6)
     assert reference.n_beside == (7 if buffer_m is None else 0)
 
@@ -146,7 +144,7 @@ def test_planes_are_laid_by_their_points_and_told_of(tmp_path: Path) -> None:
     np.testing.assert_array_equal(planes.part_plane, [0, 1])
     np.testing.assert_allclose(
         planes.corners[1],
-        np.array(ORIGIN) + [[-2, 2, 1], [-2, 2, -1], [2, 2, -1], [2, 2, 1]],
+        np.array(ORIGIN) + np.array([[-2, 2, 1], [-2, 2, -1], [2, 2, -1], [2, 2, 1]]),
         atol=1e-5,
     )
     np.testing.assert_array_equal(planes.part_corners, planes.corners)

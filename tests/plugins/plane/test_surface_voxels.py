@@ -42,7 +42,9 @@ def test_a_cube_reaches_half_its_side_less_the_voxel_itself(size_m: float, reach
     assert replace(CUBE, size_m=size_m).width_voxels() == 2 * reach + 1
 
 
-@pytest.mark.parametrize(("size_m", "radius"), [(0.004, 1), (0.02, 2.0), (0.025, 2.5), (0.041, 4.1)])
+@pytest.mark.parametrize(
+    ("size_m", "radius"), [(0.004, 1), (0.02, 2.0), (0.025, 2.5), (0.041, 4.1)]
+)
 def test_a_sphere_has_the_voxels_whose_middles_are_no_farther(size_m: float, radius: float) -> None:
     steps = steps_of("radius", size_m)
     reach = math.floor(size_m / 0.01)
@@ -147,9 +149,7 @@ def test_wider_voxels_hold_the_moments_of_those_in_them() -> None:
     assert wide.voxels.neighbourhood.size_m == 2.0 * voxels.neighbourhood.size_m
     assert wide.voxels.neighbourhood.voxel_m == 2.0 * voxels.neighbourhood.voxel_m
     assert wide.voxels.grid.shape == tuple(-(-size // 2) for size in voxels.grid.shape)
-    np.testing.assert_array_equal(
-        wide.voxels.places[wide.of_member], voxels.places[member] // 2
-    )
+    np.testing.assert_array_equal(wide.voxels.places[wide.of_member], voxels.places[member] // 2)
     np.testing.assert_array_equal(
         wide.voxels.counts, np.bincount(wide.of_member, voxels.counts[member])
     )
