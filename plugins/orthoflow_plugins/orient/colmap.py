@@ -108,8 +108,6 @@ def _set_up(block: Block) -> _Colmap:
         config.add_image(index + 1)
         config.add_constant_point(scene.add_point3D(ahead, track, np.zeros(3, np.uint8)))
     options = colmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_principal_point = True
     options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _NOTHING
     adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, scene)

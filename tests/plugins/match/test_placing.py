@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import placing
+from orthoflow_plugins.match.channels import Channels
+from orthoflow_plugins.match.displacements import Displacements
 from orthoflow_plugins.match.placing import Placed, PlacedWalls, places_of
+from orthoflow_plugins.match.structures import Place
+from orthoflow_plugins.match.tie_pieces import TiePiece
 
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Photo, Wall
@@ -106,6 +112,8 @@ def test_a_turned_photo_says_where_its_places_are(degrees: float, shape: tuple[i
     # All of it is photo: nothing black from beside it.
     assert made.rgb[..., 1].min() > 0 or degrees % 90 == 0
     assert made.size_px[0] / made.size_px[1] == pytest.approx(width / height, rel=0.01)
+    # What has to be turned by parts of a quarter is shrunk before.
+    assert max(height, width) <= 1200 or degrees % 90 == 0
 
 
 def test_exif_says_how_a_photo_was_held() -> None:
@@ -129,3 +137,308 @@ def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, PHOTO, PlacedWalls(walls=[blind])) == []
+
+
+# --- how places are judged ---
+
+
+def ties_at(
+    n: int, right_m: float = 0.0, *, wall: int = 0, width_m: float = 2.0, depth_m: float = 0.0
+) -> TiePiece:
+    """Ties along a line of this width that begins so far to the right."""
+    points = np.zeros((n, 3))
+    points[:, 0] = right_m + np.linspace(0.0, width_m, n)
+    points[:, 2] = depth_m
+    return TiePiece(
+        photo=0,
+        wall=wall,
+        pixels_photo=np.zeros((n, 2)),
+        points_world=points,
+        sigma_px=np.ones(n),
+        sigma_m=np.ones(n),
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "is_same"),
+    [
+        (ties_at(31, 0.19), True),
+        (ties_at(31, 0.21), False),
+        (ties_at(31, -0.21), False),
+        (ties_at(31, 0.15, depth_m=0.15), False),
+        (ties_at(31, 0.0, width_m=0.3), False),
+        (ties_at(31, wall=1), False),
+    ],
+)
+def test_places_a_tenth_of_the_width_apart_are_two(other: TiePiece, is_same: bool) -> None:
+    assert placing._is_same(ties_at(21), other) == is_same
+
+
+def test_a_photo_is_shrunk_to_twelve_hundred_pixels_and_never_enlarged() -> None:
+    assert placing._shrinking(2400, 1200) == placing._shrinking(1200, 2400) == 0.5
+    assert placing._shrinking(1200, 900) == placing._shrinking(300, 400) == 1.0
+
+
+def test_a_lens_is_what_is_known_of_it_beforehand() -> None:
+    shot = replace(PHOTO, intrinsics=None, width=3000, height=4000)
+    for exif_px, focal_px, sigma in ((None, 3200.0, 0.3), (2500.0, 2500.0, 0.05)):
+        lens, freedom = placing._lens_before(replace(shot, exif_focal_px=exif_px))
+        assert (lens.width, lens.height, lens.cx, lens.cy) == (3000, 4000, 1500.0, 2000.0)
+        assert (lens.fx, lens.fy, lens.skew) == (focal_px, focal_px, 0.0)
+        assert not lens.distortion.any()
+        assert freedom.focal_sigma == sigma
+    lens, freedom = placing._lens_before(PHOTO)
+    assert lens.fx == CAMERA.fx
+    np.testing.assert_array_equal(lens.distortion, CAMERA.distortion)
+    assert not freedom.sigmas.size
+
+
+def likely(*leads: float) -> list[Place]:
+    nine = np.zeros((9, 2))
+    return [
+        Place(centre_m=np.zeros(2), width_m=1.0, lead=lead, parts_photo=nine, parts_m=nine)
+        for lead in leads
+    ]
+
+
+def judged(
+    monkeypatch: pytest.MonkeyPatch,
+    leads: tuple[tuple[float, ...], ...],
+    found: dict[float, tuple[int, float, float] | None],
+) -> list[Placed]:
+    """Places of a photo on some walls: by its lead the ties, the share and the way right of each.
+
+    Without any, no pose or too few ties are found there.
+    """
+    structures = [SimpleNamespace(leads=each) if each else None for each in leads]
+    monkeypatch.setattr(placing, "likely_places", lambda _, wall, n_most: likely(*wall.leads))
+    monkeypatch.setattr(placing, "_lens_before", lambda _: (None, None))
+    monkeypatch.setattr(placing, "_camera_at", lambda place, *_: place if place.lead else None)
+
+    def tied(at: tuple[int, int], small: Any, start: Any, structure: Any) -> Placed | None:
+        place: Any = start[0]
+        assert structures[at[1]] is structure
+        entry = found[place.lead]
+        if entry is None:
+            return None
+        piece = ties_at(entry[0], entry[2], wall=at[1])
+        return Placed(piece=piece, camera=place, lead=0.0, share=entry[1], radius_px=1.0)
+
+    monkeypatch.setattr(placing, "_tied", tied)
+    walls: Any = SimpleNamespace(structures=lambda: structures)
+    upright: Any = SimpleNamespace(rgb=None)
+    return placing._places_turned((0, PHOTO, np.zeros((1, 1, 3), np.uint8)), walls, upright)
+
+
+def test_the_three_places_that_stand_out_most_are_tried_and_sorted_by_what_agrees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found: dict[float, tuple[int, float, float] | None] = {
+        7.0: (50, 0.2, 0.0),
+        6.0: (50, 0.3, 1.0),
+        5.0: (50, 0.4, 0.0),
+    }
+    places = judged(monkeypatch, ((6.0, 4.0), (), (5.0, 7.0, 3.0)), found)
+    assert [(place.share, place.lead, place.piece.wall) for place in places] == [
+        (0.4, 5.0, 2),
+        (0.3, 6.0, 0),
+    ]
+    # That of 0.2 lies where that of 0.4 does, on the same wall.
+    assert not any(place.is_clear for place in places)
+    assert judged(monkeypatch, ((), ()), {}) == []
+    assert judged(monkeypatch, ((0.0, 6.0),), {6.0: None}) == []
+
+
+@pytest.mark.parametrize(
+    ("n_ties", "share", "n_places"), [(20, 0.05, 1), (19, 0.05, 0), (20, 0.049, 0)]
+)
+def test_a_place_has_twenty_ties_and_a_twentieth_of_its_patches(
+    monkeypatch: pytest.MonkeyPatch, n_ties: int, share: float, n_places: int
+) -> None:
+    places = judged(monkeypatch, ((9.0,),), {9.0: (n_ties, share, 0.0)})
+    assert len(places) == n_places
+    assert not any(place.is_clear for place in places)
+
+
+@pytest.mark.parametrize(
+    ("lead", "n_ties", "share", "other", "is_clear"),
+    [
+        (5.5, 40, 0.08, None, True),
+        (5.4, 40, 0.08, None, False),
+        (5.5, 39, 0.08, None, False),
+        (5.5, 40, 0.079, None, False),
+        # Half as much again as the next one.
+        (9.0, 90, 0.3, 0.199, True),
+        (9.0, 90, 0.3, 0.201, False),
+    ],
+)
+def test_a_clear_place_stands_out_by_itself_and_from_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+    lead: float,
+    n_ties: int,
+    share: float,
+    other: float | None,
+    is_clear: bool,
+) -> None:
+    found: dict[float, tuple[int, float, float] | None] = {lead: (n_ties, share, 0.0)}
+    if other is not None:
+        found[1.0] = (90, other, 5.0)
+    places = judged(monkeypatch, (tuple(found),), found)
+    assert [place.is_clear for place in places] == [is_clear, False][: len(found)]
+
+
+def test_turns_are_tried_until_a_place_is_clear_and_the_best_of_all_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def place(share: float, is_clear: bool = False) -> Placed:
+        none: Any = None
+        return Placed(
+            piece=ties_at(3), camera=none, lead=1.0, share=share, radius_px=1.0, is_clear=is_clear
+        )
+
+    asked: list[float] = []
+    turns: list[list[Placed]] = []
+    monkeypatch.setattr(placing, "turned", lambda _, degrees: degrees)
+
+    def places_turned(shot: Any, walls: Any, degrees: float) -> list[Placed]:
+        asked.append(degrees)
+        return turns[len(asked) - 1]
+
+    monkeypatch.setattr(placing, "_places_turned", places_turned)
+    walls = PlacedWalls(walls=[])
+    bare = replace(PHOTO, intrinsics=None)
+    turns[:] = [[], [place(0.1)], [place(0.2)], [place(0.15)], [], *[[]] * 19]
+    assert places_of(0, bare, walls) == turns[2]
+    assert asked == list(placing._TURNS_DEG)
+    asked.clear()
+    turns[:] = [[place(0.1)], [place(0.3, is_clear=True)], [place(0.9)]]
+    assert places_of(0, bare, walls) == turns[1]
+    assert asked == [0.0, 90.0]
+    # EXIF's orientations, by how a camera held so turns the picture.
+    for orientation, degrees in enumerate((0.0, 0.0, 180.0, 180.0, 270.0, 270.0, 90.0, 90.0), 1):
+        asked.clear()
+        shot = replace(bare, exif_orientation=orientation, exif_focal_px=840.0)
+        assert places_of(0, shot, walls) == turns[0]
+        assert asked == [degrees]
+
+
+def test_from_where_nine_parts_of_a_photo_lie_its_pose_follows() -> None:
+    wall = ms.walls_of(ms.textured_wall(1)).walls[0]
+    structure: Any = SimpleNamespace(wall=wall, usual_spread_m=0.001)
+    middle = placing.turned(decode_image(PHOTO.encoded, "a.png"), 0.0)
+    shares = np.array([[a, b] for b in (0.25, 0.5, 0.75) for a in (0.25, 0.5, 0.75)])
+    rays = CAMERA.rays_world(middle.pixels_photo(shares))
+    # Where the rays of the parts meet the wall's surface, by steps of Newton.
+    frame = wall.frame
+    reach = -(CAMERA.centre_world - frame.origin_world) @ frame.normal_world
+    points = CAMERA.centre_world + (reach / (rays @ frame.normal_world))[:, None] * rays
+    for _ in range(20):
+        at = frame.wall_from_world(points)[:, :2] * frame.gsd_m
+        depth = ms.textured_wall(1).depth_m(at[:, 0], at[:, 1])
+        along = (reach + depth) / (rays @ frame.normal_world)
+        points = CAMERA.centre_world + along[:, None] * rays
+    place = Place(
+        centre_m=at.mean(axis=0),
+        width_m=float(2.0 * np.ptp(at[:, 0])),
+        lead=9.0,
+        parts_photo=shares,
+        parts_m=at,
+    )
+    lens, _ = placing._lens_before(PHOTO)
+    found = placing._camera_at(place, structure, lens, middle)
+    assert found is not None
+    assert np.linalg.norm(found.centre_world - CAMERA.centre_world) < 0.02
+    np.testing.assert_allclose(found.rotation, CAMERA.rotation, atol=0.01)
+    # Nine parts in one place determine nothing.
+    nowhere = replace(
+        place, parts_m=np.tile(at[:1], (9, 1)), parts_photo=np.tile([0.5, 0.5], (9, 1))
+    )
+    assert placing._camera_at(nowhere, structure, lens, middle) is None
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (2, -1), (-3, 3)], ids=str)
+def test_patches_every_five_cells_are_found_where_they_went(shift: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(60, 83, 5)).astype(np.float32)
+    values = sum(np.roll(values, (i, j), (0, 1)) for i in (0, 1, 2) for j in (0, 1, 2))  # type: ignore[assignment]
+    known = np.ones((60, 83), dtype=np.float32)
+    moved = np.roll(values, shift[::-1], axis=(0, 1))
+    found = placing._measured(
+        Channels(values=values, known=known), Channels(values=moved, known=known), 4
+    )
+    # Up to the border of what is shown, but for what wraps around there.
+    assert set(found.places[:, 0].tolist()) <= set(range(2, 83, 5))
+    assert set(found.places[:, 1].tolist()) <= set(range(2, 60, 5))
+    assert len(found.places) > 0.9 * 17 * 12
+    inner = ((found.places > 12) & (found.places < np.array([70, 47]))).all(axis=1)
+    assert inner.sum() > 60
+    np.testing.assert_allclose(
+        found.shift_cells[inner], np.tile(shift, (inner.sum(), 1)), atol=0.05
+    )
+
+
+def tied(
+    monkeypatch: pytest.MonkeyPatch, counts: list[int], shift: float = 0.0
+) -> tuple[Placed | None, list[int], Any]:
+    """Tie a photo whose patches are found where its true camera shows them; so many each round."""
+    wall = ms.walls_of(ms.textured_wall(1)).walls[0]
+    rows, columns = wall.frame.shape
+    structure: Any = SimpleNamespace(
+        wall=wall,
+        usual_spread_m=0.001,
+        channels=Channels(
+            values=np.zeros((rows, columns, 1), np.float32),
+            known=np.ones((rows, columns), np.float32),
+        ),
+    )
+    radii: list[int] = []
+
+    def measured(own: Channels, other: Channels, radius: int) -> Displacements:
+        radii.append(radius)
+        at = np.argwhere(other.known > 0.0)[:, ::-1]
+        places = at[:: max(1, len(at) // 400)][: counts[len(radii) - 1]]
+        n = len(places)
+        moved = np.full((n, 2), [shift, 0.0])
+        return Displacements(
+            places=places.astype(np.intp),
+            shift_cells=moved,
+            score=np.ones(n),
+            sigma_cells=np.full(n, 0.1),
+        )
+
+    monkeypatch.setattr(placing, "_measured", measured)
+    small = np.zeros((640, 900, 3), dtype=np.uint8)
+    _, freedom = placing._lens_before(PHOTO)
+    found = placing._tied((4, 7), small, (CAMERA, freedom), structure)
+    return found, radii, structure
+
+
+def test_a_pose_is_improved_in_four_rounds_of_smaller_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found, radii, structure = tied(monkeypatch, [300, 300, 300, 200])
+    assert found is not None
+    assert radii == [6, 4, 3, 3]
+    assert (found.piece.photo, found.piece.wall) == (4, 7)
+    # Nothing moved: the pose stays.
+    assert np.linalg.norm(found.camera.centre_world - CAMERA.centre_world) < 1e-3
+    (projection,) = placing.project_walls(CAMERA, [structure.wall])
+    assert projection is not None
+    in_photo = CAMERA.project(found.piece.points_world)[:, :2]
+    np.testing.assert_allclose(found.piece.pixels_photo, in_photo, atol=0.2)
+    np.testing.assert_allclose(found.piece.sigma_px, 0.5 * projection.pixels_per_cell, rtol=0.01)
+    assert found.radius_px == pytest.approx(6.0 * projection.pixels_per_cell, rel=0.01)
+    # Every fifth cell in both directions bears a patch.
+    n_shown = np.isfinite(projection.u).sum()
+    assert found.share == pytest.approx(len(found.piece) * 25 / n_shown, rel=0.05)
+    assert not found.is_clear
+
+
+@pytest.mark.parametrize(("counts", "n_rounds"), [([7], 1), ([300, 7], 2), ([300, 300, 300, 7], 4)])
+def test_eight_ties_are_needed_in_every_round(
+    monkeypatch: pytest.MonkeyPatch, counts: list[int], n_rounds: int
+) -> None:
+    found, radii, _ = tied(monkeypatch, counts)
+    assert found is None
+    assert len(radii) == n_rounds
+    assert tied(monkeypatch, [40, 40, 40, 8])[0] is not None
