@@ -120,6 +120,60 @@ def test_textures_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert np.abs(middle - whole).max() <= 2
 
 
+def test_walls_are_painted_with_colours_that_have_their_light_already(written: Path) -> None:
+    told, _ = parts(written)
+    painted = {
+        "metallicFactor": 0.0,
+        "roughnessFactor": 1.0,
+    }
+    wall, floor = told["materials"]
+    for index, material in enumerate((wall, floor)):
+        texture = {"baseColorTexture": {"index": index}}
+        assert material["pbrMetallicRoughness"] == texture | painted
+        assert material["extensions"] == {"KHR_materials_unlit": {}}
+    # A cell is shown or not: half way between is the border.
+    assert (wall["alphaMode"], wall["alphaCutoff"]) == ("MASK", 0.5)
+    assert floor.keys().isdisjoint({"alphaMode", "alphaCutoff"})
+    assert told["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert told["textures"] == [{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}]
+    assert [image["mimeType"] for image in told["images"]] == ["image/png", "image/jpeg"]
+    # Linear, between levels too, and no side's colour on the other side.
+    assert told["samplers"] == [
+        {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+    ]
+    assert (told["scene"], told["scenes"]) == (0, [{"nodes": [0]}])
+    assert told["nodes"][0]["children"] == [1, 2]
+    assert [node["mesh"] for node in told["nodes"][1:]] == [0, 1]
+
+
+@pytest.mark.parametrize("model", ["written", "carved"])
+def test_accessors_say_what_their_numbers_are(request: pytest.FixtureRequest, model: str) -> None:
+    told, binary = parts(request.getfixturevalue(model))
+    kinds = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+    types = {5126: "<f4", 5125: "<u4", 5123: "<u2"}
+    for mesh in told["meshes"]:
+        for primitive in mesh["primitives"]:
+            corners = told["accessors"][primitive["attributes"]["POSITION"]]["count"]
+            for name, at in (*primitive["attributes"].items(), ("indices", primitive["indices"])):
+                entry = told["accessors"][at]
+                view = told["bufferViews"][entry["bufferView"]]
+                # Arrays of corners and arrays of elements.
+                assert view["target"] == (34963 if name == "indices" else 34962)
+                values = np.frombuffer(
+                    binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]],
+                    types[entry["componentType"]],
+                ).reshape(-1, kinds[entry["type"]])
+                assert len(values) == entry["count"]
+                if name == "POSITION":
+                    np.testing.assert_allclose(entry["min"], values.min(axis=0))
+                    np.testing.assert_allclose(entry["max"], values.max(axis=0))
+                elif name == "indices":
+                    assert (values.min(), values.max()) == (0, corners - 1)
+                else:
+                    assert entry["count"] == corners
+                    assert (values.min(), values.max()) == (0.0, 1.0)
+
+
 @pytest.mark.parametrize("model", ["written", "carved"])
 def test_accessors_stay_inside_their_views(request: pytest.FixtureRequest, model: str) -> None:
     told, binary = parts(request.getfixturevalue(model))
