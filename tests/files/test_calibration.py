@@ -284,6 +284,10 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
             "cameras:\n  a.jpg:\n    heigth: 5\n",
             '3:5: cameras."a.jpg".heigth: unknown key (did you mean height?)',
         ),
+        (
+            "cameras:\n  a.jpg: {width: 4000, height: 3000, fx: 3000,5, fy: 3000}\n",
+            '.5: unknown key, what a decimal comma leaves behind: write decimal points; expected',
+        ),
         ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key; expected cameras"),
         ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", 'found duplicate key "a"; remove one'),
         ("cameras: {a: {" + GOOD + "]}", "calibration.yaml:1:14: this is not YAML: the brace"),

@@ -14,6 +14,7 @@ from orthoflow.files.fisheyes import (
     FACE_FROM_CAMERA,
     FisheyeFace,
     FisheyeLens,
+    _fold_rad,
     face_lenses,
     fisheye_faces,
     problem_of,
@@ -198,6 +199,43 @@ def test_a_lens_that_is_none_says_why(change: dict[str, float], problem: str) ->
     assert problem in problem_of(lens)
     with pytest.raises(InputError, match="the fisheye lens of photo a is none: "):
         fisheye_faces(b"", "a", lens)
+
+
+@pytest.mark.parametrize(
+    ("radial", "fold_rad"),
+    [
+        # 1 - 3 t^2, 1 - 0.9 t^2, 1 - 5 (0.1) t^4, 1 - 7 (0.01) t^6, 1 - 9 (0.001) t^8.
+        ((-1.0, 0.0, 0.0, 0.0), 3.0**-0.5),
+        ((-0.3, 0.0, 0.0, 0.0), 0.9**-0.5),
+        ((0.0, -0.1, 0.0, 0.0), 0.5**-0.25),
+        ((0.0, 0.0, -0.01, 0.0), 0.07 ** (-1 / 6)),
+        ((0.0, 0.0, 0.0, -0.001), 0.009**-0.125),
+        ((0.1, 0.0, 0.0, 0.0), np.pi),
+        ((0.0, 0.0, 0.0, 0.0), np.pi),
+    ],
+)
+def test_a_lens_folds_where_its_picture_stops_growing(
+    radial: tuple[float, ...], fold_rad: float
+) -> None:
+    found = _fold_rad(radial)
+    # Two thousand angles are tried.
+    assert fold_rad - np.pi / 1_900 < found <= fold_rad
+
+
+@pytest.mark.parametrize("field_of_view_deg", [92.0, 95.0, 98.0, 101.0, 105.0, 112.0])
+def test_faces_that_show_a_fiftieth_of_the_largest_are_shown(field_of_view_deg: float) -> None:
+    wide = replace(LENS, width=2_000, height=2_000, cx=1_000.0, cy=1_000.0)
+    lens = replace(wide, field_of_view_deg=field_of_view_deg)
+    steps = np.linspace(-1.0, 1.0, 65)
+    down, right = np.meshgrid(steps, steps, indexing="ij")
+    # Of a face beside, what is `off` before its middle plane: the axis is where `down` is.
+    limit = np.cos(np.radians(0.5 * field_of_view_deg))
+    beside = (right / np.sqrt(1.0 + right**2 + down**2) >= limit).mean()
+    front = (1.0 / np.sqrt(1.0 + right**2 + down**2) >= limit).mean()
+    expected = {"front"}
+    if beside >= 0.02 * front:
+        expected |= {"left", "right", "up", "down"}
+    assert set(face_lenses(lens)) == expected
 
 
 def test_a_fold_outside_the_image_or_beyond_the_field_does_no_harm() -> None:

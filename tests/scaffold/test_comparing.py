@@ -1,4 +1,4 @@
-"""The workflow in which a new method stands beside an installed one: short, judged, and complete."""
+"""The workflow in which a new method stands beside an installed one: short, judged, whole."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_method_stands_beside_the_last_step_of_its_kind(catalog: Catalog) -> N
     assert node["in"] == before["in"]
     assert found["name"] == "compare-mine"
     assert found["compare"]["design"] == "product"
-    # A detector's own numbers are good where it found but the easy planes: those of the truth count.
+    # What a detector says of its own planes is good where it found but the easy ones.
     assert found["compare"]["metrics"] == [
         "check.true_planes_found",
         "check.label_iou_mean",

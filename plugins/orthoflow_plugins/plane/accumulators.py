@@ -108,7 +108,7 @@ class PlanProposer:
         self._voting = voting
         self._least_votes = VOTE_CAUTION * voting.least_points
         self._points_per_vote = cloud.sample.n_represented if voting.is_raw else 1.0
-        n_angles = max(4, round(180.0 / voting.angle_step_deg))
+        n_angles = round(180.0 / voting.angle_step_deg)
         self._angles_rad = np.arange(n_angles, dtype=np.float64) * (math.pi / n_angles)
         half_m = 0.5 * grid.cell_m * math.hypot(grid.shape[0], grid.shape[1])
         self._reach_bins = math.ceil(half_m / grid.cell_m) + 1

@@ -269,7 +269,7 @@ class Directions:
 
 def directions_over(step_deg: float, family: Family, tilt_most_deg: float) -> Directions:
     """Cover the hemisphere, or the part of it that a family of planes needs."""
-    n_turns = max(4, round(180.0 / step_deg))
+    n_turns = round(180.0 / step_deg)
     step_rad = math.pi / n_turns
     phis = -0.5 * math.pi + step_rad * np.arange(1, n_turns + 1)
     limit_rad = math.radians(tilt_most_deg) + step_rad

@@ -100,6 +100,17 @@ def test_contours_of_a_slope_are_where_it_has_their_depth(tmp_path: Path) -> Non
         assert np.ptp(points[:, 1]) == pytest.approx(0.495, abs=1e-9)
 
 
+@pytest.mark.parametrize("n_rows", [1, 2, 3])
+def test_two_rows_are_enough_for_a_contour_between_them(tmp_path: Path, n_rows: int) -> None:
+    rows = np.array([0.0, 0.1, 0.1], dtype=np.float32)[:n_rows]
+    write_raster(tmp_path / "a.tif", np.repeat(rows[:, None], 40, axis=1), gsd_m=0.05, tags={})
+    whole = Part(left_m=0.0, top_m=0.0, right_m=2.0, bottom_m=0.05 * n_rows)
+    found = contours(tmp_path / "a.tif", whole, scale=10, interval_m=0.1)
+    assert [level for level, _ in found] == ([] if n_rows < 2 else [0.05])
+    for _, points in found:
+        np.testing.assert_allclose(points[:, 1], 0.05, atol=1e-9)
+
+
 def test_a_flat_wall_has_no_contours(tmp_path: Path) -> None:
     noise = np.random.default_rng(2).normal(0.0, 0.002, (100, 200)).astype(np.float32)
     write_raster(tmp_path / "a.tif", noise, gsd_m=0.005, tags={})

@@ -15,6 +15,7 @@ from reportlab.pdfbase.pdfmetrics import stringWidth
 from orthoflow.files.drawings import sheet_columns as module
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import Paper, Part, View, paper_of
+from orthoflow.files.drawings.pens import text_width_mm
 from orthoflow.files.drawings.sheet_columns import draw_column
 from orthoflow.files.drawings.sheet_contents import Axes, Sheet, SheetText, WallDrawing
 from orthoflow.files.drawings.title_blocks import TitleBlock
@@ -419,6 +420,22 @@ def test_walls_that_are_short_or_close_have_no_number(drawn: Page) -> None:
     walls = {12: short, 13: long, 14: beside}
     module._number_walls(drawn, walls, high_mm=1.7)  # type: ignore[arg-type]
     assert written(drawn) == ["13"]
+
+
+@pytest.mark.parametrize(("factor", "has_room"), [(0.98, False), (1.02, True)])
+def test_a_number_has_room_where_its_width_and_a_half_and_its_height_fit(
+    drawn: Page, factor: float, has_room: bool
+) -> None:
+    room = 1.5 * text_width_mm("13", 1.7) + 1.7
+    wall = np.array([[0.0, 0.0], [factor * room, 0.0]])
+    module._number_walls(drawn, {13: wall}, high_mm=1.7)  # type: ignore[arg-type]
+    assert written(drawn) == (["13"] if has_room else [])
+    # Nor where the middle of another is nearer than that.
+    long = np.array([[0.0, 20.0], [40.0, 20.0]])
+    beside = long + np.array([0.0, factor * room])
+    before = len(drawn.texts)
+    module._number_walls(drawn, {13: long, 14: beside}, high_mm=1.7)  # type: ignore[arg-type]
+    assert written(drawn)[before:] == (["13", "14"] if has_room else ["13"])
 
 
 def test_the_wall_of_the_sheet_has_its_number_before_those_beside_it(drawn: Page) -> None:

@@ -6,11 +6,13 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
+from orthoflow_plugins.inspect import truth as module
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import report
 from orthoflow_plugins.inspect.truth import InspectTruth
@@ -427,3 +429,31 @@ def test_a_large_wall_takes_the_memory_of_a_band(
         tracemalloc.stop()
     metrics = {metric.name: metric.value for metric in context.metrics}
     assert metrics["depth_median_mm"] == pytest.approx(1e3 * 2.0**-9, rel=1e-6)
+
+
+def test_painters_without_an_oriented_photo_of_their_name_are_told(tmp_path: Path) -> None:
+    def context() -> StepContext:
+        return StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+
+    images: Any = SimpleNamespace(
+        images=[
+            SimpleNamespace(sources=("a.jpg", "b.jpg")),
+            SimpleNamespace(sources=("b.jpg", "c.jpg", "d.jpg")),
+        ]
+    )
+    cameras: Any = SimpleNamespace(
+        cameras=[
+            SimpleNamespace(photo=photo, status=status)
+            for photo, status in (("a.jpg", "ok"), ("b.jpg", "refused"), ("d.jpg", "ok"))
+        ]
+    )
+    ctx = context()
+    module._warn_of_untraced(images, cameras, ctx)
+    (warning,) = ctx.warnings
+    assert "not traced where b.jpg, c.jpg painted" in warning
+    ctx = context()
+    module._warn_of_untraced(images, None, ctx)
+    images.images[1].sources = ("a.jpg",)
+    images.images[0].sources = ("d.jpg",)
+    module._warn_of_untraced(images, cameras, ctx)
+    assert list(ctx.warnings) == []

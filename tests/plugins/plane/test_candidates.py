@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 from orthoflow_plugins.plane import candidates
 from orthoflow_plugins.plane.candidates import Candidate, Family, FoundPlane, Rules
+from orthoflow_plugins.plane.sample import Unassigned, prepare
 from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.geometry import Plane
+from tests.plane_scenes import cloud_of
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -205,3 +208,46 @@ def test_parts_at_other_depths_do_not_pull_a_plane_askew(step_m: float) -> None:
     assert np.median(np.abs(fitted.distances_m(largest))) < 0.0009
     beyond_m = abs(float(fitted.distances_m(np.array([[4.5, 0.0, 1.0]]))[0]))
     assert beyond_m < 0.001
+
+
+def free_wall(n_points: int) -> Unassigned:
+    """A wall of 4 x 2 m at y = 2, and as many points far behind it."""
+    rng = np.random.default_rng(3)
+    wall = rng.uniform([-2.0, 2.0, -1.0], [2.0, 2.0, 1.0], (n_points, 3))
+    wall[:, 1] += rng.normal(0.0, 0.002, n_points)
+    far = rng.uniform([-2.0, 7.0, -1.0], [2.0, 9.0, 1.0], (n_points, 3))
+    points = np.vstack([wall, far])
+    return Unassigned.of(
+        prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.01, parts=1)
+    )
+
+
+@pytest.mark.parametrize("offset_m", [2.0, 2.03, 4.5, 20.0])
+def test_a_candidate_is_a_plane_where_there_are_points(offset_m: float) -> None:
+    along_y = np.array([0.0, 1.0, 0.0])
+    proposed = Candidate(plane=Plane(normal=along_y, offset_m=offset_m), family="wall", votes=1.0)
+    item = candidates.verify(proposed, free_wall(3_000), rules(is_exact=False))
+    assert (item is not None) == (offset_m < 3.0)
+    if item is not None:
+        assert item.candidate is proposed
+        assert abs(float(item.raster.plane.offset_m)) == pytest.approx(2.0, abs=2e-4)
+        np.testing.assert_allclose(
+            item.support.bounds_m[1] - item.support.bounds_m[0], 4.0, atol=0.5
+        )
+
+
+@pytest.mark.parametrize(("least_share", "is_plane"), [(0.45, True), (0.55, False)])
+def test_a_plane_holds_its_share_of_all_points(least_share: float, is_plane: bool) -> None:
+    proposed = Candidate(
+        plane=Plane(normal=np.array([0.0, 1.0, 0.0]), offset_m=2.0), family="wall", votes=1.0
+    )
+    asked = replace(rules(is_exact=False), least_share=least_share)
+    assert (candidates.verify(proposed, free_wall(3_000), asked) is not None) is is_plane
+
+
+def test_without_points_near_a_plane_cells_are_those_of_the_tolerance() -> None:
+    left = free_wall(500)
+    away = Plane(normal=np.array([0.0, 1.0, 0.0]), offset_m=-3.0)
+    sums, found = candidates._cells_near(np.zeros((0, 3)), away, left, rules())
+    assert not sums.n_find.any()
+    assert found.cell_m == 0.05
