@@ -12,7 +12,13 @@ from rasterio.transform import Affine
 
 from orthoflow.errors import InputError
 from orthoflow.files import geotiff as module
-from orthoflow.files.geotiff import check_header, epsg_of, epsg_wkt, require_map_crs
+from orthoflow.files.geotiff import (
+    check_header,
+    epsg_of,
+    epsg_wkt,
+    require_map_crs,
+    world_file_text,
+)
 
 PATH = Path("wall.tif")
 
@@ -127,6 +133,14 @@ def test_cells_are_square_and_upright_to_a_millionth(
 )
 def test_codes_of_maps_have_four_to_six_digits(text: str | None, code: int | None) -> None:
     assert epsg_of(text) == code
+
+
+def test_a_world_file_says_the_sides_and_the_middle_of_the_first_pixel() -> None:
+    text = world_file_text(0.02, rows=3.5, columns=2.5, corner_m=(100.0, 40.0))
+    found = [float(line) for line in text.splitlines()]
+    assert found == pytest.approx([0.05, 0.0, 0.0, -0.07, 100.025, 39.965])
+    plain = [float(line) for line in world_file_text(0.02).splitlines()]
+    assert plain == pytest.approx([0.02, 0.0, 0.0, -0.02, 0.01, -0.01])
 
 
 def test_maps_are_in_metres() -> None:

@@ -15,6 +15,7 @@ A covariance from single points would promise micrometres. Three things are done
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -125,10 +126,10 @@ def stated_covariance(observed: CellHeights, fit: CellFit) -> Stated:
     inverse = np.linalg.inv(products.sum(axis=0))
     # Every cell a tile of its own; what one of them has in the solution is too little to matter.
     alone = before = _mean_variance(design, factor * inverse @ (scores.T @ scores) @ inverse)
-    reach = -1.0
+    reach = -math.inf
     for size in _TILE_CELLS:
         tile = rows // size * (int(columns.max()) // size + 1) + columns // size
-        if np.count_nonzero(np.bincount(tile)) < _TILES_LEAST and reach >= 0.0:
+        if np.count_nonzero(np.bincount(tile)) < _TILES_LEAST and math.isfinite(reach):
             break
         covariance = factor * _left_out(scores, products, tile)
         variance = _mean_variance(design, covariance)

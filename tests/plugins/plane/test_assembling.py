@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.assembling import (
+    Assembly,
+    assemble,
     enclosing,
     known_viewpoint,
     middle_viewpoint_m,
@@ -17,6 +19,10 @@ from orthoflow_plugins.plane.assembling import (
     side_of_remaining,
     side_of_stations,
 )
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, verify
+from orthoflow_plugins.plane.final_fit import label
+from orthoflow_plugins.plane.measuring import Deviations, measure_planes
+from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import PointCloud
@@ -171,3 +177,182 @@ def test_without_other_points_no_side_is_told(n_points: int) -> None:
     points = np.tile([[0.0, 2.0, 0.0]], (n_points, 1))
     nowhere = np.zeros(n_points, dtype=np.bool_)
     assert side_of_remaining(WALL, CORNERS, points, nowhere, clear_m=0.05) == 0
+
+
+# --- products ---
+
+ORIGIN = np.array([300.0, -200.0, 40.0])
+RULES = Rules(
+    find_m=0.05,
+    fit_m=0.015,
+    n_planes_most=10,
+    least_share=0.1,
+    stop_unclassified_share=0.05,
+    tilt_most_deg=10.0,
+    stop_rest_share=0.0,
+    is_exact=False,
+    joins_parts=True,
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two walls as a detector found them, the smaller first: its normal points to the origin."""
+
+    cloud: PointCloud
+    prepared: PreparedCloud
+    found: list[FoundPlane]
+    deviations: Deviations
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(4)
+    west = rng.uniform([-2.0, -1.9, -1.0], [-2.0, 1.9, 1.0], (8_000, 3))
+    north = rng.uniform([-1.9, 2.0, -1.0], [2.0, 2.0, 1.0], (24_000, 3))
+    # More of them beyond the wall than before it.
+    north[:, 1] += rng.exponential(0.003, 24_000)
+    west[:, 0] -= rng.exponential(0.002, 8_000)
+    seen = cloud_of(np.vstack([west, north, [[0.3, 0.0, 0.0]]]), origin=tuple(ORIGIN))
+    prepared = prepare(seen, np.eye(3), cell_m=0.5, least_share=0.01, parts=2)
+    unassigned = Unassigned.of(prepared)
+    found = []
+    for normal, offset_m, votes in (([1.0, 0.0, 0.0], -2.0, 77.0), ([0.0, 1.0, 0.0], 2.0, 99.0)):
+        rough = Candidate(
+            plane=Plane(normal=np.array(normal), offset_m=offset_m), family="wall", votes=votes
+        )
+        item = verify(rough, unassigned, RULES)
+        assert item is not None
+        unassigned.claim(item.claim(RULES.find_m))
+        found.append(item)
+    label(found, prepared, RULES.find_m)
+    deviations = measure_planes(
+        prepared,
+        np.array([item.raster.slab() for item in found]),
+        np.array([item.support.bounds_m for item in found]),
+        find_m=RULES.find_m,
+        fit_m=RULES.fit_m,
+    )
+    return Scene(cloud=seen, prepared=prepared, found=found, deviations=deviations)
+
+
+def assembled(scene: Scene, *stations: tuple[float, float, float]) -> Assembly:
+    known = scene.cloud
+    if stations:
+        known = replace(known, stations=np.array(stations) + ORIGIN, stations_source="file")
+    return assemble(scene.found, scene.prepared, scene.deviations, known)
+
+
+def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
+    assembly = assembled(scene, (0.0, 0.0, 0.0))
+    planes = assembly.planes
+    assert planes.names == ("wall 0", "wall 1")
+    assert planes.n_points.tolist() == sorted(planes.n_points, reverse=True)
+    np.testing.assert_array_equal(assembly.labels_from_claims, [1, 0, -1])
+    np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
+    assert (planes.viewpoint, planes.side_from, assembly.n_guessed) == ("stations", (), 0)
+    for k, item in enumerate(reversed(scene.found)):
+        sign = -1.0 if k == 0 else 1.0
+        own = item.raster.plane
+        np.testing.assert_array_equal(planes.normal[k], sign * own.normal)
+        assert planes.offset[k] == sign * own.offset_m + float(planes.normal[k] @ ORIGIN)
+        # The offset counts from the world's origin: it moves with the normal.
+        shift = np.eye(4)
+        shift[3, :3] = ORIGIN
+        stated = item.adjusted.stated()
+        np.testing.assert_allclose(
+            planes.covariance[k], shift @ stated.covariance @ shift.T, rtol=1e-6, atol=1e-15
+        )
+        assert assembly.n_independent[k] == stated.n_independent
+        raw = assembly.raw[k]
+        np.testing.assert_array_equal(raw.plane.normal, sign * item.candidate.plane.normal)
+        assert raw.plane.offset_m == pytest.approx(
+            sign * item.candidate.plane.offset_m + float(raw.plane.normal @ ORIGIN)
+        )
+        assert raw.votes == item.candidate.votes
+    assert planes.tolerance_m == RULES.find_m
+
+
+def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
+    before, after = scene.deviations, assembled(scene, (0.0, 0.0, 0.0)).deviations
+    assert not np.array_equal(before.histogram[1], before.histogram[1, ::-1])
+    np.testing.assert_array_equal(after.histogram[0], before.histogram[1, ::-1])
+    np.testing.assert_array_equal(after.histogram[1], before.histogram[0])
+    np.testing.assert_array_equal(after.mean_fit_m, [-before.mean_fit_m[1], before.mean_fit_m[0]])
+    np.testing.assert_array_equal(after.n_fit, before.n_fit[::-1])
+    np.testing.assert_array_equal(after.rms_find_m, before.rms_find_m[::-1])
+    # From behind it is the other way round.
+    after = assembled(scene, (-3.0, 3.0, 0.0)).deviations
+    np.testing.assert_array_equal(after.histogram, [before.histogram[1], before.histogram[0, ::-1]])
+    np.testing.assert_array_equal(after.mean_fit_m, [before.mean_fit_m[1], -before.mean_fit_m[0]])
+
+
+def test_rectangles_end_with_the_points(scene: Scene) -> None:
+    planes = assembled(scene, (0.0, 0.0, 0.0)).planes
+    north, west = planes.corners - ORIGIN
+    np.testing.assert_allclose(
+        north[:, [0, 2]], [[-1.9, 1], [-1.9, -1], [2, -1], [2, 1]], atol=0.005
+    )
+    np.testing.assert_allclose(
+        west[:, [1, 2]], [[-1.9, 1], [-1.9, -1], [1.9, -1], [1.9, 1]], atol=0.005
+    )
+    assert planes.part_plane is not None
+    np.testing.assert_array_equal(planes.part_plane, [0, 1])
+    # Parts are known to a cell, and none reaches beyond the points.
+    np.testing.assert_allclose(planes.part_corners, planes.corners, atol=0.06)
+    for part, whole in zip(planes.part_corners, planes.corners, strict=True):
+        assert (part.max(axis=0) <= whole.max(axis=0) + 1e-9).all()
+        assert (part.min(axis=0) >= whole.min(axis=0) - 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("stations", "viewpoint", "side_from", "n_guessed"),
+    [
+        ([], "guess", (), 2),
+        # In the plane of the larger one it says nothing about that.
+        ([(0.0, 2.0, 0.0)], "stations", ("guess", "stations"), 1),
+        ([(0.0, 2.0, 0.0), (0.0, 0.5, 0.0)], "stations", (), 0),
+    ],
+)
+def test_sides_that_no_station_knows_are_guessed(
+    scene: Scene,
+    stations: list[tuple[float, float, float]],
+    viewpoint: str,
+    side_from: tuple[str, ...],
+    n_guessed: int,
+) -> None:
+    assembly = assembled(scene, *stations)
+    planes = assembly.planes
+    assert (planes.viewpoint, planes.side_from, assembly.n_guessed) == (
+        viewpoint,
+        side_from,
+        n_guessed,
+    )
+    # The other wall lies before each of them.
+    np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
+    given = planes.details["guessed_sides"]
+    assert given == [k for k in range(2) if n_guessed == 2 or "guess" in side_from[k : k + 1]]
+
+
+def test_sides_that_were_stated_are_given(scene: Scene) -> None:
+    known = replace(
+        scene.cloud, stations=np.array([[0.0, 2.0, 0.0]]) + ORIGIN, stations_source="view_from"
+    )
+    planes = assemble(scene.found, scene.prepared, scene.deviations, known).planes
+    assert (planes.viewpoint, planes.side_from) == ("view_from", ("guess", "given"))
+
+
+def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
+    assembly = assembled(scene, (0.0, 0.0, 0.0))
+    details = assembly.planes.details
+    assert details["fit_n_points"] == scene.deviations.n_fit[::-1].tolist()
+    assert details["fit_rms_m"] == scene.deviations.rms_fit_m[::-1].tolist()
+    assert details["fit_tolerance_m"] == RULES.fit_m
+    assert details["n_independent"] == list(assembly.n_independent)
+    first = details["raw"][0]  # type: ignore[index]
+    assert first == {
+        "normal": [0.0, -1.0, 0.0],
+        "offset_m": pytest.approx(-2.0 + 200.0),
+        "support": 99.0,
+        "own_tolerance_m": None,
+    }
