@@ -260,3 +260,12 @@ def test_previews_in_webp_are_those_in_png() -> None:
     assert parts == images.preview_webp(image, shown, longest_side_px=32)
     whole = images.cells_png(shown.shape, lambda part: (image[part], shown[part]))
     assert whole == images.preview_png(image, shown)
+
+
+def test_levels_are_as_deep_as_the_file_and_in_the_order_of_colours() -> None:
+    deep = np.random.default_rng(5).integers(0, 1 << 16, (6, 9, 3), dtype=np.uint16)
+    np.testing.assert_array_equal(images.decode_levels(images.encode_png(deep)), deep)
+    plain = (deep >> 8).astype(np.uint8)
+    found = images.decode_levels(images.encode_png(plain))
+    np.testing.assert_array_equal(found, plain)
+    assert found.dtype == np.uint8

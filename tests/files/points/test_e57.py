@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan
+from orthoflow.files.points import e57, open_scan
 from tests import scan_files
 from tests.scan_files import read_all
 
@@ -174,3 +175,148 @@ def test_an_e57_scan_without_coordinates_is_refused(tmp_path: Path) -> None:
     path = scan_files.write_e57(tmp_path / "a.e57", [scan])
     with pytest.raises(InputError, match="scan 0 has the fields intensity, expected cartesianX"):
         open_scan(path)
+
+
+# --- what headers say ---
+
+
+class Node(dict[str, Any]):
+    """What a file has at some place, by name."""
+
+    def isDefined(self, name: str) -> bool:  # noqa: N802 - the library's name
+        return name in self
+
+
+class Number:
+    def __init__(self, value: float, scaled: float | None = None) -> None:
+        self._value = value
+        if scaled is not None:
+            self.scaledValue = lambda: scaled
+
+    def value(self) -> float:
+        return self._value
+
+
+def numbers(**values: float) -> Node:
+    return Node({name: Number(value) for name, value in values.items()})
+
+
+def test_a_number_is_what_it_stands_for() -> None:
+    assert e57.number_of(Number(7)) == 7.0
+    assert e57.number_of(Number(7, scaled=0.007)) == 0.007
+
+
+@pytest.mark.parametrize(
+    ("stated", "limits"),
+    [
+        ({"low": 1.0, "high": 5.0}, (1.0, 5.0)),
+        ({"low": -1.0, "high": 0.0}, (-1.0, 0.0)),
+        ({"low": 5.0, "high": 5.0}, None),
+        ({"low": 5.0, "high": 1.0}, None),
+        ({"low": 1.0}, None),
+        ({"high": 1.0}, None),
+        ({"low": -np.inf, "high": 1.0}, None),
+        ({"low": 1.0, "high": np.inf}, None),
+        ({"low": np.nan, "high": 1.0}, None),
+        (None, None),
+    ],
+)
+def test_limits_hold_where_both_are_stated_and_differ(
+    stated: dict[str, float] | None, limits: tuple[float, float] | None
+) -> None:
+    node = Node() if stated is None else Node(group=numbers(**stated))
+    assert e57._limits(node, "group", "low", "high") == limits
+
+
+def test_colours_are_full_at_the_largest_of_three_limits() -> None:
+    stated = {"colorRedMinimum": 0.0, "colorGreenMinimum": 0.0, "colorBlueMinimum": 0.0}
+    full = {"colorRedMaximum": 200.0, "colorGreenMaximum": 255.0, "colorBlueMaximum": 100.0}
+    assert e57._rgb_limit(Node(colorLimits=numbers(**stated, **full))) == 255.0
+    del full["colorBlueMaximum"]
+    assert e57._rgb_limit(Node(colorLimits=numbers(**stated, **full))) is None
+    assert e57._rgb_limit(Node()) is None
+
+
+def test_a_scanner_stands_where_its_pose_says() -> None:
+    rotation, translation = e57.pose_of(Node())
+    np.testing.assert_array_equal(rotation, np.eye(3))
+    np.testing.assert_array_equal(translation, np.zeros(3))
+    # A quarter turn about z, of a length that squares to nothing.
+    turn = numbers(w=1e-200, x=0.0, y=0.0, z=1e-200)
+    rotation, translation = e57.pose_of(
+        Node(pose=Node(rotation=turn, translation=numbers(z=3.0, x=1.0, y=2.0)))
+    )
+    np.testing.assert_allclose(rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_array_equal(translation, [1.0, 2.0, 3.0])
+    nothing = numbers(w=0.0, x=0.0, y=0.0, z=0.0)
+    rotation, translation = e57.pose_of(Node(pose=Node(rotation=nothing)))
+    np.testing.assert_array_equal(rotation, np.eye(3))
+    np.testing.assert_array_equal(translation, np.zeros(3))
+
+
+def header_of(**known: Any) -> e57.ScanHeader:
+    plain: dict[str, Any] = {
+        "index": 0,
+        "n_points": 3,
+        "names": frozenset({"cartesianX", "cartesianY", "cartesianZ"}),
+        "rotation": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+        "translation": np.array([10.0, 20.0, 30.0]),
+        "is_posed": True,
+        "intensity_limits": None,
+        "rgb_limit": None,
+    }
+    return e57.ScanHeader(**{**plain, **known})
+
+
+ARRAYS = {
+    "cartesianX": np.array([1.0, 2.0, 3.0]),
+    "cartesianY": np.array([4.0, 5.0, 6.0]),
+    "cartesianZ": np.array([7.0, 8.0, 9.0]),
+}
+MORE = {
+    "intensity": np.array([0.25, 0.5, 0.75]),
+    "colorRed": np.array([1.0, 2.0, 3.0]),
+    "colorGreen": np.array([4.0, 5.0, 6.0]),
+    "colorBlue": np.array([7.0, 8.0, 9.0]),
+    "rowIndex": np.array([0.0, 1.0, 2.0]),
+    "columnIndex": np.array([5.0, 6.0, 7.0]),
+}
+
+
+def test_a_block_has_what_its_scan_has() -> None:
+    block = e57._block(dict(ARRAYS), header_of(), 2)
+    np.testing.assert_allclose(block.points, [[6, 21, 37], [5, 22, 38], [4, 23, 39]])
+    assert (block.scan, block.n_read, block.n_invalid) == (2, 3, 0)
+    assert block.station is not None
+    np.testing.assert_array_equal(block.station, [10.0, 20.0, 30.0])
+    assert block.intensity is None
+    assert block.rgb is None
+    assert block.row is None
+    assert block.column is None
+    still = e57._block(dict(ARRAYS), header_of(is_posed=False), 2)
+    np.testing.assert_array_equal(still.points[0], [1.0, 4.0, 7.0])
+    full = e57._block({**ARRAYS, **MORE}, header_of(), 0)
+    np.testing.assert_array_equal(full.intensity, [0.25, 0.5, 0.75])
+    np.testing.assert_array_equal(full.rgb, [[1, 4, 7], [2, 5, 8], [3, 6, 9]])
+    np.testing.assert_array_equal(full.row, [0, 1, 2])
+    np.testing.assert_array_equal(full.column, [5, 6, 7])
+    # Two of three colours, or a row alone, are none.
+    for gone, name in (("colorBlue", "rgb"), ("columnIndex", "row")):
+        some = {key: values for key, values in {**ARRAYS, **MORE}.items() if key != gone}
+        assert getattr(e57._block(some, header_of(), 0), name) is None
+
+
+def test_points_without_a_position_are_left_out_with_all_that_is_theirs() -> None:
+    arrays = {**ARRAYS, **MORE, "cartesianInvalidState": np.array([0.0, 2.0, 0.0])}
+    block = e57._block(arrays, header_of(is_posed=False), 0)
+    assert (block.n_read, block.n_invalid) == (3, 1)
+    np.testing.assert_array_equal(block.points[:, 0], [1.0, 3.0])
+    np.testing.assert_array_equal(block.intensity, [0.25, 0.75])
+    np.testing.assert_array_equal(block.column, [5, 7])
+
+
+def test_spheres_count_from_x_towards_y_and_up() -> None:
+    spherical = np.array([[2.0, 0.0, 0.0], [2.0, np.pi / 2, 0.0], [2.0, 0.0, np.pi / 2]])
+    np.testing.assert_allclose(e57._cartesian(spherical), 2.0 * np.eye(3), atol=1e-12)
+    both = e57._cartesian(np.array([[2.0, np.pi / 6, np.pi / 3]]))
+    np.testing.assert_allclose(both, [[np.sqrt(3) / 2, 0.5, np.sqrt(3)]])
