@@ -18,8 +18,7 @@ import numpy as np
 from orthoflow.files.geotiff import write_orthoimage
 from orthoflow.files.ortho_files import ortho_files
 from orthoflow.files.sidecars import frame_json, write_json
-from orthoflow.files.tiles.pyramid import write_tiles
-from orthoflow.files.tiles.viewer import write_viewer
+from orthoflow.files.tiles.pyramid import write_tiles, write_viewer
 from orthoflow.geometry import WallFrame
 
 GSD_M = 0.001

@@ -14,7 +14,7 @@ import orthoflow_plugins
 import pytest
 from numba.core import types
 
-from orthoflow.geometry.kernel_contents import UntellableError, contents_digest, fields_of
+from orthoflow.geometry.kept_kernels import UntellableError, contents_digest, fields_of
 
 OTHERS = """
 import enum

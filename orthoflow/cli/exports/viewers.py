@@ -61,8 +61,7 @@ def _depths(
 
 def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
     """Write the tiles of each orthoimage, and `index.html`."""
-    from orthoflow.files.tiles.pyramid import write_tiles
-    from orthoflow.files.tiles.viewer import PAGE, write_viewer
+    from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
 
     address, orthos = _orthos(run, chosen)
     images = {f"wall_{ortho.wall}_ortho": ortho for ortho in orthos}

@@ -2,13 +2,16 @@
 
 `NAME.dzi` says the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles: the last level has the
 cells as they are, each before it half as many a side, level 0 is one pixel. Tiles are transparent
-where the orthoimage is empty.
+where the orthoimage is empty. The page beside them pans, zooms and measures: one file, no server,
+nothing from elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
@@ -17,10 +20,13 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_webp
 from orthoflow.files.ortho_files import OrthoFile
-from orthoflow.files.sidecars import write_bytes, write_text
+from orthoflow.files.sidecars import numbers, write_bytes, write_text
+from orthoflow.products import JsonValue
 
 TILE_PX: Final = 512
 SUFFIX: Final = "webp"
+PAGE: Final = "index.html"
+_PLACE: Final = "/*IMAGES*/[]"
 
 
 def write_tiles(folder: Path, name: str, ortho: OrthoFile) -> int:
@@ -142,3 +148,42 @@ def _descriptor(width: int, height: int) -> str:
         f'Format="{SUFFIX}" Overlap="0" TileSize="{TILE_PX}">\n'
         f'  <Size Width="{width}" Height="{height}"/>\n</Image>\n'
     )
+
+
+def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
+    """Write `index.html` for images whose tiles lie in the folder.
+
+    Args:
+        folder: existing folder.
+        images: name of the tiles -> orthoimage.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    described = [_image(name, ortho) for name, ortho in images.items()]
+    text = json.dumps(described, allow_nan=False)
+    # Names come from records, and the page must not end within one.
+    for letter in "<>&":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    page = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+    write_text(folder / PAGE, page.replace(_PLACE, text))
+
+
+def _image(name: str, ortho: OrthoFile) -> JsonValue:
+    frame = ortho.frame
+    return {
+        "file": name,
+        "title": ortho.name,
+        "width": frame.width,
+        "height": frame.height,
+        "gsd": frame.gsd_m,
+        "tile": TILE_PX,
+        "suffix": SUFFIX,
+        "last": last_level(frame.width, frame.height),
+        "origin": numbers(frame.origin_world),
+        "u": numbers(frame.u_world),
+        "v": numbers(frame.v_world),
+        # X and Y as in the GeoTIFF.
+        "corner": list(frame.raster_corner_m),
+        "crs": frame.map_crs,
+    }

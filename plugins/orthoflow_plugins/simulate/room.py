@@ -12,7 +12,6 @@ from pydantic import Field, model_validator
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
 from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.simulate.check_points import check_points
 from orthoflow_plugins.simulate.photographs import (
     Film,
     PhotoLayout,
@@ -304,6 +303,8 @@ def _film(params: SimulateRoom.Params) -> Film:
 
 
 def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> CheckPoints:
+    from orthoflow_plugins.simulate.deliverables import check_points
+
     return check_points(
         delivery.room.scene,
         views,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.e57_xml import check_xml
+from orthoflow.files.points.e57 import check_xml
 from tests.fuzz.e57_pages import e57_of
 
 # What stands before the XML does not count here.

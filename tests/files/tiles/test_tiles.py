@@ -9,8 +9,7 @@ from PIL import Image
 
 from orthoflow.files.ortho_files import OrthoFile
 from orthoflow.files.tiles import pyramid
-from orthoflow.files.tiles.pyramid import halved, write_tiles
-from orthoflow.files.tiles.viewer import write_viewer
+from orthoflow.files.tiles.pyramid import halved, write_tiles, write_viewer
 from tests.browser import PROGRAM, browser
 from tests.ortho_file_scenes import CORNER, GSD_M, UP, WALL_SHAPE, colours, room
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as balancing
-from orthoflow_plugins.mosaic.balance import Balance, balance_of
+from orthoflow_plugins.mosaic.balance import Balance, Exposures, Radii, balance_of, estimate
 from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.exposures import Exposures, Radii, estimate
 from orthoflow_plugins.mosaic.light import BlockLight, block_light, light_of_levels, lit
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates

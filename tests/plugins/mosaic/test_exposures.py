@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic import exposures as module
-from orthoflow_plugins.mosaic.exposures import Exposures, Radii, estimate
+from orthoflow_plugins.mosaic import balance as module
+from orthoflow_plugins.mosaic.balance import Exposures, Radii, estimate
 from orthoflow_plugins.mosaic.light import BlockLight
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.simulate import check_points
+from orthoflow_plugins.simulate import deliverables
 from orthoflow_plugins.simulate.building import SceneDraft
 from orthoflow_plugins.simulate.room_model import RoomPlan, build_room, wall_sides
 from orthoflow_plugins.simulate.scanning import station_positions
@@ -32,22 +32,22 @@ def fresco(extent: tuple[float, float, float, float], period_m: float = 1.0) -> 
 
 
 def test_lines_cross_every_nine_tenths_of_a_period_inside_the_rectangle() -> None:
-    spots = check_points._lattice(fresco((-1.0, 1.85, -0.5, 0.95)), 0)
+    spots = deliverables._lattice(fresco((-1.0, 1.85, -0.5, 0.95)), 0)
     # From -0.9 to 1.8 across, 0 and 0.9 up: where lines of the lattice cross.
     expected = [(a, b) for b in (0.0, 0.9) for a in (-0.9, 0.0, 0.9, 1.8)]
     np.testing.assert_allclose(spots.in_rectangle, expected, atol=1e-12)
     assert spots.rectangle.tolist() == [0] * 8
-    twice = check_points._lattice(fresco((-1.0, 1.85, -0.5, 0.95), period_m=2.0), 0)
+    twice = deliverables._lattice(fresco((-1.0, 1.85, -0.5, 0.95), period_m=2.0), 0)
     np.testing.assert_allclose(twice.in_rectangle, [(0.0, 0.0), (1.8, 0.0)], atol=1e-12)
 
 
 def test_places_on_a_rectangle_are_points_of_the_room() -> None:
     scene = fresco((-1.0, 1.0, -1.0, 1.0))
-    spots = check_points._lattice(scene, 0)
+    spots = deliverables._lattice(scene, 0)
     moved = spots.moved(np.array([0.1, -0.2]))
     np.testing.assert_allclose(moved.points(scene) - spots.points(scene), [[0.1, 0.0, -0.2]] * 9)
     np.testing.assert_allclose(spots.points(scene)[4], [1.0, 2.0, 3.0], atol=1e-12)
-    joined = check_points._joined([spots, moved])
+    joined = deliverables._joined([spots, moved])
     assert len(joined.rectangle) == 18
     np.testing.assert_array_equal(joined.in_rectangle[9:], moved.in_rectangle)
 
@@ -55,10 +55,10 @@ def test_places_on_a_rectangle_are_points_of_the_room() -> None:
 def test_chosen_points_lie_far_from_each_other_and_keep_their_order() -> None:
     line = np.column_stack([[0.0, 1.0, 2.0, 3.0, 4.0, 10.0], np.zeros(6), np.zeros(6)])
     # The first, then the farthest from it, then the one farthest from both.
-    assert check_points._spread(line, 3)[:, 0].tolist() == [0.0, 4.0, 10.0]
-    assert check_points._spread(line, 4)[:, 0].tolist() == [0.0, 2.0, 4.0, 10.0]
-    assert check_points._spread(line, 6) is line
-    assert check_points._spread(line[:2], 6).tolist() == line[:2].tolist()
+    assert deliverables._spread(line, 3)[:, 0].tolist() == [0.0, 4.0, 10.0]
+    assert deliverables._spread(line, 4)[:, 0].tolist() == [0.0, 2.0, 4.0, 10.0]
+    assert deliverables._spread(line, 6) is line
+    assert deliverables._spread(line[:2], 6).tolist() == line[:2].tolist()
 
 
 class Views:
@@ -85,10 +85,10 @@ class Views:
 )
 def test_a_place_is_seen_where_its_own_rectangle_is_met_there(views: Any, is_seen: bool) -> None:
     scene = fresco((-1.0, 1.0, -1.0, 1.0))
-    spots = check_points._lattice(scene, 0)
-    seen = check_points._are_seen(scene, views, spots, np.array([[0.0, -5.0, 0.0]]))
+    spots = deliverables._lattice(scene, 0)
+    seen = deliverables._are_seen(scene, views, spots, np.array([[0.0, -5.0, 0.0]]))
     assert seen.tolist() == [is_seen] * 9
-    assert not check_points._are_seen(scene, views, spots, np.zeros((0, 3))).any()
+    assert not deliverables._are_seen(scene, views, spots, np.zeros((0, 3))).any()
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,8 @@ def test_a_place_is_level_where_a_surface_goes_on_at_its_height(
     height_m: float, is_level: bool
 ) -> None:
     scene = fresco((-1.0, 1.0, -1.0, 1.0))
-    spots = check_points._lattice(scene, 0)
-    found = check_points._are_level(scene, Views(t=height_m), spots)  # type: ignore[arg-type]
+    spots = deliverables._lattice(scene, 0)
+    found = deliverables._are_level(scene, Views(t=height_m), spots)  # type: ignore[arg-type]
     assert found.tolist() == [is_level] * 9
 
 
@@ -110,7 +110,7 @@ def of_the_room(n_most: int, turn_deg: float = 0.0, shift_m: float = 0.0) -> Che
     rotation = np.array(
         [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
     )
-    return check_points.check_points(
+    return deliverables.check_points(
         scene,
         SceneCameras(scene, cores=1),
         station_positions(2),

@@ -18,7 +18,7 @@ from orthoflow_plugins.simulate.building import (
     TruePlane,
     wall_side,
 )
-from orthoflow_plugins.simulate.drawn_walls import WallDrawing, WallPaints, draw_wall
+from orthoflow_plugins.simulate.room_model import WallDrawing, WallPaints, draw_wall
 
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.simulate.laser_band import LaserBand
+from orthoflow_plugins.simulate.scanning import LaserBand
 
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 
