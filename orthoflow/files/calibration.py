@@ -92,7 +92,14 @@ def read_calibration(path: Path) -> CalibratedLenses:
         InputError: the file cannot be used; one line per problem, `file:line:column: ...`.
     """
     reader = _Reader(path.name)
-    calibration = reader.read(_text_of(path))
+    calibration = reader.read(
+        text_of_file(
+            path,
+            MOST_BYTES,
+            "a calibration file (YAML)",
+            way_out=": give photos of one camera one entry, by a pattern",
+        )
+    )
     if calibration is None or reader.problems:
         raise InputError("\n".join(problem for _, problem in sorted(reader.problems)))
     return calibration
@@ -171,22 +178,6 @@ def lens_for(
         f'photo {photo_name} has {width} x {height} pixels, but its calibration "{pattern}" is '
         f"for {camera.width} x {camera.height}; {way_out}"
     )
-
-
-def _text_of(path: Path) -> str:
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path.name} has {path.stat().st_size} bytes, a calibration file at most "
-                f"{MOST_BYTES}: give photos of one camera one entry, by a pattern"
-            )
-        return text_of_file(path)
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path.name} is no UTF-8 text: expected a calibration file (YAML)"
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
 class _Pixels(TypedDict):

@@ -10,9 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
@@ -24,7 +22,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
 from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.json_texts import parse_json
-from orthoflow.files.regular_files import open_file, text_of_file
+from orthoflow.files.regular_files import open_file, open_text, reading, text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
@@ -32,6 +30,7 @@ from orthoflow.products import Intrinsics
 MOST_MODEL_BYTES: Final = 500_000_000
 MOST_BYTES: Final = 50_000_000
 MOST_LINE: Final = 20_000_000
+_WHAT: Final = "a file of cameras"
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _FULL_FRAME_MM: Final = 36.0
@@ -120,8 +119,7 @@ def text_of(path: Path) -> str:
     Raises:
         InputError: it cannot be read, is no text, or larger than any such file.
     """
-    with _reading(path, MOST_BYTES):
-        return text_of_file(path)
+    return text_of_file(path, MOST_BYTES, _WHAT)
 
 
 def lines_of(path: Path) -> Iterator[str]:
@@ -131,10 +129,7 @@ def lines_of(path: Path) -> Iterator[str]:
         InputError: it cannot be read, is no text, is larger than any such file, or has a longer
             line.
     """
-    with (
-        _reading(path, MOST_MODEL_BYTES),
-        TextIOWrapper(open_file(path), encoding="utf-8-sig") as stream,
-    ):
+    with reading(path, MOST_MODEL_BYTES, _WHAT), open_text(path) as stream:
         while line := stream.readline(MOST_LINE):
             if len(line) == MOST_LINE:
                 raise InputError(f"{path.name} has a line of more than {MOST_LINE} letters")
@@ -147,23 +142,8 @@ def bytes_of(path: Path) -> bytes:
     Raises:
         InputError: it cannot be read, or is larger than any such file.
     """
-    with _reading(path, MOST_MODEL_BYTES), open_file(path) as stream:
+    with reading(path, MOST_MODEL_BYTES, _WHAT), open_file(path) as stream:
         return stream.read(MOST_MODEL_BYTES)
-
-
-@contextmanager
-def _reading(path: Path, most_bytes: int) -> Iterator[None]:
-    try:
-        if path.stat().st_size > most_bytes:
-            raise InputError(
-                f"{path.name} has {path.stat().st_size} bytes, more than {most_bytes}: it is too "
-                "large for a file of cameras"
-            )
-        yield
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path.name} is no UTF-8 text: expected a file of cameras") from error
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
 def bare_name(text: str) -> str:

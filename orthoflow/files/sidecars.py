@@ -76,16 +76,8 @@ def read_sidecar(path: Path) -> dict[str, object]:
     Raises:
         InputError: the file cannot be read, is too large, or holds something else.
     """
-    try:
-        if path.stat().st_size > MOST_SIDECAR_BYTES:
-            raise InputError(
-                f"{path.name} has {path.stat().st_size} bytes, more than {MOST_SIDECAR_BYTES}: "
-                "expected a JSON object with origin_world, u_world ..."
-            )
-        text = text_of_file(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} cannot be read: {error}") from error
-    return sidecar_of(text, path.name)
+    what = "a JSON object with origin_world, u_world ..."
+    return sidecar_of(text_of_file(path, MOST_SIDECAR_BYTES, what), path.name)
 
 
 def sidecar_of(text: str, name: str) -> dict[str, object]:

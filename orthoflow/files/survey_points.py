@@ -132,19 +132,8 @@ _TIES: Final = _Form(
 
 
 def _text_of(path: Path, form: _Form) -> str:
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path.name} is too large for a list of {form.content}: expected a CSV file"
-            )
-        return text_of_file(path)
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path.name} is no UTF-8 text: expected a CSV file with the columns "
-            f"{','.join(form.required)}; save it as UTF-8"
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+    what = f"a CSV file of {form.content} with the columns {','.join(form.required)}"
+    return text_of_file(path, MOST_BYTES, what)
 
 
 @dataclass(frozen=True, kw_only=True)

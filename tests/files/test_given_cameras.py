@@ -541,7 +541,7 @@ def test_a_file_that_no_cameras_need_is_not_read(
     for name in names:
         with (tmp_path / name).open("wb") as file:
             file.truncate(most + 1)
-    with pytest.raises(InputError, match=f"has {most + 1} bytes, more than {most}: it is too"):
+    with pytest.raises(InputError, match=f"has {most + 1} bytes, a file of cameras at most {most}"):
         read_given_cameras([tmp_path / name for name in names])
 
 

@@ -248,7 +248,7 @@ KNOWN: Final = {
         words="origin_world must be three numbers",
     ),
     "a megabyte of JSON": Known(
-        target="SIDECAR", file="wall.json", content=b" " * 1_100_000, words="1100000 bytes, more"
+        target="SIDECAR", file="wall.json", content=b" " * 1_100_000, words="1100000 bytes"
     ),
     # Pictures.
     "30,000 x 30,000 pixels": Known(

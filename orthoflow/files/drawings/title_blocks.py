@@ -84,7 +84,8 @@ def read_title_block(path: Path) -> TitleBlock:
             one sentence, about the first place.
     """
     problems = _Problems()
-    content = read_yaml(_text_of(path), problems, _DIALECT)
+    text = text_of_file(path, MOST_BYTES, "a title block (YAML)")
+    content = read_yaml(text, problems, _DIALECT)
     values = {} if content is None else _values(content, problems)
     if problems.found:
         position, message = min(problems.found)
@@ -115,16 +116,3 @@ def _values(content: Value, problems: _Problems) -> dict[str, str]:
         else:
             values[entry.key] = text
     return values
-
-
-def _text_of(path: Path) -> str:
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path.name} has {path.stat().st_size} bytes, a title block at most {MOST_BYTES}"
-            )
-        return text_of_file(path)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path.name} is no UTF-8 text: expected a title block (YAML)") from error
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error

@@ -35,7 +35,7 @@ def test_every_field_is_read_as_text(tmp_path: Path) -> None:
         ("title: a\ntitle: b\n", "the key is there already, in line 1; remove one of them"),
         (f"note: {'a' * 301}\n", "note: has 301 letters, at most 300 fit on a sheet"),
         ("title: [", "block.yaml:"),
-        ("a" * 100_001, "block.yaml has 100001 bytes, a title block at most 100000"),
+        ("a" * 100_001, "block.yaml has 100001 bytes, a title block (YAML) at most 100000"),
     ],
     ids=["misspelt", "unknown", "list", "null", "no-table", "empty", "twice", "long", "cut", "big"],
 )
