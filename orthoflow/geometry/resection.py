@@ -26,6 +26,7 @@ from orthoflow.geometry.lenses import (
     stepped,
 )
 from orthoflow.geometry.rotations import cross_matrix
+from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
 # A step that gains so little of some hundred points' squares moved no parameter by more than a
@@ -38,7 +39,7 @@ _BLUR_MOST_SHARE: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeenPoints:
+class SeenPoints(Rows):
     """Points seen in one photo and known in the world.
 
     Attributes:
@@ -52,18 +53,6 @@ class SeenPoints:
     points_world: NDArray[np.float64]
     sigma_px: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.pixels_photo)
-
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> SeenPoints:
-        """Give some of the points."""
-        return SeenPoints(
-            pixels_photo=self.pixels_photo[chosen],
-            points_world=self.points_world[chosen],
-            sigma_px=self.sigma_px[chosen],
-            sigma_m=self.sigma_m[chosen],
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,6 @@ from orthoflow_plugins.inspect.patches import (
     GreyCells,
     GreyImage,
     PatchShifts,
-    joined_shifts,
     refine_shifts,
     tiles,
     unrefined,
@@ -171,7 +170,7 @@ def _refined(
             threads=threads,
         )
         parts.append(replace(refined, centre=refined.centre + corner))
-    return joined_shifts(parts)
+    return PatchShifts.joined(parts)
 
 
 def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import in_order
 
 PATCH_CELLS: Final = 32
@@ -134,7 +135,7 @@ def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchShifts:
+class PatchShifts(Rows):
     """Displacements of the patches that have enough texture in both directions.
 
     Attributes:
@@ -156,13 +157,8 @@ class PatchShifts:
         first = rows.start or 0
         end = np.inf if rows.stop is None else rows.stop
         own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
-        return PatchShifts(
-            centre=self.centre[own] - (0.0, float(first)),
-            shift=self.shift[own],
-            sigma=self.sigma[own],
-            found=self.found[own],
-            correlation=self.correlation[own],
-        )
+        kept = self.take(own)
+        return replace(kept, centre=kept.centre - (0.0, float(first)))
 
 
 def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
@@ -237,18 +233,8 @@ def refine_shifts(
         chosen = unrefined(start.centre[part], start.shift[part])
         return _refined(first, sampler, chosen, sigma_most_cells, focus_cells)
 
-    return joined_shifts(
+    return PatchShifts.joined(
         [*in_order(refined, range(0, len(start.centre), _AT_ONCE), threads=threads)]
-    )
-
-
-def joined_shifts(parts: Sequence[PatchShifts]) -> PatchShifts:
-    """Put the displacements of several parts of an image together."""
-    return PatchShifts(
-        **{
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(PatchShifts)
-        }
     )
 
 

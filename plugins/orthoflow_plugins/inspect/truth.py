@@ -56,7 +56,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     pose_findings,
     tie_findings,
 )
-from orthoflow_plugins.inspect.patches import PatchShifts, joined_shifts
+from orthoflow_plugins.inspect.patches import PatchShifts
 from orthoflow_plugins.inspect.placing import in_files, on_walls, rows_of, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     found_planes,
@@ -341,7 +341,7 @@ class _Judge:
         allocate = in_files(self.ctx, f"{image.wall}.cells")
         return _Verdict(
             samples=pooled([item.samples for item in errors], allocate),
-            patches=joined_shifts([item.patches for item in errors]),
+            patches=PatchShifts.joined([item.patches for item in errors]),
             depth_m=np.concatenate([item.depth_m for item in errors]),
             grey=np.concatenate([item.grey for item in errors]),
             step=step,

@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.rows import Rows
+
 # Pairs whose descriptors are gathered at once: 2 x 32 MB.
 _PAIRS_AT_ONCE: Final = 65_536
 # Entries of a block of distances: 12 MB, which a processor's cache holds while they are searched.
@@ -22,7 +24,7 @@ _LISTS_LEAST: Final = 2 * _LISTS_PROBED
 
 
 @dataclass(frozen=True, kw_only=True)
-class Matches:
+class Matches(Rows):
     """Pairs of descriptors.
 
     Attributes:
@@ -35,15 +37,6 @@ class Matches:
     first: NDArray[np.intp]
     second: NDArray[np.intp]
     ratio: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.first)
-
-    def take(self, chosen: NDArray[np.bool_]) -> Matches:
-        """Give some of the pairs."""
-        return Matches(
-            first=self.first[chosen], second=self.second[chosen], ratio=self.ratio[chosen]
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.patch_kernels import (
@@ -53,7 +54,7 @@ class SearchRule:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Displacements:
+class Displacements(Rows):
     """Measured displacements.
 
     Attributes:
@@ -67,15 +68,6 @@ class Displacements:
     shift_cells: NDArray[np.float64]
     score: NDArray[np.float64]
     sigma_cells: NDArray[np.float64]
-
-    def take(self, chosen: NDArray[np.bool_]) -> Displacements:
-        """Give some of them."""
-        return Displacements(
-            places=self.places[chosen],
-            shift_cells=self.shift_cells[chosen],
-            score=self.score[chosen],
-            sigma_cells=self.sigma_cells[chosen],
-        )
 
 
 def measure(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.key_points import in_turns, root_sift
 from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.rows import Rows
 
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
@@ -26,7 +27,7 @@ _SIDE_LEAST_PX: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class Features:
+class Features(Rows):
     """Key points of an image: the first n of them are the n strongest, spread over the image.
 
     Attributes:
@@ -40,18 +41,6 @@ class Features:
     sizes_px: NDArray[np.float64]
     angles_deg: NDArray[np.float64]
     descriptors: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def take(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Features:
-        """Give some of the key points."""
-        return Features(
-            pixels=self.pixels[chosen],
-            sizes_px=self.sizes_px[chosen],
-            angles_deg=self.angles_deg[chosen],
-            descriptors=self.descriptors[chosen],
-        )
 
     def undescribed(self) -> Features:
         """Give places and sizes without the descriptors, which are most of the bytes."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.photo_masks import used_pixels
+from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pictures import points_on_wall
@@ -23,7 +24,7 @@ _SIGMA_MOST_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class TiePiece:
+class TiePiece(Rows):
     """Ties of one photo with one wall.
 
     Attributes:
@@ -43,21 +44,6 @@ class TiePiece:
     sigma_px: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
     role: TieRole = TieRole.CONTROL
-
-    def __len__(self) -> int:
-        return len(self.pixels_photo)
-
-    def take(self, chosen: NDArray[np.bool_]) -> TiePiece:
-        """Give some of the ties."""
-        return TiePiece(
-            photo=self.photo,
-            wall=self.wall,
-            pixels_photo=self.pixels_photo[chosen],
-            points_world=self.points_world[chosen],
-            sigma_px=self.sigma_px[chosen],
-            sigma_m=self.sigma_m[chosen],
-            role=self.role,
-        )
 
 
 def key_point_ties(

@@ -18,6 +18,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import widened
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values, linearised
 from orthoflow.geometry.resection import whiten
+from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo
 from orthoflow_plugins.orient.layout import GROUPS, image_cells
 from orthoflow_plugins.orient.lenses import Lens
@@ -29,7 +30,7 @@ _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observations:
+class Observations(Rows):
     """Pixels at which photos see points.
 
     Attributes:
@@ -44,21 +45,9 @@ class Observations:
     pixels: NDArray[np.float64]
     sigma_px: NDArray[np.float64]
 
-    def __len__(self) -> int:
-        return len(self.photo)
-
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
-        """Give some of them."""
-        return Observations(
-            photo=self.photo[chosen],
-            point=self.point[chosen],
-            pixels=self.pixels[chosen],
-            sigma_px=self.sigma_px[chosen],
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class Points:
+class Points(Rows):
     """Points that photos see.
 
     Attributes:
@@ -70,9 +59,6 @@ class Points:
     now: NDArray[np.float64]
     known: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.now)
 
 
 @dataclass(frozen=True, kw_only=True)

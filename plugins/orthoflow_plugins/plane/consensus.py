@@ -135,7 +135,7 @@ class ConsensusProposer:
         for place in range(len(pool.hypotheses)):
             if is_barred[place] or not self._is_worth_it(pool.scores, place, unassigned):
                 continue
-            hypothesis = pool.hypotheses.chosen(np.array([place]))
+            hypothesis = pool.hypotheses.take(np.array([place]))
             layer = self._crowded_layer(hypothesis, pool.asked_m, unassigned.up)
             if layer is not None:
                 return self._candidate(hypothesis, pool.scores, place, layer, unassigned)
@@ -162,9 +162,9 @@ class ConsensusProposer:
         drawn = draw_hypotheses(
             self._ordered_m.take(free, axis=0), count, self._search.model, unassigned.up, self._rng
         )
-        hypotheses = drawn if earlier is None else drawn.joined(earlier.hypotheses)
-        hypotheses = hypotheses.chosen(self._leans_well(hypotheses, unassigned.up))
-        hypotheses = hypotheses.chosen(~self._rejections.cover(hypotheses))
+        hypotheses = drawn if earlier is None else Hypotheses.joined([drawn, earlier.hypotheses])
+        hypotheses = hypotheses.take(self._leans_well(hypotheses, unassigned.up))
+        hypotheses = hypotheses.take(~self._rejections.cover(hypotheses))
         if len(hypotheses) == 0:
             return
         # Among the first of them there nearly always are enough.
@@ -177,11 +177,11 @@ class ConsensusProposer:
         first = self._score(hypotheses, asked_m[:_FIRST_POINTS], parts)
         n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
         kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
-        hypotheses = hypotheses.chosen(kept)
+        hypotheses = hypotheses.take(kept)
         second = self._score(hypotheses, asked_m, parts)
         ranked = np.argsort(-second.value, kind="stable")
         self._pool = _Pool(
-            hypotheses=hypotheses.chosen(ranked),
+            hypotheses=hypotheses.take(ranked),
             asked_m=asked_m,
             scores=Scores(
                 value=second.value[ranked],
@@ -241,7 +241,7 @@ class ConsensusProposer:
         # The best ones nearly always hold enough that differ.
         for n_asked in (min(len(ranked), _ALIKE_MOST * n_most), len(ranked)):
             asked = ranked[:n_asked]
-            some = hypotheses.chosen(asked)
+            some = hypotheses.take(asked)
             near = self._alike(some, some)
             kept: list[int] = []
             alike = np.zeros(n_asked, dtype=np.int64)

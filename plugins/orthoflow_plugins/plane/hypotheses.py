@@ -23,6 +23,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.rows import Rows
+
 Model = Literal["3d", "2d"]
 Scoring = Literal["count", "msac", "a-contrario"]
 
@@ -43,7 +45,7 @@ _LOST_SHARE: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hypotheses:
+class Hypotheses(Rows):
     """Planes in the frame of the points they were drawn from.
 
     Attributes:
@@ -53,20 +55,6 @@ class Hypotheses:
 
     normals: NDArray[np.float64]
     offsets_m: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.offsets_m)
-
-    def chosen(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Hypotheses:
-        """Give some of them."""
-        return Hypotheses(normals=self.normals[index], offsets_m=self.offsets_m[index])
-
-    def joined(self, others: Hypotheses) -> Hypotheses:
-        """Give them and some others."""
-        return Hypotheses(
-            normals=np.concatenate([self.normals, others.normals]),
-            offsets_m=np.concatenate([self.offsets_m, others.offsets_m]),
-        )
 
     def rows(self) -> NDArray[np.float32]:
         """(h, 4) normal and offset, as the compiled scoring takes them."""
@@ -211,7 +199,7 @@ class Rejections:
 
     def add(self, hypothesis: Hypotheses) -> None:
         """Keep one from being proposed again."""
-        self._rejected = self._rejected.joined(hypothesis)
+        self._rejected = Hypotheses.joined([self._rejected, hypothesis])
         self._n_near = np.append(self._n_near, self._count(hypothesis))
 
     def take(self, is_free: NDArray[np.bool_]) -> None:
@@ -221,7 +209,7 @@ class Rejections:
             return
         n_near = self._count(self._rejected)
         stays = n_near >= (1.0 - _LOST_SHARE) * self._n_near
-        self._rejected, self._n_near = self._rejected.chosen(stays), self._n_near[stays]
+        self._rejected, self._n_near = self._rejected.take(stays), self._n_near[stays]
 
     def cover(self, hypotheses: Hypotheses) -> NDArray[np.bool_]:
         """(h,) whether hypotheses are much the same as a rejected one."""

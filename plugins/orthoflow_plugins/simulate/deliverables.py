@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, frame_over, wall_axes
+from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.scene_views import render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints, JsonValue, Photos, Planes, PointCloud, Truth
@@ -305,7 +306,7 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Spots:
+class _Spots(Rows):
     """Places on rectangles: rectangle (n,), and (a, b) metres (n, 2) on it."""
 
     rectangle: NDArray[np.int64]
@@ -369,7 +370,7 @@ def _crossings(
     scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     frescos = (scene.plane_index == _MAIN_WALL) & (scene.texture == TextureKind.FRESCO)
-    spots = _joined([_lattice(scene, int(index)) for index in np.flatnonzero(frescos)])
+    spots = _Spots.joined([_lattice(scene, int(index)) for index in np.flatnonzero(frescos)])
     clear = np.ones(len(spots.rectangle), dtype=np.bool_)
     for right in (-_CLEAR_M, 0.0, _CLEAR_M):
         for up in (-_CLEAR_M, 0.0, _CLEAR_M):
@@ -407,13 +408,6 @@ def _corners(
     # Where bars meet, their common corner lies in the middle of a face and shows no edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
     return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
-
-
-def _joined(parts: Sequence[_Spots]) -> _Spots:
-    return _Spots(
-        rectangle=np.concatenate([part.rectangle for part in parts]),
-        in_rectangle=np.concatenate([part.in_rectangle for part in parts]),
-    )
 
 
 def _are_seen(

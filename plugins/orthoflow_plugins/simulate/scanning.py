@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.hashed_numbers import cell_states, normals, uniforms
+from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_on
 from orthoflow.geometry.scenes import Scene, TextureKind
 from orthoflow.geometry.threads import in_runs
@@ -102,7 +103,7 @@ class Errors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scanned:
+class Scanned(Rows):
     """What a scan gives, one entry per ray, column by column.
 
     Attributes:
@@ -120,17 +121,6 @@ class Scanned:
     intensity: NDArray[np.float32]
     rgb: NDArray[np.uint8]
     rectangle: NDArray[np.int32]
-
-    def part(self, part: slice | NDArray[np.bool_]) -> Scanned:
-        """Give some of the entries; a view for a slice."""
-        return Scanned(
-            x=self.x[part],
-            y=self.y[part],
-            z=self.z[part],
-            intensity=self.intensity[part],
-            rgb=self.rgb[part],
-            rectangle=self.rectangle[part],
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +200,7 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
         ctx.progress(0.5 * index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
         in_runs(
-            partial(_sweep, scanner, sweep, points.part(span)),
+            partial(_sweep, scanner, sweep, points.take(span)),
             sweep.n_columns,
             n_per_run=max(1, RAYS_AT_ONCE // sweep.n_rows),
             threads=ctx.cores,
@@ -247,7 +237,7 @@ class Scanner:
             scanned: filled, entries of the whole scan.
         """
         echoes = self._echoes(sweep, first, last)
-        into = scanned.part(slice(first * sweep.n_rows, last * sweep.n_rows))
+        into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
         start = sweep.station[:, None]
         into.rectangle[:] = echoes.hits.rectangle
         measured = self._measured(sweep, echoes, into.rectangle)
@@ -343,7 +333,7 @@ def _only_hits(scan: Scan) -> Scan:
     if bool(hit.all()):
         return scan
     return Scan(
-        points=scan.points.part(hit),
+        points=scan.points.take(hit),
         scan=scan.scan[hit],
         row=scan.row[hit],
         column=scan.column[hit],

@@ -71,10 +71,12 @@ def test_of_hypotheses_much_the_same_five_are_kept() -> None:
     same = Hypotheses(normals=np.tile(UP, (8, 1)), offsets_m=np.linspace(0.0, 0.007, 8))
     other = Hypotheses(normals=np.tile(UP, (2, 1)), offsets_m=np.array([1.0, 1.001]))
     ranked = np.array([3, 0, 1, 2, 4, 5, 6, 7, 9, 8])
-    kept = ConsensusProposer._distinct(proposer(), same.joined(other), ranked, 7)
+    kept = ConsensusProposer._distinct(proposer(), Hypotheses.joined([same, other]), ranked, 7)
     assert kept.tolist() == [3, 0, 1, 2, 4, 9, 8]
     # With fewer wanted, only the best of them are looked at.
-    assert ConsensusProposer._distinct(proposer(), same.joined(other), ranked, 2).tolist() == [3, 0]
+    assert ConsensusProposer._distinct(
+        proposer(), Hypotheses.joined([same, other]), ranked, 2
+    ).tolist() == [3, 0]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_places_on_a_rectangle_are_points_of_the_room() -> None:
     moved = spots.moved(np.array([0.1, -0.2]))
     np.testing.assert_allclose(moved.points(scene) - spots.points(scene), [[0.1, 0.0, -0.2]] * 9)
     np.testing.assert_allclose(spots.points(scene)[4], [1.0, 2.0, 3.0], atol=1e-12)
-    joined = deliverables._joined([spots, moved])
+    joined = deliverables._Spots.joined([spots, moved])
     assert len(joined.rectangle) == 18
     np.testing.assert_array_equal(joined.in_rectangle[9:], moved.in_rectangle)
 

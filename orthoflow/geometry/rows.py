@@ -1,0 +1,32 @@
+"""Things kept as arrays with a row each: some of them, and those of several together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """What a dataclass is made of whose arrays have one row per thing; other fields tell of all."""
+
+    def __len__(self) -> int:
+        return len(next(iter(_arrays(self).values())))
+
+    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
+        """Give some of the things; views for a slice."""
+        return replace(self, **{name: array[chosen] for name, array in _arrays(self).items()})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Put the things of several together, at least one; what tells of all is the first's."""
+        columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
+        return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
+
+
+def _arrays(rows: Rows) -> dict[str, NDArray[Any]]:
+    return {name: value for name, value in vars(rows).items() if isinstance(value, np.ndarray)}
