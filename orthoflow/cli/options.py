@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -34,39 +34,17 @@ class Changes:
         """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
         from orthoflow.workflow import load_workflow
 
-        return load_workflow(
-            workflow,
-            catalog,
-            sets=self.sets,
-            inputs=self.inputs,
-            datasets=self.datasets,
-            only_data=self.only_data,
-            set_files=self.set_files,
-        )
+        return load_workflow(workflow, catalog, **vars(self))
 
 
 def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
     """Add the workflow and `changes` to it: `WORKFLOW --set --set-file --input --datasets ...`."""
 
-    # Any: the command's other parameters, whose types click has checked.
+    # Any: the command's parameters, whose types click has checked.
     @wraps(run)
-    def command(
-        *,
-        sets: tuple[str, ...],
-        set_files: tuple[str, ...],
-        inputs: tuple[str, ...],
-        datasets: str,
-        only_data: tuple[str, ...],
-        **others: Any,
-    ) -> int:
-        changes = Changes(
-            sets=sets,
-            inputs=inputs,
-            datasets=datasets,
-            only_data=only_data,
-            set_files=set_files,
-        )
-        return run(changes=changes, **others)
+    def command(**given: Any) -> int:
+        changes = Changes(**{item.name: given.pop(item.name) for item in fields(Changes)})
+        return run(changes=changes, **given)
 
     command = click.option(
         "--only-data",

@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 from orthoflow_provenance.digests import canonical_json, payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import shared_fields
 
 from orthoflow.engine.durability import (
     folder_size,
@@ -70,7 +71,7 @@ from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue, Payload, Product
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.payloads import StoredPayload
+    pass
 
 __all__ = [
     "Preimage",
@@ -231,7 +232,7 @@ class Store:
             if isinstance(error, OSError) and error.errno in SHORTAGES:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error
             raise DamageError(f"{damaged} ({error})") from error
-        return cls.from_payload(_as_payload(stored))
+        return cls.from_payload(Payload(**shared_fields(stored, Payload)))
 
     def product_metadata(self, digest: str) -> Mapping[str, JsonValue]:
         """What a product holds besides its arrays, which are not read.
@@ -540,16 +541,6 @@ class Store:
 def digest_of(product: Product) -> str:
     """Digest of a product's logical content, `sha256:` + 64 hexadecimal digits."""
     return payload_digest(product.to_payload())
-
-
-def _as_payload(stored: StoredPayload) -> Payload:
-    return Payload(
-        type_name=stored.type_name,
-        encoding_version=stored.encoding_version,
-        metadata=stored.metadata,
-        arrays=stored.arrays,
-        mapped=stored.mapped,
-    )
 
 
 def _read_preimage(path: Path) -> Preimage | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,10 @@ class TextureKind(IntEnum):
     TEXTILE = 2  # one motif, repeated exactly
     TILES = 3  # checker of stained tiles with joints
     WOOD = 4  # grain along b
+
+
+# Fields of a scene with a row per rectangle.
+_PER_RECTANGLE: Final = "centre axis_a axis_b extent plane_index role texture texture_params"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,16 +117,10 @@ class Scene:
         """Give the chosen rectangles (r,) alone, with their holes."""
         place = np.cumsum(chosen) - 1
         holes = chosen[self.hole_rectangle]
+        kept = {name: getattr(self, name)[chosen] for name in _PER_RECTANGLE.split()}
         return replace(
             self,
-            centre=self.centre[chosen],
-            axis_a=self.axis_a[chosen],
-            axis_b=self.axis_b[chosen],
-            extent=self.extent[chosen],
-            plane_index=self.plane_index[chosen],
-            role=self.role[chosen],
-            texture=self.texture[chosen],
-            texture_params=self.texture_params[chosen],
+            **kept,
             hole_rectangle=place[self.hole_rectangle[holes]].astype(np.int32),
             hole_extent=self.hole_extent[holes],
         )

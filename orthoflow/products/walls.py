@@ -83,18 +83,8 @@ class Wall:
     percentiles_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        _check_rasters(
-            self.frame,
-            self.name,
-            depth_m=self.depth_m,
-            sigma_m=self.sigma_m,
-            count=self.count,
-            mask=self.mask,
-            intensity=self.intensity,
-            rgb=self.rgb,
-            rgb_mask=self.rgb_mask,
-            percentiles_m=self.percentiles_m,
-        )
+        names = "depth_m sigma_m count mask intensity rgb rgb_mask percentiles_m"
+        _check_rasters(self, self.name, names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,14 +204,7 @@ class Layer:
     filled: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        _check_rasters(
-            self.frame,
-            f"layer {self.source}",
-            rgb=self.rgb,
-            mask=self.mask,
-            quality=self.quality,
-            filled=self.filled,
-        )
+        _check_rasters(self, f"layer {self.source}", "rgb mask quality filled")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,13 +273,7 @@ class Orthoimage:
     plane_index: int | None = None
 
     def __post_init__(self) -> None:
-        _check_rasters(
-            self.frame,
-            f"orthoimage {self.name}",
-            rgb=self.rgb,
-            mask=self.mask,
-            source=self.source,
-        )
+        _check_rasters(self, f"orthoimage {self.name}", "rgb mask source")
 
     @property
     def number(self) -> int:
@@ -329,9 +306,11 @@ class Orthoimages(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 
-def _check_rasters(frame: WallFrame, owner: str, **rasters: Array | None) -> None:
-    for name, raster in rasters.items():
-        if raster is not None and raster.shape[:2] != frame.shape:
+def _check_rasters(owner: Wall | Layer | Orthoimage, called: str, names: str) -> None:
+    shape = owner.frame.shape
+    for name in names.split():
+        raster: Array | None = getattr(owner, name)
+        if raster is not None and raster.shape[:2] != shape:
             raise ProductError(
-                f"{owner}: {name} has {raster.shape[:2]} cells, but its frame has {frame.shape}"
+                f"{called}: {name} has {raster.shape[:2]} cells, but its frame has {shape}"
             )

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
+from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord, shared_fields
 from orthoflow_provenance.payloads import StoredPayload
 from orthoflow_provenance.reader import open_outputs, read_record
 
@@ -144,14 +144,7 @@ class Run:
             return
         with record_errors(self.path):
             for address, port in places:
-                stored = self.output(address, port)
-                yield Payload(
-                    type_name=stored.type_name,
-                    encoding_version=stored.encoding_version,
-                    metadata=stored.metadata,
-                    arrays=dict(stored.arrays),
-                    mapped=stored.mapped,
-                )
+                yield Payload(**shared_fields(self.output(address, port), Payload))
 
     def _check_embedded(self, address: str, port: str) -> None:
         outputs = self.cell(address).outputs

@@ -18,7 +18,7 @@ from orthoflow.files.survey_points import (
 SHOWN = "shown_x, shown_y, shown_z"
 KNOWN = "known are name, x, y, z, class, wall, u_px, v_px, map_x, map_y, shown_x, shown_y, shown_z"
 NAMES_EXPECTED = "expected the names of the columns, name,x,y,z[,class][,wall,u_px,v_px]"
-CSV_EXPECTED = "expected a CSV file with the columns name,x,y,z"
+POINTS_EXPECTED = "expected a CSV file of points with the columns name,x,y,z"
 ALL = "name,x,y,z,wall,u_px,v_px\n"
 
 
@@ -137,10 +137,7 @@ def test_names_of_columns_may_be_followed_by_a_number(tmp_path: Path) -> None:
         ),
         (
             b"P,1,2,\xff\n",
-            [
-                "p.csv is no UTF-8 text: expected a CSV file of points with the columns name,x,y,z; "
-                "save it as UTF-8"
-            ],
+            [f"p.csv is no UTF-8 text: {POINTS_EXPECTED}; save it as UTF-8"],
         ),
     ],
 )

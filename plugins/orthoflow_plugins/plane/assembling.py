@@ -91,7 +91,7 @@ def assemble(
 ) -> Assembly:
     """Give planes their side, order and names."""
     order = np.argsort(-deviations.n_find, kind="stable")
-    ordered = deviations.reordered(order)
+    ordered = deviations.take(order)
     faced = [_faced(found, int(i), prepared, cloud, deviations) for i in order]
     # Histograms and means follow the normal when it was turned.
     flips = np.array(

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import wall_axes
 from orthoflow.geometry.robust import median_deviation
+from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Planes, PointCloud, ScanRow, Spread, Thickness
 from orthoflow_plugins.plane.block_kernels import each_part, piece_of
 from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS, measure_deviations
@@ -55,7 +56,7 @@ _ROW_LEAST: Final = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deviations:
+class Deviations(Rows):
     """How far the points of each plane lie from it.
 
     Attributes:
@@ -80,20 +81,6 @@ class Deviations:
     extents_m: NDArray[np.float64]
     find_m: float
     fit_m: float
-
-    def reordered(self, order: NDArray[np.int64]) -> Deviations:
-        """Give the planes in another order, as copies."""
-        return Deviations(
-            n_find=self.n_find[order],
-            rms_find_m=self.rms_find_m[order],
-            n_fit=self.n_fit[order],
-            rms_fit_m=self.rms_fit_m[order],
-            mean_fit_m=self.mean_fit_m[order],
-            histogram=self.histogram[order],
-            extents_m=self.extents_m[order],
-            find_m=self.find_m,
-            fit_m=self.fit_m,
-        )
 
 
 def measure_planes(

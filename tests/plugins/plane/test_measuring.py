@@ -279,7 +279,7 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     wide = measure_planes(prepared, slabs, bounds, find_m=fit_m, fit_m=find_m)
     assert wide.fit_m == wide.find_m == fit_m
     order = np.array([1, 0, 2])
-    turned = found.reordered(order)
+    turned = found.take(order)
     for name in ("n_find", "rms_find_m", "n_fit", "rms_fit_m", "mean_fit_m", "histogram"):
         np.testing.assert_array_equal(getattr(turned, name), getattr(found, name)[order])
     assert (turned.find_m, turned.fit_m) == (find_m, fit_m)
