@@ -32,7 +32,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from orthoflow_provenance.digests import canonical_json, payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
@@ -69,9 +69,6 @@ from orthoflow.engine.store_folder import make_store
 from orthoflow.errors import DamageError, ProductError, StoreError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue, Payload, Product
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "Preimage",
