@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import click
 
 from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_table, number
 
@@ -42,18 +41,22 @@ def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
     far their metrics and products lie apart. A parameter with * was set, others are defaults.
     Cells are the same when their addresses are, or else when each step that varies on their way
     has one method with the same parameters; what only one run has is counted apart. --json has
-    also what is equal.
+    also what is equal. Ends with 3 where the seal of a record does not hold.
     """
     from orthoflow.engine import Store
     from orthoflow.records import compare_runs, open_run
+    from orthoflow.records.verification import broken_seal
 
     stores = (Store(store),) if store.is_dir() else ()
-    comparison = compare_runs(open_run(first), open_run(second), stores=stores)
+    runs = (open_run(first), open_run(second))
+    comparison = compare_runs(*runs, stores=stores)
     if as_json:
         echo_json(comparison_json(comparison))
     else:
         _print(comparison)
-    return EXIT_GOOD
+    doubts = [doubt for run in runs if (doubt := broken_seal(run))]
+    say_error(*(f"error: {doubt}; rely on nothing that is said of it here" for doubt in doubts))
+    return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD
 
 
 def comparison_json(comparison: RunComparison) -> dict[str, object]:
@@ -153,11 +156,16 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 
 def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
-    """Print every metric that differs; time and memory always do, so they are not counted."""
-    is_measured = [not row.either.is_cost for row in rows]
-    is_different = [_value(row.left) != _value(row.right) for row in rows]
-    n_different = sum(a and b for a, b in zip(is_measured, is_different, strict=True))
-    echo("", f"metrics: {n_different} of {sum(is_measured)} differ, time and memory left aside")
+    """Print every metric that differs; times and memory, which always do, apart and last."""
+    for title, is_cost in (("metrics", False), ("times and memory", True)):
+        chosen = [row for row in rows if row.either.is_cost == is_cost]
+        different = [row for row in chosen if _value(row.left) != _value(row.right)]
+        echo("", f"{title}: {len(different)} of {len(chosen)} differ")
+        if different:
+            _print_numbers(different)
+
+
+def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:
     echo_table(
         ("metric", "A", "B", "B - A", "unit"),
         [
@@ -172,7 +180,7 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
                 else number(row.right.value - row.left.value),
                 row.either.unit,
             )
-            for row in itertools.compress(rows, is_different)
+            for row in rows
         ],
     )
 

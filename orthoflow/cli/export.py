@@ -9,9 +9,9 @@ import click
 
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.formats import FORMATS, check_choices
+from orthoflow.cli.exports.formats import FORMATS, Format, check_choices
 from orthoflow.cli.exports.products import make_empty
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import input_option, store_option
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError
@@ -158,10 +158,11 @@ _HELP: Final = "\n\n".join(
     "datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
-    """Write the results of a run for other programs."""
+    """Write the results of a run for other programs; 3 where the record's seal does not hold."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records import open_run
+    from orthoflow.records.verification import broken_seal
 
     chosen = Choices(**choices)
     check_choices(chosen, target)
@@ -171,11 +172,23 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     _refuse_filled(folder)
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
-            said = FORMATS[target].load()(opened, aside, chosen)
+            said = _export_to(FORMATS[target], opened, aside, chosen)
         else:
             said = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {said}")
+    if doubt := broken_seal(opened):
+        say_error(f"error: {doubt}; rely on nothing in {folder}")
+        return EXIT_RECORD_DIFFERS
     return EXIT_GOOD
+
+
+def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
+    from orthoflow.records.files_anew import with_files
+
+    if not target.takes_rasters:
+        return target.load()(run, folder, chosen)
+    with with_files(run, lambda said: say_error(f"note: {said}")) as whole:
+        return target.load()(whole, folder, chosen)
 
 
 def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:

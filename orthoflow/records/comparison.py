@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
+import numpy as np
 from orthoflow_provenance.digests import canonical_json
 from orthoflow_provenance.model import (
     COSTS,
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from orthoflow.engine import Store
 
 Side = TypeVar("Side")
+# Seconds and memory that methods measured themselves hang on the machine, too.
+_COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 _ROWS_MOST: Final = 60  # of a table in a notebook
 
 
@@ -128,7 +131,7 @@ class ComparedMetric:
     Attributes:
         value: the number.
         unit: its unit.
-        is_cost: time or memory, which depend on the machine and its load.
+        is_cost: a time or memory, which depend on the machine and its load, whoever measured it.
         is_cached: of a cell that an earlier run computed; its cost is that run's.
         environment: id of the environment it was computed in.
     """
@@ -178,7 +181,7 @@ class RunComparison:
             for name, rows in (
                 ("inputs", self.inputs),
                 ("parameters", self.shared(self.parameters)),
-                ("metrics", self.shared(self.metrics)),
+                ("metrics", self.measured),
             )
         ]
         n_products = sum(item.verdict == "different" for item in self.products)
@@ -190,7 +193,7 @@ class RunComparison:
 
     def _repr_html_(self) -> str:
         table = self.metric_table()
-        is_cost = table.metric.isin(COSTS)
+        is_cost = np.array([row.either.is_cost for row in self.metrics], dtype=np.bool_)
         moved = table[~is_cost & table.left.notna() & table.right.notna() & (table.difference != 0)]
         said = f"<p>{escape(shown(repr(self)))}</p>"
         if moved.empty:
@@ -198,6 +201,11 @@ class RunComparison:
                 f"{said}<p>No number that both runs have differs, time and memory left aside.</p>"
             )
         return said + str(moved.to_html(index=False, max_rows=_ROWS_MOST))
+
+    @property
+    def measured(self) -> tuple[Pair[ComparedMetric], ...]:
+        """Numbers of the cells that both runs have, without times and memory."""
+        return tuple(row for row in self.shared(self.metrics) if not row.either.is_cost)
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
         """Leave out what belongs to cells that only one of the runs has: it cannot differ."""
@@ -355,7 +363,7 @@ def _metrics(cell: RecordedCell) -> dict[str, ComparedMetric]:
         row.metric: ComparedMetric(
             value=row.value,
             unit=row.unit,
-            is_cost=row.metric in COSTS,
+            is_cost=row.metric in COSTS or row.unit in _COST_UNITS,
             is_cached=bool(cell.cached_from),
             environment=cell.environment,
         )

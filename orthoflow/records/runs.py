@@ -40,11 +40,13 @@ class Run:
         record: everything the record says except the products' arrays.
         output: reads an output by address and port from the record that is held open; None where
             it is opened for it.
+        files_folder: what stands for the folder of the record, where its files lie elsewhere.
     """
 
     path: Path
     record: RunRecord
     output: Callable[[str, str], StoredPayload] | None = field(default=None, compare=False)
+    files_folder: Path | None = field(default=None, compare=False)
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
@@ -63,7 +65,7 @@ class Run:
     @property
     def folder(self) -> Path:
         """The folder the record lies in, with `products/` and the report beside it."""
-        return self.path.parent
+        return self.files_folder or self.path.parent
 
     @cached_property
     def cells(self) -> Mapping[str, RecordedCell]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -22,13 +22,20 @@ from orthoflow.records.runs import Run, record_errors
 from orthoflow.records.verification import require_unchanged
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
-# Of the accuracy that inspections found, what a drawing says: names of two numbers, and of what.
+# Of the accuracy that inspections found, what a drawing says: names of two numbers, the sentence,
+# and which number says of how many of what it is.
 _ACCURACY: Final = (
-    ("rmse_x_mm", "rmse_y_mm", "RMSE x {} mm, y {} mm"),
-    ("rmse_u_mm", "rmse_v_mm", "RMSE x {} mm, y {} mm"),
-    ("patch_rmse_u_mm", "patch_rmse_v_mm", "of patches RMSE x {} mm, y {} mm"),
-    ("rms_3d_mm", "max_3d_mm", "in space RMS {} mm, largest {} mm"),
+    ("rmse_x_mm", "rmse_y_mm", "RMSE x {} mm, y {} mm", ("n_found", "n_pairs")),
+    ("rmse_u_mm", "rmse_v_mm", "RMSE x {} mm, y {} mm", ()),
+    ("patch_rmse_u_mm", "patch_rmse_v_mm", "of patches RMSE x {} mm, y {} mm", ("n_patches",)),
+    ("rms_3d_mm", "max_3d_mm", "in space RMS {} mm, largest {} mm", ("n_3d",)),
 )
+_COUNTED: Final = {
+    "n_found": ("check point", "check points"),
+    "n_pairs": ("pair", "pairs"),
+    "n_patches": ("patch", "patches"),
+    "n_3d": ("check point", "check points"),
+}
 
 # The same of the photos, all walls together.
 _PHOTOS: Final = {
@@ -169,7 +176,7 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
         if is_wanted and not (run.folder / path).exists():
             raise RecordError(
                 f"{path} is gone from {run.folder}, where the run left it: copy it back, or "
-                f"make it anew by `orthoflow replay {run.folder} -o NEW`"
+                f"make it anew by `orthoflow replay {run.path} -o NEW`"
             )
 
 
@@ -300,12 +307,18 @@ def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:
         for values, whose in ((own, ""), (everywhere, " (all walls)")):
             said = [
                 text.format(f"{values[first]:.1f}", f"{values[second]:.1f}")
-                for first, second, text in _ACCURACY
+                + _of_how_many(values, counts)
+                for first, second, text, counts in _ACCURACY
                 if first in values and second in values
             ]
             if said:
                 yield f"{address}: {'; '.join(said)}{whose}"
                 break
+
+
+def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> str:
+    name = next((name for name in counts if name in values), "")
+    return f" of {values[name]:.0f} {_COUNTED[name][values[name] != 1]}" if name else ""
 
 
 def _photo_accuracy(run: Run, upstream: tuple[str, ...]) -> Iterator[str]:

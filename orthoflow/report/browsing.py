@@ -17,6 +17,7 @@ from orthoflow.files.regular_files import open_file
 from orthoflow.products import JsonValue
 from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
 from orthoflow.records.datasets import parts_of
+from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import words_of
 from orthoflow.report.summaries import QUALITY
@@ -38,7 +39,7 @@ class RunSummary:
     Attributes:
         folder: of the run, as its finder named it.
         state: `ok`; `failed`, some cell did; `unfinished`, there is no record yet; `damaged`, the
-            record cannot be read.
+            record cannot be read, or its seal does not hold.
         reason: what failed, first, or why it cannot be read; empty where all is well.
         workflow: name of the workflow.
         run_id: of the run.
@@ -143,7 +144,10 @@ def _summary(folder: Path) -> RunSummary:
     if not (folder / RECORD_FILE).exists():
         return _unfinished(folder)
     try:
-        return _of_run(folder, open_run(folder))
+        run = open_run(folder)
+        if doubt := broken_seal(run):
+            return RunSummary(folder=folder, state="damaged", reason=doubt)
+        return _of_run(folder, run)
     except OrthoflowError as error:
         return RunSummary(folder=folder, state="damaged", reason=str(error))
     except Exception as error:  # noqa: BLE001 - a record may hold anything; the others shall be told

@@ -17,6 +17,9 @@ from orthoflow.report.summaries import QUALITY, is_quality
 from orthoflow.workflow.cells import variants_text
 
 _NOTHING: Final = "-"
+# Distances to a plane are of the points that its tolerances let in.
+_CUT: Final = frozenset(("rms_mm", "fit_rms_mm"))
+_CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
 _NAMED: Final = 3  # numbers that a combination is best in
 
 
@@ -227,15 +230,22 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         ]
         # What a plugin says to have a good side is worth a column, too.
         wanted += [key for key, row in first.items() if row.good]
-    return tuple(
-        Column(
-            step=step,
-            metric=metric,
-            label=label_in_words(first[step, metric]),
-            sense=sense_of(metric, first[step, metric]),
-        )
-        for step, metric in wanted
-    )
+    return tuple(_column(first[key], combinations) for key in wanted)
+
+
+def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:
+    label, sense = label_in_words(row), sense_of(row.metric, row)
+    if row.metric in _CUT and row.method.startswith("plane."):
+        tolerances = {
+            repr([cell.params.get(name) for name in _CUT_BY])
+            for one in combinations
+            for cell in one.cells
+            if cell.step == row.step and cell.status == "ok"
+        }
+        # The smallest tolerance leaves the smallest distances, whatever the plane is like.
+        if len(tolerances) > 1:
+            label, sense = f"{label}, cut at its own tolerance", Sense.NEITHER
+    return Column(step=row.step, metric=row.metric, label=label, sense=sense)
 
 
 def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:

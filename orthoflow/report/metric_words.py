@@ -336,11 +336,15 @@ def words_of(name: str, method: str, declared: str = "") -> str:
     kind = method.partition(".")[0]
     if kind not in _KINDS and name not in COSTS:
         return name
-    return _OF_KIND.get((kind, name)) or metric_words(name)
+    return metric_words(name, kind)
 
 
-def metric_words(name: str) -> str:
+def metric_words(name: str, kind: str = "") -> str:
     """Say what a metric is; its own name where nobody described it.
+
+    Args:
+        name: of the metric.
+        kind: of the methods that report it; some say another thing by a name.
 
     >>> metric_words("rmse_u_mm")
     'error along u (right), RMS'
@@ -348,9 +352,11 @@ def metric_words(name: str) -> str:
     ('error along u (right), RMS; wall 3', 'edges whose sharpness was measured; all walls')
     >>> metric_words("vertical_edge_n_found"), metric_words("strangeness")
     ('check points found; vertical edge', 'strangeness')
+    >>> metric_words("target_rms_mm", "inspect")
+    'check points, RMS; target'
     """
     rest, behind = name, []
-    while (words := WORDS.get(rest) or _by_pattern(rest)) is None:
+    while (words := _OF_KIND.get((kind, rest)) or WORDS.get(rest) or _by_pattern(rest)) is None:
         found = next(_prefixes(rest), None)
         if found is None:
             return name

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
@@ -27,6 +28,7 @@ from orthoflow.records import (
     compare_runs,
 )
 from orthoflow.records import open_run as open_plain_run
+from orthoflow.records.datasets import parts_of
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
@@ -50,7 +52,8 @@ class OpenedRun(Run):
         Returns:
             Columns `cell`, `step`, `method`, one per step that varies (`data` for datasets; the
             variant, missing where the cell does not have it; with a `=` behind where the step is
-            called as another column), one per swept parameter (`plane.tolerance_m`, a number),
+            called as another column), one with the method of each step that sweeps parameters of
+            several (`plane.use`), one per swept parameter (`plane.tolerance_m`, a number),
             `repeat`, `metric`, `value`, `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
@@ -85,18 +88,22 @@ class OpenedRun(Run):
             }
         )
 
-    def orthoimage(self, number: int | None = None, *, cell: str | None = None) -> WallImage:
+    def orthoimage(
+        self, number: int | None = None, *, cell: str | None = None, data: str | None = None
+    ) -> WallImage:
         """Give the orthoimage of a wall as an array with its frame.
 
         Args:
             number: of the wall, as in the names of its files; None for the first one.
             cell: address of the cell that made it; None for that of the baseline.
+            data: name of the dataset, where the run has several; None for the first one.
 
         Raises:
             ArgumentError: the run has no such orthoimage; says which there are.
         """
-        places = dict(embedded_products(self, "orthoimages"))
-        baseline = [one.address for one in baseline_cells(self) if one.address in places]
+        part = self if data is None else self._part(data)
+        places = dict(embedded_products(part, "orthoimages"))
+        baseline = [one.address for one in baseline_cells(part) if one.address in places]
         chosen = cell or next(iter([*baseline, *places]), "")
         if chosen not in places:
             raise ArgumentError(
@@ -112,6 +119,16 @@ class OpenedRun(Run):
         name = f"wall_{image.number}_ortho.tif"
         files = [file for file in self.files.get(chosen, ()) if file.name == name]
         return WallImage(image=image, cell=chosen, file=files[0] if files else None)
+
+    def _part(self, data: str) -> Run:
+        """What belongs to a dataset."""
+        parts = parts_of(self)
+        if data not in parts:
+            raise ArgumentError(
+                f"the run {self.record.run_id} has no dataset {data}"
+                f"{did_you_mean(data, parts)}; it has {', '.join(parts) or 'none'}"
+            )
+        return parts[data]
 
     def compare(self, other: str | Path | Run) -> RunComparison:
         """Lay this run beside another one, see `RunComparison`.

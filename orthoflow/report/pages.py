@@ -43,7 +43,7 @@ from orthoflow.report.legends import depth_gradient
 from orthoflow.report.metric_words import metric_words, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.overlays import overlays
-from orthoflow.report.paired import MetricOverDatasets, over_datasets
+from orthoflow.report.paired import MetricOverDatasets, over_datasets, who_leads
 from orthoflow.report.photo_plans import PhotoPlan, photo_plan
 from orthoflow.report.pictures import (
     DIVERGING,
@@ -128,6 +128,7 @@ class _Section:
     doubt: str = ""
     datasets: DatasetTable | None = None
     over: tuple[MetricOverDatasets, ...] = ()
+    leads: str = ""
 
 
 def write_page(
@@ -342,6 +343,7 @@ def _breakable(name: str) -> Markup:
 def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     """Tell of a run on several datasets, whose pictures and figures stand on pages of their own."""
     parts = parts_of(run)
+    over = over_datasets(parts)
     empty = replace(run, record=replace(run.record, cells=()))
     return replace(
         _section(empty, prefix, place, share=share),
@@ -353,7 +355,8 @@ def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section
         citations=citations(run),
         datasets=dataset_table(parts, place.pages),
         curves=curves_over(parts),
-        over=over_datasets(parts),
+        over=over,
+        leads=who_leads(over, len(parts)),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from orthoflow.geometry.robust import median_deviation
-from orthoflow.records import Run
+from orthoflow.records import RecordedCell, Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.rankings import Sense, badness
@@ -22,6 +22,10 @@ _DECIDING_SHARE: Final = 0.5
 _MOST_DECIDING: Final = 3
 # Of four differences that all agree p is 0.125: a test of so few can show nothing.
 _FEWEST_TESTED: Final = 5
+# Of six that all agree p is 0.031, of five 0.0625.
+_FEWEST_SHOWN: Final = 6
+_SHOWN_P: Final = 0.05
+_NAMED: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +61,8 @@ class MethodOverDatasets:
     Attributes:
         name: the variants, `plane=ransac`; empty when nothing varies.
         is_reference: the others are compared with it.
+        against: what it is compared with: the reference or, where both sweep a parameter, what the
+            reference's method gives at the same value; empty for the reference itself.
         n: datasets with a value.
         failed: datasets on which the combination failed; they have no part in any number.
         n_absent: datasets that have no value though nothing failed, or were left out.
@@ -67,6 +73,7 @@ class MethodOverDatasets:
 
     name: str
     is_reference: bool
+    against: str
     n: int
     failed: tuple[str, ...]
     n_absent: int
@@ -91,6 +98,11 @@ class MetricOverDatasets:
     sense: Sense
     methods: tuple[MethodOverDatasets, ...]
 
+    @property
+    def reference(self) -> str:
+        """What the others are compared with, where nothing is said of them."""
+        return next((one.name for one in self.methods if one.is_reference), "")
+
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     """Compare the combinations of a run over its datasets, metric by metric.
@@ -110,12 +122,15 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     if len(names) < 2 or not every:
         return ()
     reference = next((_method(one) for one in every if one.is_baseline), next(iter(found)))
+    partners = _partners(
+        {method: next(iter(ways.values())) for method, ways in found.items()}, reference
+    )
     return tuple(
         MetricOverDatasets(
             step=column.step,
             label=column.label,
             sense=column.sense,
-            methods=_methods(found, names, reference, (column.step, column.metric, column.sense)),
+            methods=_methods(found, names, partners, (column.step, column.metric, column.sense)),
         )
         for column in comparison_columns(every)
     )
@@ -125,10 +140,102 @@ def _method(one: Combination) -> str:
     return variants_text({k: v for k, v in one.assignment.items() if k != DATA})
 
 
+def _partners(ways: Mapping[str, Combination], reference: str) -> dict[str, str]:
+    """What each combination is compared with; the reference with nothing.
+
+    A method is compared with another at the same value of what both sweep, where there is one.
+
+    Args:
+        ways: method -> one of its combinations.
+        reference: one of them.
+    """
+    called: dict[str, dict[str, RecordedCell]] = {}
+    for way in ways.values():
+        for cell in way.cells:
+            if cell.step in cell.assignment and cell.repeat == 0:
+                called.setdefault(cell.step, {}).setdefault(cell.assignment[cell.step], cell)
+    wanted = {step: one for step, one in ways[reference].assignment.items() if step != DATA}
+    partners = {reference: ""}
+    for method, way in ways.items():
+        if method != reference:
+            like = {
+                step: _alike(called.get(step, {}), variant, way.assignment.get(step, variant))
+                for step, variant in wanted.items()
+            }
+            name = variants_text(like)
+            partners[method] = name if name in ways and name != method else reference
+    return partners
+
+
+def _alike(called: Mapping[str, RecordedCell], reference: str, own: str) -> str:
+    """The variant of the reference's method that has the values that another method has, too."""
+    if reference not in called or own not in called:
+        return reference
+    mine, theirs = called[own], called[reference]
+    if mine.method == theirs.method:
+        return reference
+    family = {name: cell.params for name, cell in called.items() if cell.method == theirs.method}
+    shared = {
+        name
+        for name in theirs.params
+        if name in mine.params and len({repr(params.get(name)) for params in family.values()}) > 1
+    }
+    found = [
+        variant
+        for variant, params in family.items()
+        if all(params.get(name) == mine.params[name] for name in shared)
+    ]
+    return found[0] if shared and len(found) == 1 else reference
+
+
+def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
+    """Say in a sentence or two which combinations are shown to be better; empty without several.
+
+    Args:
+        over: the metrics.
+        n_datasets: how many the run has.
+    """
+    judged = [metric for metric in over if metric.sense is not Sense.NEITHER]
+    rows = [one for metric in judged for one in metric.methods if one.against]
+    if not rows:
+        return ""
+    tested = [one for one in rows if one.paired is not None and math.isfinite(one.paired.p)]
+    if not tested:
+        few = (
+            f"{n_datasets} datasets are too few for a test"
+            if n_datasets < _FEWEST_SHOWN
+            else "too few of the datasets differ for a test"
+        )
+        return (
+            f"Nobody is shown to lead: {few}; it takes {_FEWEST_SHOWN} that differ to show anything"
+        )
+    said = []
+    for name, against in dict.fromkeys((one.name, one.against) for one in tested):
+        shown = [
+            one.paired.effect
+            for one in tested
+            if one.name == name and one.paired is not None and one.paired.p < _SHOWN_P
+        ]
+        n_better = sum(effect > 0 for effect in shown)
+        n_worse = len(shown) - n_better
+        if shown:
+            said.append(
+                f"{name} against {against}: better in {n_better}, worse in {n_worse} of "
+                f"{len(judged)} numbers"
+            )
+    if not said:
+        return f"Nobody is shown to lead in any of {len(judged)} numbers (p below {_SHOWN_P:g})"
+    others = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
+    return (
+        f"Shown over the datasets (p below {_SHOWN_P:g}, not corrected): "
+        f"{'; '.join(said[:_NAMED])}{others}"
+    )
+
+
 def _methods(
     found: Mapping[str, Mapping[str, Combination]],
     names: Sequence[str],
-    reference: str,
+    partners: Mapping[str, str],
     column: tuple[str, str, Sense],
 ) -> tuple[MethodOverDatasets, ...]:
     step, metric, sense = column
@@ -148,17 +255,19 @@ def _methods(
         if sense is Sense.LESS:
             # Errors of both signs would make each other small.
             numbers = np.abs(numbers)
-        compared = method != reference and sense is not Sense.NEITHER
+        against = partners[method]
+        compared = against and sense is not Sense.NEITHER
         rows.append(
             MethodOverDatasets(
                 name=method,
-                is_reference=method == reference,
+                is_reference=not against,
+                against=against,
                 n=len(values),
                 failed=failed,
                 n_absent=len(names) - len(values) - len(failed),
                 median=float(np.median(numbers)) if numbers.size else math.nan,
                 spread=median_deviation(numbers) if numbers.size else math.nan,
-                paired=_paired(values, measured[reference], sense) if compared else None,
+                paired=_paired(values, measured[against], sense) if compared else None,
             )
         )
     return tuple(rows)

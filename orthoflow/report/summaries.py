@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.alike import alike
+from orthoflow.products import Orthoimages
 from orthoflow.records import MetricRow, Run, cell_metrics
 from orthoflow.records.warnings import standing_warnings
 from orthoflow.report.combinations import baseline_cells
@@ -72,6 +73,8 @@ def answers(run: Run) -> tuple[Answer, ...]:
     found: list[Answer] = []
     for wanted in QUALITY:
         stated = [row for row in rows if row.metric == wanted and is_quality(row)]
+        # Own orthoimages stand behind those of others, whatever the order of the steps.
+        stated.sort(key=lambda row: not _is_of_others(run, row.cell))
         # A later step of the chain improves on an earlier one: first and final orientation.
         stated = [row for row in stated if row.step == stated[-1].step]
         if wanted == "completeness":
@@ -84,6 +87,16 @@ def answers(run: Run) -> tuple[Answer, ...]:
             not_held = _NOT_HELD.get(wanted, "")
             found.append(Answer(what=what, value=value, cell=row.cell, not_held=not_held))
     return tuple(found)
+
+
+def _is_of_others(run: Run, address: str) -> bool:
+    """Whether a cell looks at orthoimages that were read from files."""
+    makers = (
+        run.cells.get(given.source.rpartition(".")[0])
+        for given in run.cells[address].inputs.values()
+        if given.type_name == Orthoimages.type_name
+    )
+    return any(maker is not None and maker.method.startswith("read.") for maker in makers)
 
 
 def limits(run: Run) -> tuple[Limit, ...]:

@@ -17,10 +17,12 @@ class Varied:
 
     Attributes:
         steps: the steps with variants; `data` for datasets.
+        methods: step -> variant -> method, of steps that sweep parameters of several methods.
         swept: (step, parameter) -> variant -> value, of parameters that are swept.
     """
 
     steps: tuple[str, ...]
+    methods: Mapping[str, Mapping[str, str]]
     swept: Mapping[tuple[str, str], Mapping[str, float]]
 
     @classmethod
@@ -30,18 +32,25 @@ class Varied:
         for sweep in sweeps(run.record.cells):
             swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
         steps = dict.fromkeys(step for cell in run.record.cells for step in cell.assignment)
-        return cls(steps=tuple(steps), swept=swept)
+        methods: dict[str, dict[str, str]] = {}
+        for cell in run.record.cells:
+            if any(cell.step == step for step, _ in swept) and cell.step in cell.assignment:
+                methods.setdefault(cell.step, {})[cell.assignment[cell.step]] = cell.method
+        several = {step: named for step, named in methods.items() if len({*named.values()}) > 1}
+        return cls(steps=tuple(steps), methods=several, swept=swept)
 
     def names(self, taken: Collection[str]) -> tuple[str, ...]:
         """Name the columns: steps, with a `=` where a column is called so; parameters in full."""
         steps = (f"{step}=" if step in taken else step for step in self.steps)
-        return (*steps, *(".".join(parameter) for parameter in self.swept))
+        methods = (f"{step}.use" for step in self.methods)
+        return (*steps, *methods, *(".".join(parameter) for parameter in self.swept))
 
     def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
         """Give the columns of a cell or combination; None where it has no part in one."""
         variants = (assignment.get(step) for step in self.steps)
         numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
-        return (*variants, *numbers)
+        methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
+        return (*variants, *methods, *numbers)
 
 
 def combination_rows(run: Run) -> Iterator[Sequence[Value]]:

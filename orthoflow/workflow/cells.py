@@ -205,7 +205,7 @@ class _Node:
         cell: the cell.
         dependence: the variants that its product depends on; for a skipped cell, those that its
             being skipped depends on, which may be fewer than its address names.
-        causes: which inputs, given or not, are why it is skipped.
+        causes: with or without which inputs it would not be skipped.
     """
 
     cell: Cell
@@ -258,7 +258,7 @@ class _Expansion:
     def _takes_data(self, name: str) -> bool:
         """Whether datasets change something of a step itself."""
         step = self.workflow.steps[name]
-        names = {step.unless} | {
+        names = step.asked_inputs | {
             reference.name
             for references in step.inputs.values()
             for reference in references
@@ -306,13 +306,12 @@ class _Expansion:
             calls = self.workflow.datasets[full[DATA]].calls
             variant = calls.get((step.name, variant.name), variant)
         # Whether a step is needed may hang on the data too.
-        always = by_data if step.unless in self.workflow.data_inputs else {}
+        always = {} if step.asked_inputs.isdisjoint(self.workflow.data_inputs) else by_data
         own |= always
         if is_excluded(self.workflow, own):
             raise _ExcludedError
-        if step.unless and self._input_name(step.unless, full) in self.present:
-            cause = f"inputs.{step.unless} is given"
-            cell = self._cell(step, variant, own, {}, f"not needed, because {cause}")
+        if cause := self._is_unwanted(step, full):
+            cell = self._cell(step, variant, own, {}, _reason(cause))
             return _Node(cell=cell, dependence=always, causes=(cause,))
         choices = {
             port: self._choose(step.inputs[port], full)
@@ -330,12 +329,19 @@ class _Expansion:
             cell = self._cell(step, variant, assignment, inputs, "")
             return _Node(cell=cell, dependence=assignment)
         choice = choices[missing]
-        reason = f"port {missing} stays empty, because {' and '.join(choice.causes)}"
         dependence = dict(choice.dependence) | always
         if not self._all_require(step, missing):
             dependence |= own
-        cell = self._cell(step, variant, assignment, inputs, reason)
+        cell = self._cell(step, variant, assignment, inputs, _reason(*choice.causes))
         return _Node(cell=cell, dependence=dependence, causes=choice.causes)
+
+    def _is_unwanted(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
+        """Why a step is skipped, whatever it takes; empty where it is not."""
+        if step.unless and self._input_name(step.unless, full) in self.present:
+            return f"without the input {step.unless}"
+        if step.only_if and self._input_name(step.only_if, full) not in self.present:
+            return f"with the input {step.only_if}"
+        return ""
 
     def _choose(self, references: tuple[Reference, ...], full: Mapping[str, str]) -> _Choice:
         dependence: Assignment = {}
@@ -347,7 +353,7 @@ class _Expansion:
                 name = self._input_name(reference.name, full)
                 if name in self.present:
                     return _Choice(source=WorkflowInput(name=name), dependence=dependence)
-                causes[f"{reference} is not given"] = None
+                causes[f"with the input {reference.name}"] = None
                 continue
             node = self._upstream(reference.source, full)
             # What a passed-over candidate depends on decides this choice as well.
@@ -402,6 +408,11 @@ class _Expansion:
             timeout_s=variant.timeout_s,
             skip_reason=skip_reason,
         )
+
+
+def _reason(*causes: str) -> str:
+    """Say why a cell is skipped: any of the causes would do."""
+    return f"only {' or '.join(causes)}"
 
 
 def _variant_name(step: WorkflowStep, cell: Cell) -> str:

@@ -275,6 +275,7 @@ class _Reader:
                 port.name: tuple(placed.reference for placed in port.references)
                 for port in draft.ports
             },
+            only_if=draft.only_if.reference.name if draft.only_if else "",
             unless=draft.unless.reference.name if draft.unless else "",
             is_varied=draft.is_varied,
         )

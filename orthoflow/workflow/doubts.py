@@ -34,7 +34,7 @@ def _taken_inputs(workflow: Workflow) -> set[str]:
         for reference in references
         if reference.is_input
     }
-    return taken | {step.unless for step in workflow.steps.values()}
+    return taken.union(*(step.asked_inputs for step in workflow.steps.values()))
 
 
 def _idle_datasets(workflow: Workflow) -> Iterator[str]:

@@ -171,7 +171,8 @@ TIMEOUT: Final = Key(
 )
 CALL: Final = Section(
     words="a method call",
-    about="How one method is called. All variants of a step share its wiring (`in`, `unless`).",
+    about="How one method is called. All variants of a step share its wiring (`in`, `if`, "
+    "`unless`).",
     keys=(USE, PARAMS, REPEAT, RESOURCES, TIMEOUT),
 )
 UNLESS: Final = Key(
@@ -179,6 +180,13 @@ UNLESS: Final = Key(
     shape=InputSource(),
     meaning="The step is skipped when this input is given.",
     example="inputs.scan",
+    default="the step always runs",
+)
+IF: Final = Key(
+    name="if",
+    shape=InputSource(),
+    meaning="The step is skipped unless this input is given, also where its ports do without.",
+    example="inputs.other",
     default="the step always runs",
 )
 VARIANTS: Final = Key(
@@ -197,7 +205,7 @@ STEP: Final = Section(
     about="A step calls one method, or has variants that each call one; then what belongs to a "
     "call stands in the variants. A step that lacks a required product, because optional data are "
     "absent, is skipped with all that needs it. Steps may stand in any order.",
-    keys=(USE, IN, *CALL.keys[1:], UNLESS, VARIANTS),
+    keys=(USE, IN, *CALL.keys[1:], IF, UNLESS, VARIANTS),
 )
 
 
@@ -232,6 +240,7 @@ class WorkflowStep:
         name: name of the step.
         variants: alternatives in the order of the file.
         inputs: port -> references; the first that is present wins.
+        only_if: the step is skipped when this input is absent; empty for always.
         unless: the step is skipped when this input is present; empty for always.
         is_varied: the file lists variants, even if only one.
     """
@@ -239,12 +248,18 @@ class WorkflowStep:
     name: str
     variants: tuple[StepVariant, ...]
     inputs: Mapping[str, tuple[Reference, ...]] = field(default_factory=dict)
+    only_if: str = ""
     unless: str = ""
     is_varied: bool = False
 
     def variant(self, name: str) -> StepVariant:
         """Give the variant of that name."""
         return next(variant for variant in self.variants if variant.name == name)
+
+    @property
+    def asked_inputs(self) -> frozenset[str]:
+        """Inputs whose presence alone decides whether the step runs."""
+        return frozenset((self.only_if, self.unless)) - {""}
 
     def upstream(self) -> tuple[str, ...]:
         """Names of the steps that the ports may take products from, each once."""

@@ -72,6 +72,7 @@ def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[_Wire, str]]:
             source = str(reference) if reference.is_input else f"{reference.source}."
             wire = _Wire(source=source, target=step.name, is_certain=len(references) == 1)
             yield wire, port
-    if step.unless:
-        wire = _Wire(source=f"{INPUTS_NAME}.{step.unless}", target=step.name, is_certain=False)
-        yield wire, "unless"
+    for name, word in ((step.only_if, "if"), (step.unless, "unless")):
+        if name:
+            wire = _Wire(source=f"{INPUTS_NAME}.{name}", target=step.name, is_certain=False)
+            yield wire, word

@@ -137,6 +137,7 @@ def _step_json(step: WorkflowStep) -> dict[str, object]:
     return {
         "in": {port: [str(item) for item in items] for port, items in step.inputs.items()},
         "unless": step.unless,
+        **({"if": step.only_if} if step.only_if else {}),
         "is_varied": step.is_varied,
         "variants": [_variant_json(variant) for variant in step.variants],
     }
@@ -177,6 +178,7 @@ class _VariantDocument(BaseModel):
 
 class _StepDocument(BaseModel):
     inputs: dict[str, list[str]] = Field(alias="in")
+    only_if: str = Field(alias="if", default="")
     unless: str
     is_varied: bool
     variants: list[_VariantDocument]
@@ -223,6 +225,7 @@ def _step(name: str, entry: Mapping[str, Any]) -> WorkflowStep:
         inputs={
             port: tuple(_reference(text) for text in texts) for port, texts in entry["in"].items()
         },
+        only_if=entry.get("if", ""),
         unless=entry["unless"],
         is_varied=entry["is_varied"],
     )
@@ -286,7 +289,7 @@ def _check_step(workflow: Workflow, step: WorkflowStep) -> None:
         _check_variant(variant)
     if len({variant.name for variant in step.variants}) != len(step.variants):
         raise ValueError(f"step {step.name} has two variants of one name")
-    if step.unless and step.unless not in workflow.inputs:
+    if not step.asked_inputs <= workflow.inputs.keys():
         raise ValueError(f"step {step.name} hangs on an unknown input")
     for reference in (item for references in step.inputs.values() for item in references):
         known = workflow.inputs if reference.is_input else workflow.steps

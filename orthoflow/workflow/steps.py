@@ -11,6 +11,7 @@ from orthoflow.sdk.hooks import KindSpec
 from orthoflow.workflow.format import (
     CALL,
     CORES,
+    IF,
     IN,
     PARAMS,
     REPEAT,
@@ -63,6 +64,7 @@ class DraftStep:
     name: str
     variants: tuple[DraftVariant, ...]
     ports: tuple[PlacedPort, ...]
+    only_if: PlacedReference | None
     unless: PlacedReference | None
     is_varied: bool
 
@@ -95,6 +97,7 @@ class _StepReader:
             name=entry.key,
             variants=variants,
             ports=IN.read(table, path, self.log) or (),
+            only_if=IF.read(table, path, self.log),
             unless=UNLESS.read(table, path, self.log),
             is_varied=is_varied,
         )

@@ -127,8 +127,9 @@ class _Checker:
             else:
                 self._report_unknown_port(step, port, accepted)
                 self._check_references(port.references, None)
-        if step.unless is not None:
-            self._type_of(step.unless)
+        for asked in (step.only_if, step.unless):
+            if asked is not None:
+                self._type_of(asked)
         self._check_required(step)
 
     def _report_unknown_port(

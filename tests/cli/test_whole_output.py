@@ -169,7 +169,7 @@ def test_equal_runs_are_said_to_be_equal(capsys: pytest.CaptureFixture[str]) -> 
     titles = ["inputs", "workflow", "options", "cells", "parameters (* set, others are defaults)"]
     lines = [f"{title}: same" for title in [*titles, "environment"]]
     lines[1] = "workflow: same text"
-    lines += ["metrics: 0 of 0 differ, time and memory left aside", "products"]
+    lines += ["metrics: 0 of 0 differ", "times and memory: 0 of 0 differ", "products"]
     spaced = [text for line in lines for text in ("", line)]
     assert printed(capsys) == [*HEADS, *spaced, "0 products"]
 
@@ -211,11 +211,14 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
         "        A     B",
         "python  3.11  -",
         "",
-        "metrics: 2 of 3 differ, time and memory left aside",
+        "metrics: 2 of 3 differ",
         "metric    A    B     B - A  unit",
-        "a.wall_s  1    2     1      mm",
         "a.rms_mm  1.5  1.25  -0.25  mm",
         "a.max_mm  -    2            mm",
+        "",
+        "times and memory: 1 of 1 differ",
+        "metric    A  B  B - A  unit",
+        "a.wall_s  1  2  1      mm",
         "",
         "products",
         *PRODUCT_LINES,

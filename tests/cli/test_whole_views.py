@@ -99,6 +99,10 @@ def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
     assert doubt in said("show", path, code=3)
     assert doubt in said("report", path, "-o", page, code=3)
     assert warning in page.read_text()
+    assert doubt in said("compare", path, path, code=3)
+    (row,) = json.loads(said("runs", tmp_path, "--json"))
+    assert (row["status"], row["metrics"]) == ("damaged", {})
+    assert row["reason"] == doubt.removesuffix("; ")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import re
@@ -16,7 +17,12 @@ from orthoflow.records import NOT_YET, RecordedCell, Run
 from orthoflow.records.datasets import datasets_of, parts_of
 from orthoflow.report import dataset_tables, write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
-from orthoflow.report.paired import MethodOverDatasets, over_datasets, paired_differences
+from orthoflow.report.paired import (
+    MethodOverDatasets,
+    over_datasets,
+    paired_differences,
+    who_leads,
+)
 from orthoflow.report.rankings import Sense
 from orthoflow.report.summaries import QUALITY
 from tests.report_runs import (
@@ -120,6 +126,84 @@ def test_pairs_are_of_the_datasets_that_both_have(rooms: Run) -> None:
     # Of 32 signs of five ranks those with a sum of at most 2 are {}, {1} and {2}, on either side.
     assert paired.p == pytest.approx(2 * 3 / 32)
     assert paired.deciding == {"tower": -8.0}
+
+
+def swept(folder: Path, n_rooms: int, *, step_mm: float) -> HeldRun:
+    """Two detectors at three tolerances; the second is better by some millimetres at each."""
+    cells = []
+    for index in range(n_rooms):
+        for value in (0.02, 0.05, 0.1):
+            for method, less_mm in (("hough", 0.0), ("ransac", step_mm)):
+                name = f"{method}-tolerance_m-{value}".replace(".", "_")
+                cells.append(
+                    cell(
+                        f"plane@data=room{index},plane={name}",
+                        method=f"plane.{method}",
+                        params={"tolerance_m": value, "seeded": method == "ransac"},
+                        metrics=metrics(depth_rmse_mm=1000 * value + index - less_mm * (index + 1)),
+                    )
+                )
+    resolved = {
+        "datasets": {f"room{index}": {"inputs": {}, "set": {}} for index in range(n_rooms)},
+        "compare": {"baseline": {"plane": "hough-tolerance_m-0_02"}},
+    }
+    return HeldRun(
+        path=folder / "run.h5", record=record(cells, workflow_resolved=json.dumps(resolved))
+    )
+
+
+def test_what_sweeps_a_parameter_is_compared_at_the_same_value(tmp_path: Path) -> None:
+    (metric,) = over_datasets(parts_of(swept(tmp_path, 3, step_mm=0.5)))
+    against = {one.name: one.against for one in metric.methods}
+    assert against == {
+        "plane=hough-tolerance_m-0_02": "",
+        "plane=ransac-tolerance_m-0_02": "plane=hough-tolerance_m-0_02",
+        "plane=hough-tolerance_m-0_05": "plane=hough-tolerance_m-0_02",
+        "plane=ransac-tolerance_m-0_05": "plane=hough-tolerance_m-0_05",
+        "plane=hough-tolerance_m-0_1": "plane=hough-tolerance_m-0_02",
+        "plane=ransac-tolerance_m-0_1": "plane=hough-tolerance_m-0_1",
+    }
+    coarse = metric.methods[-1].paired
+    assert coarse is not None
+    assert (coarse.wins, coarse.median) == (3, pytest.approx(-1.0))
+
+
+def test_distances_to_a_plane_are_not_ranked_where_its_tolerance_cuts_them(tmp_path: Path) -> None:
+    run = swept(tmp_path, 3, step_mm=0.5)
+    cells = tuple(
+        replace(one, metrics=(*one.metrics, *metrics(rms_mm=one.metrics[0].value)))
+        for one in run.record.cells
+    )
+    both = replace(run, record=replace(run.record, cells=cells))
+    cut, depth = sorted(over_datasets(parts_of(both)), key=lambda one: one.sense is Sense.LESS)
+    assert (cut.label, cut.sense) == (
+        "points to their plane, RMS / mm, cut at its own tolerance",
+        Sense.NEITHER,
+    )
+    assert depth.sense is Sense.LESS
+    alike = tuple(replace(one, params={"tolerance_m": 0.05}) for one in cells)
+    same = replace(run, record=replace(run.record, cells=alike))
+    assert {one.sense for one in over_datasets(parts_of(same))} == {Sense.LESS}
+
+
+@pytest.mark.parametrize(
+    ("n_rooms", "step_mm", "said"),
+    [
+        (3, 0.5, "Nobody is shown to lead: 3 datasets are too few for a test; it takes 6 that"),
+        (7, 0.0, "plane=hough-tolerance_m-0_05 against plane=hough-tolerance_m-0_02: better in 0"),
+        (7, 0.5, "plane=ransac-tolerance_m-0_1 against plane=hough-tolerance_m-0_1: better in 1"),
+    ],
+)
+def test_who_leads_over_datasets_is_said_first(
+    tmp_path: Path, n_rooms: int, step_mm: float, said: str
+) -> None:
+    run = swept(tmp_path, n_rooms, step_mm=step_mm)
+    told = who_leads(over_datasets(parts_of(run)), n_rooms)
+    assert said in told
+    assert ("ransac" in told) == (step_mm > 0 and n_rooms > 3)
+    write_page(run, tmp_path / "report.html")
+    first_screen = (tmp_path / "report.html").read_text().partition("<h2")[0]
+    assert told in html.unescape(first_screen)
 
 
 def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,6 +153,21 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
         run.orthoimage(cell="first")
 
 
+def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
+    from tests.report_runs import given
+
+    made = [
+        cell(f"mosaic@data={name}", outputs={"orthoimages": given("", "7", "orthoimages")})
+        for name in ("calm", "noisy")
+    ]
+    resolved = json.dumps({"datasets": {"calm": {}, "noisy": {}}})
+    run = Painted(path=tmp_path / "run.h5", record=record(made, workflow_resolved=resolved))
+    assert run.orthoimage(8).cell == "mosaic@data=calm"
+    assert run.orthoimage(8, data="noisy").cell == "mosaic@data=noisy"
+    with pytest.raises(ArgumentError, match=r"no dataset noise \(did you mean noisy\?\)"):
+        run.orthoimage(8, data="noise")
+
+
 def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
@@ -193,4 +209,13 @@ def test_what_is_wrong_with_a_workflow_is_raised(
     for files in ("fine.yaml", [tmp_path / "fine.yaml"]):
         with pytest.raises(OrthoflowError, match=r"fine\.yaml:2:1: .*there is no parameter gsd in"):
             orthoflow.run("direct.yaml", set_files=files)
+    # A mapping of datasets is what a table of them says.
+    for said, message in (
+        ({"set": {"plane.tolerance": 0.1}}, "there is no parameter tolerance in"),
+        ({"scan": "missing.e57"}, r"missing\.e57"),
+        ({"scan": ["a.e57", "b.e57"]}, "the input scan of dataset hall must be a path"),
+        (0.1, "the dataset hall must be a mapping of inputs to files"),
+    ):
+        with pytest.raises(OrthoflowError, match=message):
+            orthoflow.run("direct.yaml", datasets={"hall": said})  # type: ignore[dict-item]
     assert not (tmp_path / "runs").exists()

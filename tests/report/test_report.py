@@ -239,7 +239,7 @@ def test_a_step_that_has_no_data_leaves_a_combination_whole() -> None:
             cell(
                 f"points@plane={name}",
                 status="skipped",
-                error_message="port checkpoints stays empty, because checkpoints is not given",
+                error_message="only with the input checkpoints",
             ),
         )
     ]

@@ -191,7 +191,7 @@ def test_the_first_present_reference_of_a_list_wins(catalog: Catalog, write: Pat
     cells = cells_of(TWO_ORTHOS, write, catalog, "scan=a.e57", "photos=photos")
     assert cells["plane@plane=hough2d"].inputs["cloud"] == CellOutput(address="cloud", port="cloud")
     assert cells["cloud"].inputs == {"files": WorkflowInput(name="scan")}
-    assert cells["room"].skip_reason == "not needed, because inputs.scan is given"
+    assert cells["room"].skip_reason == "only without the input scan"
     cells = cells_of(TWO_ORTHOS, write, catalog, "photos=photos")
     assert cells["plane@plane=hough2d"].inputs["cloud"] == CellOutput(address="room", port="cloud")
     assert cells["room"].skip_reason == ""
@@ -203,14 +203,26 @@ def test_steps_without_their_data_are_skipped_and_say_which_data(
     cells = cells_of(TWO_ORTHOS, write, catalog)
     reasons = {cell.step: cell.skip_reason for cell in cells.values() if cell.skip_reason}
     assert reasons == {
-        "cloud": "port files stays empty, because inputs.scan is not given",
-        "shots": "port files stays empty, because inputs.photos is not given",
-        "ties": "port photos stays empty, because inputs.photos is not given",
-        "orient": "port ties stays empty, because inputs.photos is not given",
-        "ortho": "port photos stays empty, because inputs.photos is not given",
-        "mosaic": "port layers stays empty, because inputs.photos is not given",
-        "check": "port orthoimages stays empty, because inputs.photos is not given",
+        "cloud": "only with the input scan",
+        "shots": "only with the input photos",
+        "ties": "only with the input photos",
+        "orient": "only with the input photos",
+        "ortho": "only with the input photos",
+        "mosaic": "only with the input photos",
+        "check": "only with the input photos",
     }
+
+
+def test_a_step_may_wait_for_an_input_that_its_ports_do_without(
+    catalog: Catalog, write: Path
+) -> None:
+    text = TWO_ORTHOS.replace("unless: inputs.scan}", "if: inputs.photos, unless: inputs.scan}")
+    assert cells_of(text, write, catalog, "photos=photos")["room"].skip_reason == ""
+    for given, reason in (((), "only with the input photos"), (("scan=a.e57",), "only without")):
+        assert cells_of(text, write, catalog, *given)["room"].skip_reason.startswith(reason)
+    # Of its candidates either would do.
+    plane = cells_of(text, write, catalog)["plane@plane=hough2d"]
+    assert plane.skip_reason == "only with the input scan or with the input photos"
 
 
 def test_a_skipped_variant_does_not_take_the_others_with_it(catalog: Catalog, write: Path) -> None:
@@ -231,7 +243,7 @@ def test_a_skipped_variant_does_not_take_the_others_with_it(catalog: Catalog, wr
         "mosaic@plane=ransac,ortho=direct",
     ]
     check = cells["check@plane=ransac,ortho=direct"]
-    assert check.skip_reason == "port truth stays empty, because inputs.scan is given"
+    assert check.skip_reason == "only without the input scan"
 
 
 def test_a_skipped_candidate_does_not_multiply_those_who_pass_it_over(

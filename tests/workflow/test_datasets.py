@@ -137,7 +137,7 @@ def test_the_command_line_goes_before_a_dataset_and_a_dataset_before_the_file(
 @pytest.mark.usefixtures("folder")
 def test_whether_a_step_is_needed_may_hang_on_the_data(catalog: Catalog) -> None:
     found = cells(ROOMS + "datasets: {hall: {scan: hall.e57}, made: {}}\n", catalog)
-    assert found["room@data=hall"].skip_reason == "not needed, because inputs.scan is given"
+    assert found["room@data=hall"].skip_reason == "only without the input scan"
     assert not found["room@data=made"].skip_reason
     assert found["cloud@data=made"].skip_reason
     source = found["plane@data=made,plane=hough2d"].inputs["cloud"]

@@ -93,6 +93,11 @@ CASES = {
         "steps.x.unless",
         "expected an input such as inputs.scan, got cloud.cloud",
     ),
+    "if an unknown input": (
+        STEP % ", if: inputs.scam",
+        "steps.x.if",
+        "there is no input scam (did you mean scan?)",
+    ),
     "unless an unknown input": (
         STEP % ", unless: inputs.scam",
         "steps.x.unless",

@@ -33,7 +33,8 @@ def test_every_recipe_comes_back_whole(path: Path) -> None:
     for name, step in workflow.steps.items():
         found = again.steps[name]
         assert found.inputs == step.inputs
-        assert (found.unless, found.is_varied) == (step.unless, step.is_varied)
+        assert (found.only_if, found.unless) == (step.only_if, step.unless)
+        assert found.is_varied == step.is_varied
         assert [variant.method for variant in found.variants] == [
             variant.method for variant in step.variants
         ]
@@ -134,6 +135,7 @@ CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
         r"timeout_s: Input should be greater than 0",
     ),
     "an unknown input": (lambda d: _first(d, "steps").update(unless="no"), "an unknown input"),
+    "no such input": (lambda d: _first(d, "steps").update({"if": "no"}), "an unknown input"),
     "a flag that is a number": (
         lambda d: _first(d, "inputs").update(optional=1),
         "optional: Input should be a valid bool",

@@ -99,7 +99,7 @@ orthoflow: 1
 inputs: {scan: {optional: true}, photos: {files: photos}}
 steps:
   end: {use: read.scan, in: {files: inputs.scan}}
-  room: {use: simulate.room, unless: inputs.scan}
+  room: {use: simulate.room, if: inputs.photos, unless: inputs.scan}
   plane:
     in: {cloud: [end.cloud, room.cloud]}
     variants: {hough2d: {use: plane.hough2d}, many: {use: plane.ransac, repeat: 10}}
@@ -116,6 +116,7 @@ steps:
         '    step3["<b>wall</b><br/>raster.grid"]\n'
         '    step4["<b>ortho</b><br/>ortho.direct"]\n'
         '    input0 -->|"files"| step0\n'
+        '    input1 -.->|"if"| step1\n'
         '    input0 -.->|"unless"| step1\n'
         '    step0 -.->|"cloud"| step2\n'
         '    step1 -.->|"cloud"| step2\n'

@@ -31,11 +31,13 @@ class Format:
         writer: import string `module:function` below `orthoflow.cli.exports`, of a `Writer`.
         summary: what it holds, for the help.
         options: the fields of `Choices` that belong to it.
+        takes_rasters: it reads GeoTIFFs that the run published.
     """
 
     writer: str
     summary: str
     options: frozenset[str] = frozenset()
+    takes_rasters: bool = False
 
     def load(self) -> Writer:
         """Import the module and give the function."""
@@ -61,6 +63,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         summary="each wall in its own coordinates with its orthoimage to scale, and the room in "
         "space: planes, where they meet, outline, check points",
         options=frozenset({"cell", "wall"}),
+        takes_rasters=True,
     ),
     "figures": Format(
         writer="results:export_figures",
@@ -72,6 +75,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         summary="outlines of walls and lines in which planes meet, from above and in the "
         "coordinates of each wall",
         options=frozenset({"cell", "wall"}),
+        takes_rasters=True,
     ),
     "layers": Format(
         writer="results:export_layers",
@@ -105,12 +109,14 @@ FORMATS: Final[Mapping[str, Format]] = {
         summary="the walls of the room with their orthoimages as a model that browsers open, "
         "room.glb",
         options=frozenset({"cell", "wall", "relief"}),
+        takes_rasters=True,
     ),
     "tiles": Format(
         writer="viewers:export_tiles",
         summary="each orthoimage as Deep Zoom tiles, with a page that measures on them without a "
         "server",
         options=frozenset({"cell", "wall"}),
+        takes_rasters=True,
     ),
     "prov": Format(
         writer="results:export_prov",
@@ -119,6 +125,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     "stac": Format(
         writer="results:export_stac",
         summary="the orthoimages with a STAC item beside each, and a collection",
+        takes_rasters=True,
     ),
     "ro-crate": Format(
         writer="results:export_crate",
@@ -130,6 +137,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         summary="each wall on paper in exact scale, as PDF, with coordinates, title block, "
         "accuracy and the seal of the record",
         options=frozenset({"cell", "scale", "paper", "wall", "grid_m", "title_block", "beside"}),
+        takes_rasters=True,
     ),
 }
 

@@ -43,6 +43,7 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
 )
+from orthoflow_plugins.inspect.missed_points import missed_points, said_of_missed
 from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
@@ -134,6 +135,10 @@ class InspectCheckpoints(Method):
             )
         for doubt in doubts(points, inputs.checkpoints, pictures):
             ctx.warn(doubt)
+        missed = missed_points(points, inputs.checkpoints, pictures, inputs.walls)
+        # In a simulated room points are hidden on purpose.
+        if missed and inputs.truth is None:
+            ctx.warn(said_of_missed(missed, len(points)))
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}
         shift_m = np.array(
@@ -153,6 +158,8 @@ class InspectCheckpoints(Method):
         own_names = [inputs.checkpoints.names[k] for k in found]
         _draw(pictures, [points[k] for k in found], own_names, ctx)
         _tell(shift_m, own_names, ctx)
+        for name, reason in list(missed.items())[:_TOLD]:
+            ctx.log(f"check point {name}: counts nowhere, {reason}")
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import ezdxf
+import h5py
 import numpy as np
 import pdfplumber
 import pytest
@@ -205,8 +206,42 @@ def test_no_other_raster_stands_in_for_an_orthoimage_that_is_gone(tmp_path: Path
         done = export(run, target, tmp_path / target)
         assert done.exit_code != 0
         assert f"products/mosaic/{gone.name} is gone from" in done.output
-        assert "orthoflow replay" in done.output
+        assert f"orthoflow replay {run / 'run.h5'} -o" in done.output
         assert not (tmp_path / target).exists()
+
+
+@pytest.mark.parametrize("target", ["sheet", "dxf", "geojson", "tiles", "gltf"])
+def test_a_record_alone_is_drawn_as_its_run_is(run: Path, tmp_path: Path, target: str) -> None:
+    alone = tmp_path / "court.h5"
+    alone.write_bytes((run / "run.h5").read_bytes())
+    for source, name in ((run, "of-run"), (alone, "alone")):
+        done = export(source, target, tmp_path / name)
+        assert done.exit_code == 0, done.output
+    assert f"note: {alone} lies alone: its rasters are made anew" in done.output
+    made, wanted = (
+        {
+            path.relative_to(tmp_path / name): path.read_bytes()
+            for path in (tmp_path / name).rglob("*")
+            if path.is_file()
+        }
+        for name in ("alone", "of-run")
+    )
+    assert made.keys() == wanted.keys() != set()
+    # Those of CAD and paper hold the time, or how their writer packed them.
+    if target not in {"sheet", "dxf"}:
+        assert made == wanted
+
+
+def test_an_export_of_a_changed_record_says_so(run: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "run.h5"
+    changed.write_bytes((run / "run.h5").read_bytes())
+    with h5py.File(changed, "r+") as file:
+        file.attrs["seed"] = type(file.attrs["seed"])(b"8")
+    done = export(changed, "csv", tmp_path / "out")
+    assert done.exit_code == 3
+    assert f"error: {changed} is not as it was written: its seal does not hold for /; " in (
+        done.output
+    )
 
 
 def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:

@@ -116,6 +116,27 @@ def test_each_point_is_told_the_farthest_off_first(tmp_path: Path) -> None:
     ]
 
 
+def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    frame = walls.walls[0].frame
+    places = np.array([[50.0, 40.0], [60.0, frame.height + 0.5], [-300.0, 9.0], [60.0, 60.0]])
+    surveyed = frame.world_from_wall(places)
+    surveyed[3] = frame.world_from_wall(places[3:], BUFFER_M + 0.25)[0]
+    pixels = np.full((4, 2), np.nan)
+    pixels[0] = places[0]
+    points = points_at(surveyed, pixels=pixels)
+    points = replace(points, wall=np.array([0, -1, -1, -1], dtype=np.int32))
+    image = inspect_scenes.displaced(0, 0)
+    metrics, _, ctx = inspect(tmp_path, points, walls, image)
+    assert (metrics["n_points"], metrics["n_found"]) == (4, 1)
+    (said,) = ctx.warnings
+    assert said.startswith(
+        f"3 of 4 check points count nowhere: P1 (2 mm below {image.name}), "
+        f"P2 (1.2 m left of {image.name}), P3 (250 mm before {image.name}, beyond its buffer); "
+    )
+    assert "margin_m" in said
+
+
 def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     places = np.column_stack([np.linspace(40.0, 300.0, 20), np.linspace(40.0, 200.0, 20)])

@@ -1,0 +1,73 @@
+"""Check points that no picture shows, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from orthoflow.products import CheckPoints, Walls
+from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
+
+_NAMED: Final = 4
+_NEAR_M: Final = 1.0
+
+
+def missed_points(
+    points: Sequence[ShownPoint],
+    surveyed: CheckPoints,
+    pictures: Sequence[Picture],
+    walls: Walls,
+) -> dict[str, str]:
+    """Name the points that count nowhere, each with the reason, in the order of the survey.
+
+    Args:
+        points: where each is expected and shown.
+        surveyed: the points.
+        pictures: what they were looked for in; at least one.
+        walls: those of the pictures.
+    """
+    names = {picture.wall: picture.image.name for picture in pictures}
+    found: dict[str, str] = {}
+    for index, point in enumerate(points):
+        if np.isfinite(point.place).all():
+            continue
+        if point.how != "outside":
+            found[surveyed.names[index]] = f"nothing like it was recognised on {names[point.wall]}"
+            continue
+        found[surveyed.names[index]] = min(
+            _beside(surveyed, index, picture, walls) for picture in pictures
+        )[1]
+    return found
+
+
+def said_of_missed(missed: Mapping[str, str], n_points: int) -> str:
+    """Say in one sentence which of the points count nowhere; empty where all do."""
+    if not missed:
+        return ""
+    named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
+    more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
+    return (
+        f"{len(missed)} of {n_points} check points count nowhere: {', '.join(named)}{more}; "
+        "measure them in an orthoimage, or let `margin_m` of raster.grid make walls larger"
+    )
+
+
+def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -> tuple[float, str]:
+    """How far a point lies off a picture in metres, and on which side."""
+    frame, slab = picture.frame, walls.slab(picture.wall)
+    column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
+    off_m = {
+        "left of": -column * frame.gsd_m,
+        "right of": (column - frame.width) * frame.gsd_m,
+        "above": -row * frame.gsd_m,
+        "below": (row - frame.height) * frame.gsd_m,
+        "before": depth_m - slab.front_m,
+        "behind": -depth_m - slab.behind_m,
+    }
+    side = max(off_m, key=off_m.__getitem__)
+    far_m = float(np.linalg.norm([max(0.0, value) for value in off_m.values()]))
+    said = f"{1e3 * off_m[side]:.3g} mm" if off_m[side] < _NEAR_M else f"{off_m[side]:.3g} m"
+    limit = ", beyond its buffer" if side in {"before", "behind"} else ""
+    return far_m, f"{said} {side} {picture.image.name}{limit}"
