@@ -131,14 +131,20 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     columns = comparison_columns(combinations)
     chosen = [one for one in columns if one.is_key or one.sense is not Sense.NEITHER]
     cells = [cell for part in parts for cell in part.record.cells]
-    found = list(sweeps(cells))
-    swept = Counter((one.step, one.parameter) for one in found)
+    # What several methods sweep is one drawing: axes of their own would hide which is better.
+    swept: dict[tuple[str, str], list[Sweep]] = {}
+    for sweep in sweeps(cells):
+        swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     for column in sorted(chosen, key=lambda one: not one.is_key):
-        for sweep in found:
-            lines = _lines(combinations, sweep, column, is_over=len(parts) > 1)
+        for alike in swept.values():
+            lines: dict[str, list[_Point]] = {}
+            for sweep in alike:
+                own = _lines(combinations, sweep, column, is_over=len(parts) > 1)
+                method = sweep.method if len(alike) > 1 else ""
+                lines |= {", ".join(filter(None, [method, name])): own[name] for name in own}
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
-                is_alone = swept[sweep.step, sweep.parameter] == 1
-                yield _curve(sweep, column, lines, is_alone=is_alone, n_datasets=len(parts))
+                shown_lines = dict(list(lines.items())[:_MOST_LINES])
+                yield _curve(alike[0], column, shown_lines, n_datasets=len(parts))
 
 
 class _Value(NamedTuple):
@@ -171,7 +177,7 @@ def _lines(
         at.append(_Value(measured.value, measured.spread, one.is_baseline))
     return {
         name: [_point(x, found, is_over=is_over) for x, found in sorted(line.items())]
-        for name, line in list(values.items())[:_MOST_LINES]
+        for name, line in values.items()
     }
 
 
@@ -205,11 +211,9 @@ def _curve(
     column: Column,
     lines: Mapping[str, Sequence[_Point]],
     *,
-    is_alone: bool,
     n_datasets: int,
 ) -> Curve:
-    of = "" if is_alone else f" of {sweep.method}"
-    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}{of}"
+    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
     has_spread = any(
         math.isfinite(point.spread) and point.spread > 0
         for points in lines.values()
@@ -229,7 +233,7 @@ def _curve(
         svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
             lines,
             label=title,
-            below=f"{sweep.step}.{sweep.parameter}{of}",
+            below=f"{sweep.step}.{sweep.parameter}",
             beside=column.label,
         ),
         caption=(

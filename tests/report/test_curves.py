@@ -15,6 +15,8 @@ import pytest
 from orthoflow.report.curves import curves, curves_over, sweeps
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
+CUT = "points to their plane, RMS / mm, cut at its own tolerance"
+
 
 def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
     """Cells of `plane` with values of a tolerance, whose error is a tenth of it."""
@@ -59,10 +61,14 @@ def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path)
         )
         for value in (0.02, 0.05, 0.1)
     ]
-    titles = [curve.title for curve in curves(held(tmp_path, [*one, *other]))]
-    assert len(titles) == 2
-    assert titles[0].endswith("over plane.tolerance_m of plane.toy")
-    assert titles[1].endswith("over plane.tolerance_m of plane.region")
+    (curve,) = curves(held(tmp_path, [*one, *other]))
+    assert curve.title.endswith("over plane.tolerance_m")
+    # On axes that both share, the error of the one is ten times the other's.
+    assert re.findall(r">(plane\.[a-z]+)</text>", curve.svg) == ["plane.toy", "plane.region"]
+    lines = re.findall(r'<path class="line line-(\d)" d="M([0-9. L]+)"/>', curve.svg)
+    high = {index: [float(y) for y in re.findall(r"[0-9.]+ ([0-9.]+)", d)] for index, d in lines}
+    assert len(high["0"]) == len(high["1"]) == 3
+    assert all(toy > region for toy, region in zip(high["0"], high["1"], strict=True))
 
 
 def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
@@ -78,9 +84,9 @@ def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
 
 def test_points_lie_in_the_order_of_values_whatever_that_of_the_variants(tmp_path: Path) -> None:
     (curve,) = curves(held(tmp_path, swept(0.1, 0.02, 0.05)))
-    assert curve.title == "points to their plane, RMS / mm (plane) over plane.tolerance_m"
+    assert curve.title == f"{CUT} (plane) over plane.tolerance_m"
     assert "without repeats nobody knows" in curve.caption
-    assert ">points to their plane, RMS / mm</text>" in curve.svg
+    assert f">{CUT}</text>" in curve.svg
     points = [
         (float(x), float(y)) for x, y in re.findall(r'cx="([0-9.]+)" cy="([0-9.]+)"', curve.svg)
     ]
