@@ -1,0 +1,197 @@
+"""What a drawing says of a wall: how exact it is, what was done to colours, which cell is meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.products import Finding, Inspection
+from orthoflow.records import wall_results as module
+
+
+def output(type_name: str, digest: str = "", *, embedded: bool = True) -> Any:
+    return SimpleNamespace(type_name=type_name, digest=digest or type_name, embedded=embedded)
+
+
+def cell(address: str = "", **known: Any) -> Any:
+    plain = {
+        "address": address,
+        "outputs": {},
+        "inputs": {},
+        "metrics": (),
+        "params": {},
+        "method": "mosaic.seams",
+    }
+    return SimpleNamespace(**{**plain, **known})
+
+
+class ToyRun:
+    """Cells by address, each behind those before it."""
+
+    def __init__(self, folder: Path | None = None, published: tuple[str, ...] = (), **cells: Any):
+        self.cells = cells
+        self.folder = folder
+        self.record = SimpleNamespace(
+            run_id="r1", published=[SimpleNamespace(path=path) for path in published]
+        )
+
+    def cell(self, address: str) -> Any:
+        if address not in self.cells:
+            raise ArgumentError(f"no cell {address}")
+        return self.cells[address]
+
+    def upstream(self, address: str) -> list[Any]:
+        names = list(self.cells)
+        return [self.cells[name] for name in names[: names.index(address) + 1]]
+
+
+def inspection(*findings: tuple[str, float, int], walls: tuple[int, ...] = ()) -> Inspection:
+    count = len(walls)
+    return Inspection(
+        wall=np.array(walls, dtype=np.int32),
+        points_world=np.zeros((count, 3)),
+        displacement_m=np.zeros((count, 2)),
+        kind=np.zeros(count, dtype=np.uint8),
+        kinds=("point",),
+        findings=tuple(
+            Finding(name=name, value=value, unit="mm", wall=wall) for name, value, wall in findings
+        ),
+    )
+
+
+def test_an_inspection_says_how_exact_a_wall_is_or_all_of_them() -> None:
+    own = inspection(
+        ("rmse_x_mm", 1.25, 3), ("rmse_y_mm", 2.0, 3), ("rms_3d_mm", 3.0, 3), ("max_3d_mm", 9.0, 3),
+        ("rmse_x_mm", 7.0, 4), ("rmse_y_mm", 7.0, 4),
+        ("rmse_x_mm", 8.0, -1), ("rmse_y_mm", 8.0, -1),
+    )  # fmt: skip
+    every = inspection(("patch_rmse_u_mm", 1.0, -1), ("patch_rmse_v_mm", 2.0, -1))
+    first = inspection(("rmse_u_mm", 4.0, 0), ("rmse_v_mm", 5.0, 0))
+    half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
+    found = {"check": own, "truth": every, "half": half, "first": first}
+    assert list(module._accuracy(found, 3)) == [
+        "check: RMSE x 1.2 mm, y 2.0 mm; in space RMS 3.0 mm, largest 9.0 mm",
+        "truth: of patches RMSE x 1.0 mm, y 2.0 mm (all walls)",
+    ]
+    assert list(module._accuracy(found, 0)) == [
+        "check: RMSE x 8.0 mm, y 8.0 mm (all walls)",
+        "truth: of patches RMSE x 1.0 mm, y 2.0 mm (all walls)",
+        "first: RMSE x 4.0 mm, y 5.0 mm",
+    ]
+
+
+def test_places_in_walls_become_numbers() -> None:
+    numbered = module._numbered(inspection(("a", 1.0, 1), ("b", 2.0, -1), walls=(0, 1, 5)), [4, 7])
+    assert numbered.wall.tolist() == [4, 7, -1]
+    assert [item.wall for item in numbered.findings] == [7, -1]
+
+
+def metric(name: str, value: float) -> Any:
+    return SimpleNamespace(name=name, value=value)
+
+
+def test_the_last_orientation_before_the_pictures_tells_its_worst_photo() -> None:
+    run: Any = ToyRun(
+        mosaic=cell(metrics=(metric("gain_max", 2.0),)),
+        orient=cell(
+            metrics=(metric("sigma_wall_mm_worst", 1.25), metric("check_rmse_mm_worst", 3.0))
+        ),
+        before=cell(metrics=(metric("sigma_wall_mm_worst", 9.0),)),
+    )
+    (said,) = module._photo_accuracy(run, ("mosaic", "orient", "before"))
+    assert said == (
+        "orient, worst photo: expected error of its orientation against the scan 1.2 mm, "
+        "ties that only check, RMS per axis 3.0 mm; errors of depth and scan add to these"
+    )
+    (said,) = module._photo_accuracy(run, ("mosaic", "before"))
+    assert said.startswith("before, worst photo: expected error")
+    assert "ties" not in said
+    assert list(module._photo_accuracy(run, ("mosaic",))) == []
+
+
+@pytest.mark.parametrize(
+    ("params", "metrics", "said"),
+    [
+        ({}, (), "colours as mosaic.seams gave them"),
+        ({"gains": "none"}, (), "colours untouched: as photos or scan have them"),
+        ({"gains": "local"}, (), "colours untouched: the photos agree, or there is one only"),
+        (
+            {"gains": "local"},
+            (metric("gain_max", 1.5),),
+            "colours balanced between photos (gains: local)",
+        ),
+    ],
+)
+def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) -> None:
+    photos = cell(inputs={"photos": output("photos")})
+    run: Any = ToyRun(photos=photos, mosaic=cell(params=params, metrics=metrics))
+    assert module._colours(run, "mosaic") == said
+    run = ToyRun(scan=cell(inputs={"cloud": output("cloud")}), mosaic=cell(params=params))
+    assert module._colours(run, "mosaic") == "colours as the scan has them"
+
+
+def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
+    walls, images = {"walls": output("walls")}, {"images": output("orthoimages")}
+    run: Any = ToyRun(
+        a=cell(outputs=walls), b=cell(outputs=images), c=cell(outputs=images), d=cell(outputs=walls)
+    )
+    assert module._pictured(run, None) == "c"
+    assert module._pictured(run, "a") == "a"
+    assert module._pictured(ToyRun(a=cell(outputs=walls), d=cell(outputs=walls)), None) == "d"  # type: ignore[arg-type]
+    nothing: Any = ToyRun(e=cell(outputs={"cloud": output("cloud")}))
+    with pytest.raises(ArgumentError, match="the run r1 has no orthoimages and no walls"):
+        module._pictured(nothing, None)
+    with pytest.raises(ArgumentError, match=r"e holds no orthoimages or walls; .*: none"):
+        module._pictured(nothing, "e")
+    run.cells["e"] = nothing.cells["e"]
+    with pytest.raises(ArgumentError, match="those of this run: b, c, a, d"):
+        module._pictured(run, "e")
+
+
+def test_the_first_product_that_the_record_holds_counts() -> None:
+    run: Any = ToyRun(
+        a=cell(outputs={"x": output("planes", embedded=False), "y": output("cloud")}),
+        b=cell(outputs={"x": output("cloud"), "z": output("planes")}),
+        c=cell(outputs={"w": output("planes")}),
+    )
+    assert module._upstream_product(run, ("a", "b", "c"), "planes") == ("b", "z")
+    assert module._upstream_product(run, ("c", "b"), "planes") == ("c", "w")
+    assert module._upstream_product(run, ("a",), "planes") is None
+
+
+PUBLISHED = (
+    "products/mosaic/wall_2_ortho.tif",
+    "products/mosaic/images_wall_10_depth.tif",
+    "products/mosaic/wall_2_ortho.json",
+    "products/mosaic/wall_x_ortho.tif",
+    "products/mosaic/wall_3_preview.tif",
+    "products/other/wall_4_ortho.tif",
+    "products/mosaic/wall_5_intensity.tif",
+)
+
+
+def test_rasters_are_known_by_the_names_of_their_files() -> None:
+    run: Any = ToyRun(published=PUBLISHED)
+    assert module._rasters(run, "mosaic") == {
+        (2, "ortho"): PUBLISHED[0],
+        (10, "depth"): PUBLISHED[1],
+        (5, "intensity"): PUBLISHED[6],
+    }
+
+
+@pytest.mark.parametrize(("wall", "is_asked"), [(None, True), (2, True), (10, False)])
+def test_an_orthoimage_that_is_gone_is_asked_for(
+    tmp_path: Path, wall: int | None, is_asked: bool
+) -> None:
+    run: Any = ToyRun(folder=tmp_path, published=PUBLISHED)
+    if is_asked:
+        with pytest.raises(RecordError, match=r"wall_2_ortho.tif is gone from .* copy it back"):
+            module._require_orthoimages(run, "mosaic", wall)
+        (tmp_path / "products/mosaic").mkdir(parents=True)
+        (tmp_path / PUBLISHED[0]).touch()
+    module._require_orthoimages(run, "mosaic", wall)

@@ -1,0 +1,121 @@
+"""Differences dataset by dataset: who wins, by how much, and which datasets decide."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from scipy.stats import wilcoxon
+
+from orthoflow.report import paired as module
+from orthoflow.report.paired import paired_differences
+from orthoflow.report.rankings import Sense
+
+
+def worse(*values: float) -> dict[str, float]:
+    return dict(zip("abcdefgh", values, strict=False))
+
+
+@pytest.mark.parametrize(
+    ("sense", "median", "deciding"),
+    [(Sense.LESS, -1.0, {"c": -4.0, "d": 2.0}), (Sense.MORE, 1.0, {"c": 4.0, "d": -2.0})],
+)
+def test_what_less_or_more_of_a_number_is_worth_is_told_in_its_own_sign(
+    sense: Sense, median: float, deciding: dict[str, float]
+) -> None:
+    # Of eleven in all, four and two make up more than half.
+    found = paired_differences(worse(-1.0, -1.0, -4.0, 2.0, -1.5, 1.0, 0.0), sense)
+    assert (found.n, found.wins, found.losses) == (7, 4, 2)
+    assert found.median == median
+    assert found.deciding == deciding
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ((1.0, 1.0, 2.0), ["c"]),
+        ((1.0, 1.01, 2.0), ["c", "b"]),
+        ((1.0, -1.0, 1.0, -1.0, 1.0, -1.0), ["a", "b", "c"]),
+        # Three at most, though they make up less than half.
+        ((1.0,) * 8, ["a", "b", "c"]),
+        ((0.0, 0.0), []),
+        ((0.0, -3.0), ["b"]),
+    ],
+)
+def test_the_largest_differences_that_make_up_half_decide(
+    values: tuple[float, ...], names: list[str]
+) -> None:
+    assert list(paired_differences(worse(*values), Sense.LESS).deciding) == names
+
+
+def test_five_differences_are_tested_and_four_are_not() -> None:
+    few = paired_differences(worse(-1.0, -2.0, -3.0, -4.0, 0.0, 0.0), Sense.LESS)
+    assert math.isnan(few.p)
+    assert math.isnan(few.effect)
+    values = (-1.0, -2.0, -3.0, -4.0, 2.5)
+    found = paired_differences(worse(*values, 0.0), Sense.LESS)
+    # Ranks 1, 2, 4 and 5 for, 3 against: (12 - 3) / 15.
+    assert found.effect == pytest.approx(0.6)
+    assert found.p == wilcoxon(values).pvalue
+    every = paired_differences(worse(1.0, 2.0, 3.0, 4.0, 5.0), Sense.LESS)
+    assert every.effect == -1.0
+    assert every.p == pytest.approx(0.0625)
+    assert every.wins == 0
+
+
+def measured(value: float, environment: str = "one") -> Any:
+    return SimpleNamespace(value=value, environment=environment)
+
+
+def test_values_of_other_environments_or_of_no_size_are_not_paired() -> None:
+    ours = {
+        "a": measured(2.0), "b": measured(2.0, "two"), "c": measured(3.0),
+        "d": measured(math.inf), "e": measured(-1.0),
+    }  # fmt: skip
+    theirs = {name: measured(1.5) for name in "abde"}
+    found = module._paired(ours, theirs, Sense.LESS)
+    assert found is not None
+    # Of signed errors the sizes.
+    assert (found.n, found.wins, found.losses) == (2, 1, 1)
+    assert found.deciding == {"a": 0.5}
+    assert module._paired({"c": measured(1.0)}, theirs, Sense.LESS) is None
+    assert module._paired({"b": measured(1.0, "two")}, theirs, Sense.LESS) is None
+
+
+def combination(value: float | None, failure: str | None = None) -> Any:
+    return SimpleNamespace(
+        failure=failure, measured=lambda *_: None if value is None else measured(value)
+    )
+
+
+def test_a_method_is_summed_up_over_datasets() -> None:
+    found = {
+        "plane=a": {"x": combination(-2.0), "y": combination(3.0), "z": combination(10.0)},
+        "plane=b": {
+            "x": combination(1.0),
+            "y": combination(9.0, "no plane"),
+            "z": combination(None),
+        },
+    }
+    first, second = module._methods(
+        found, ("x", "y", "z", "w"), "plane=a", ("check", "rms_mm", Sense.LESS)
+    )
+    assert (first.name, first.is_reference, first.n, first.failed, first.n_absent) == (
+        "plane=a", True, 3, (), 1,
+    )  # fmt: skip
+    # Errors of both signs would make each other small.
+    assert first.median == 3.0
+    assert first.spread == pytest.approx(1.4826 * 1.0)
+    assert first.paired is None
+    assert (second.is_reference, second.n, second.failed, second.n_absent) == (
+        False, 1, ("y",), 2,
+    )  # fmt: skip
+    assert second.paired is not None
+    assert (second.paired.n, second.paired.wins) == (1, 1)
+    first, second = module._methods(
+        found, ("x", "y", "z"), "plane=a", ("check", "rms_mm", Sense.NEITHER)
+    )
+    assert first.median == 3.0
+    assert second.paired is None
