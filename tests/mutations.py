@@ -64,8 +64,8 @@ _TOLD: Final = re.compile(
 # Arguments and names that change speed, memory or looks, not results.
 _UNSEEN_KEYWORDS: Final = re.compile(
     r"^(strict|copy|cores|(n_)?threads|n_per_run|max_workers|maxsize|stacklevel|daemon|flush"
-    r"|figsize|dpi|alpha|linewidths?|lw|fontsize|labelsize|(face|edge)?color|cmap|markersize|zorder"
-    r"|pad|rotation_mode|interpolation|frameon|loc|ncols|capsize|hspace|wspace|description|examples"
+    r"|figsize|dpi|alpha|linewidths?|lw|thickness|fontsize|labelsize|(face|edge)?color|cmap|zorder"
+    r"|markersize|pad|rotation_mode|interpolation|frameon|loc|ncols|capsize|hspace|wspace|description|examples"
     r"|title|help|show_default|compresslevel|quality|indent)$"
 )
 _UNSEEN_NAMES: Final = re.compile(

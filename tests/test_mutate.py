@@ -95,6 +95,7 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "def f(*, cores: int = 1): ...",
         "class A:\n    cores: int = 1",
         "b.reshape(-1)",
+        "cv2.polylines(picture, places, thickness=2)",
         "_ROWS_FIRST: Final = 4_096",
         "@compiled\ndef f(): a = np.empty((3, n), dtype=np.int32)",
         "@kernel_part\ndef f(): a = np.zeros(10)",

@@ -169,3 +169,29 @@ def test_one_guessed_side_makes_all_of_them_a_guess(tmp_path: Path) -> None:
     assert planes.viewpoint == "guess"
     (warning,) = ctx.warnings
     assert "no scanner station says from which side 1 of 2 planes were seen" in warning
+
+
+def test_a_point_near_two_planes_is_of_the_nearer(tmp_path: Path) -> None:
+    slope = Plane(normal=np.array([0.0, -0.6, 0.8]), offset_m=-1.2)
+    # Both planes meet at y = 2, z = 0; points between them.
+    rng = np.random.default_rng(6)
+    between = rng.uniform([-2.0, 1.97, -0.03], [2.0, 2.03, 0.03], (500, 3))
+    away = np.abs(between - [0.0, 2.0, 0.0]) @ np.diag([0.0, 1.0, 1.0])
+    assert away.max() < 0.05
+    on_slope = np.column_stack(
+        [rng.uniform(-2, 2, 3_000), np.zeros(3_000), rng.uniform(-1, -0.1, 3_000)]
+    )
+    on_slope[:, 1] = 2.0 + on_slope[:, 2] * 0.8 / 0.6
+    seen = cloud_of(np.vstack([ON_WALL, on_slope, between]))
+    prepared = prepare_for_references(seen, parts=1)
+    references = [placed(seen, keeps_side=True), placed(seen, slope, keeps_side=True)]
+    labels = np.empty(len(ON_WALL) + 3_500, dtype=np.int16)
+    ctx = context(tmp_path)
+    planes = lay_references(references, seen, prepared, labels, tolerance_m=0.05, ctx=ctx)
+    assert planes.names == ("wall 0", "slope 1")
+    to_wall = np.abs(WALL.distances_m(between))
+    to_slope = np.abs(slope.distances_m(between))
+    clear = np.abs(to_wall - to_slope) > 1e-5
+    expected = (to_slope < to_wall).astype(np.int16)
+    np.testing.assert_array_equal(labels[-500:][clear], expected[clear])
+    assert 100 < expected.sum() < 400

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -10,9 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.region_kernels import grow_regions
 from orthoflow_plugins.plane.regions import (
+    Growth,
+    RegionProposer,
+    Regions,
     _common_direction,
     _densest,
+    _is_crumb,
+    _is_thin,
     _plane,
+    claim_by_region,
     facing,
 )
 from orthoflow_plugins.plane.sample import prepare
@@ -198,3 +205,161 @@ def test_of_a_group_the_layer_with_most_points_gives_the_plane() -> None:
     found = _densest(voxels, member, rough)
     assert abs(found.normal[1]) > math.cos(math.radians(0.5))
     assert abs(found.distances_m(np.array([[0.0, 2.0, 0.0]]))[0]) < 0.005
+
+
+# --- what regions propose ---
+
+
+def regions_of(n_points: list[int], planes: dict[int, Plane]) -> Regions:
+    return Regions(
+        voxels=None,  # type: ignore[arg-type] # nobody asks them
+        region_of_voxel=np.zeros(0, dtype=np.int32),
+        n_points=np.array(n_points),
+        planes=planes,
+        starts=planes,
+    )
+
+
+def rising(rise_deg: float) -> Plane:
+    rise = math.radians(rise_deg)
+    return Plane(normal=np.array([math.cos(rise), 0.0, math.sin(rise)]), offset_m=rise_deg)
+
+
+def proposer(samples: list[int], planes: dict[int, Plane], **known: Any) -> RegionProposer:
+    plain: dict[str, Any] = {
+        "regions": regions_of([100, 200, 300, 400], planes),
+        "region_of_sample": np.array(samples, dtype=np.int32),
+        "family": "any",
+        "tilt_most_deg": 10.0,
+        "least_points": 7.5,
+        "proposes_once": False,
+    }
+    return RegionProposer(**{**plain, **known})
+
+
+def free(claims: list[int]) -> Any:
+    return SimpleNamespace(claims=np.array(claims), up=np.array([0.0, 0.0, 1.0]))
+
+
+# Four points of region 2, three of 0, two of 1, one of 3, two of none.
+SAMPLES = [2, 0, 1, -1, 2, 0, 2, 1, 3, 0, 2, -1]
+NOBODY = [-1] * 12
+PLANES = {0: rising(0.0), 1: rising(20.0), 2: rising(80.0), 3: rising(5.0)}
+
+
+def test_the_region_with_most_free_points_comes_first_and_a_rejected_one_not_again() -> None:
+    over = proposer(SAMPLES, PLANES)
+    found = []
+    while (candidate := over.propose(free(NOBODY))) is not None:
+        found.append(candidate)
+        over.reject(candidate)
+    # A region needs a share of 0.2 of what a plane needs in the sample: one and a half.
+    assert [one.plane.offset_m for one in found] == [80.0, 0.0, 20.0]
+    assert [one.votes for one in found] == [300.0, 100.0, 200.0]
+    assert all(one.start is one.plane and one.family == "any" for one in found)
+    # What planes have taken counts no more.
+    over = proposer(SAMPLES, PLANES)
+    candidate = over.propose(free([0 if region == 2 else -1 for region in SAMPLES]))
+    assert candidate is not None
+    assert candidate.plane is PLANES[0]
+    again = over.propose(free(NOBODY))
+    assert again is not None
+    assert again.plane is PLANES[2]
+
+
+def test_a_region_that_proposes_once_has_one_plane() -> None:
+    for once, second in ((False, PLANES[2]), (True, PLANES[0])):
+        over = proposer(SAMPLES, PLANES, proposes_once=once)
+        first = over.propose(free(NOBODY))
+        assert first is not None
+        assert first.plane is PLANES[2]
+        again = over.propose(free(NOBODY))
+        assert again is not None
+        assert again.plane is second
+
+
+def test_regions_without_a_plane_are_passed_over() -> None:
+    found = proposer(SAMPLES, {1: PLANES[1]}).propose(free(NOBODY))
+    assert found is not None
+    assert found.plane is PLANES[1]
+    assert proposer(SAMPLES, {}).propose(free(NOBODY)) is None
+
+
+@pytest.mark.parametrize(
+    ("family", "rises_deg"),
+    # Ten degrees, and three more before a plane is fitted to all points.
+    [
+        ("wall", {0.0: True, 12.9: True, -12.9: True, 13.1: False, 90.0: False}),
+        ("level", {0.0: False, 76.9: False, 77.1: True, -77.1: True, 90.0: True}),
+        ("any", {0.0: True, 45.0: True, 90.0: True}),
+    ],
+)
+def test_regions_lean_a_little_more_than_planes_may(
+    family: str, rises_deg: dict[float, bool]
+) -> None:
+    for rise_deg, is_proposed in rises_deg.items():
+        over = proposer([0] * 12, {0: rising(rise_deg)}, family=family)
+        assert (over.propose(free(NOBODY)) is not None) is is_proposed
+
+
+class Voxels:
+    """Stand for voxels: they keep whom they are given to."""
+
+    owners: NDArray[np.int8]
+
+    def claim(self, _cloud: object, owners: NDArray[np.int8]) -> None:
+        self.owners = owners
+
+
+def test_a_region_is_of_the_plane_that_most_of_its_points_are_near() -> None:
+    region_of_sample = np.array([0] * 4 + [1] * 4 + [2] * 3 + [-1])
+    # Of region 0 three are near plane 1 and one near 0; of 1 half are near any; of 2 two are.
+    claims = np.array([1, 1, 1, 0, 0, 0, -1, -1, 0, 0, -1, 1], dtype=np.int8)
+    voxels = Voxels()
+    regions: Any = SimpleNamespace(
+        region_of=lambda _: region_of_sample,
+        region_of_voxel=np.array([0, 1, 2, -1, 2, 0]),
+        n_points=np.zeros(3),
+        voxels=voxels,
+    )
+    cloud: Any = SimpleNamespace(sample_claims=claims, sample=SimpleNamespace(points=None))
+    claim_by_region([None, None], regions, cloud)  # type: ignore[list-item]
+    assert voxels.owners.tolist() == [1, -1, 0, -1, 0, 1]
+
+
+def test_crumbs_are_in_no_region_or_in_one_with_few_points() -> None:
+    voxels: Any = SimpleNamespace(counts=np.array([5, 7, 2, 9, 1]))
+    growth = Growth(angle_deg=10.0, distance_m=0.1, least_points=12.0)
+    found = _is_crumb(voxels, np.array([0, 0, 1, -1, 1], dtype=np.int32), growth)
+    assert found.tolist() == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize(("mean", "is_thin"), [(5.3, True), (5.4, False)])
+def test_a_cloud_is_thin_where_neighbourhoods_have_few_points(mean: float, is_thin: bool) -> None:
+    # Three voxels across: nine on a surface; 48 points are enough.
+    cube = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
+    voxels: Any = SimpleNamespace(neighbourhood=cube)
+    assert _is_thin(voxels, np.array([mean - 2.0, mean + 2.0])) is is_thin
+
+
+def test_normals_on_either_side_of_a_group_count_alike() -> None:
+    """The direction is the mean, by points, of normals turned to one side."""
+    tilts = np.radians([0.0, 8.0, 0.0, 8.0])
+    sides = np.array([1.0, -1.0, -1.0, 1.0])
+    normals = sides[:, None] * np.column_stack([np.sin(tilts), np.zeros(4), np.cos(tilts)])
+    places = np.array([[0.5, 0.5, 2.5], [1.5, 0.5, 2.5], [2.5, 0.5, 2.5], [3.5, 0.5, 9.5]])
+    voxels: Any = SimpleNamespace(
+        grid=SimpleNamespace(basis=np.eye(3), cell_m=1.0),
+        counts=np.array([10, 10, 30, 30]),
+        normals=normals,
+        centroids=lambda: places,
+    )
+    rough = Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0)
+    found = _densest(voxels, np.ones(4, dtype=bool), rough)
+    mean = 40 * np.array([0.0, 0.0, 1.0]) + 40 * np.array(
+        [math.sin(math.radians(8.0)), 0.0, math.cos(math.radians(8.0))]
+    )
+    np.testing.assert_allclose(found.normal, mean / np.linalg.norm(mean), atol=1e-9)
+    # Most points lie in the lower layer, and the plane in their middle.
+    along = places[:3] @ found.normal
+    assert found.offset_m == pytest.approx(np.average(along, weights=[10, 10, 30]))

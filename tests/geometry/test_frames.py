@@ -1,0 +1,172 @@
+"""Rasters on walls: places there and back, distances, axes, and the grid over a rectangle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.frames import WallFrame, frame_over, wall_axes
+from tests import samples, scenes
+
+UP = np.array([0.0, 0.0, 1.0])
+# 0.5 x 0.3 m, its corner at (1, 2, 3); x is to the right, down is down, the viewer in the south.
+FRAME = samples.facing_south(0.1, 5, 3, (1.0, 2.0, 3.0))
+
+
+def turned() -> WallFrame:
+    turn = scenes.random_rotation(np.random.default_rng(4))
+    return replace(
+        FRAME,
+        u_world=turn @ FRAME.u_world,
+        v_world=turn @ FRAME.v_world,
+        normal_world=turn @ FRAME.normal_world,
+    )
+
+
+def test_places_on_a_wall_are_metres_to_the_right_down_and_before_it() -> None:
+    assert FRAME.shape == (3, 5)
+    points = FRAME.world_from_wall(np.array([[0.0, 0.0], [5.0, 3.0], [2.0, 1.0]]), 0.25)
+    np.testing.assert_allclose(points, [[1.0, 1.75, 3.0], [1.5, 1.75, 2.7], [1.2, 1.75, 2.9]])
+    np.testing.assert_allclose(
+        FRAME.corners_world(), [[1, 2, 3], [1, 2, 2.7], [1.5, 2, 2.7], [1.5, 2, 3]]
+    )
+    assert FRAME.plane.offset_m == -2.0
+    for frame in (FRAME, turned()):
+        placed = np.array([[0.5, 2.5, 0.1], [7.0, -4.0, -3.0], [1.0, 1.0, 0.0]])
+        points = frame.world_from_wall(placed[:, :2], placed[:, 2])
+        np.testing.assert_allclose(frame.wall_from_world(points), placed, atol=1e-9)
+        np.testing.assert_allclose(frame.plane.distances_m(points), placed[:, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("place", "away_m"),
+    [
+        ((2.0, 1.0, 0.0), 0.0),
+        ((0.0, 3.0, 0.0), 0.0),
+        ((2.0, 1.0, -0.4), 0.4),
+        ((-3.0, 1.0, 0.0), 0.3),
+        ((8.0, 1.0, 0.4), 0.5),
+        ((2.0, -3.0, 0.4), 0.5),
+        ((2.0, 7.0, 0.0), 0.4),
+        ((-3.0, 7.0, 1.2), 1.3),
+    ],
+)
+def test_points_are_as_far_from_a_raster_as_from_its_rectangle(
+    place: tuple[float, float, float], away_m: float
+) -> None:
+    for frame in (FRAME, turned()):
+        point = frame.world_from_wall(np.array([place[:2]]), np.array([place[2]]))
+        both = frame.distances_m(np.vstack([point, point]))
+        np.testing.assert_allclose(both, [away_m, away_m], atol=1e-9)
+
+
+@pytest.mark.parametrize(("crs", "corner"), [(None, (0.0, 0.0)), ("EPSG:32632", (1.0, 2.0))])
+def test_rasters_count_from_their_corner_and_maps_from_the_world(
+    crs: str | None, corner: tuple[float, float]
+) -> None:
+    frame = replace(FRAME, map_crs=crs)
+    assert frame.raster_corner_m == corner
+    places = frame.raster_from_wall(np.array([[0.0, 0.0], [2.0, 3.0]]))
+    np.testing.assert_allclose(places, np.array(corner) + np.array([[0.0, 0.0], [0.2, -0.3]]))
+    np.testing.assert_allclose(frame.wall_from_raster(places), [[0.0, 0.0], [2.0, 3.0]], atol=1e-9)
+
+
+def test_frames_have_the_same_cells_to_a_thousandth_of_one() -> None:
+    def moved(by_m: float) -> WallFrame:
+        return replace(FRAME, origin_world=FRAME.origin_world + np.array([by_m, 0.0, 0.0]))
+
+    assert FRAME.has_cells_of(moved(0.99e-4))
+    assert not FRAME.has_cells_of(moved(1.01e-4))
+    assert not FRAME.has_cells_of(replace(FRAME, width=6))
+    # Cells that grow by so little shift the last corner: five cells by 0.2 thousandths of one.
+    assert FRAME.has_cells_of(replace(FRAME, gsd_m=0.1 * (1 + 1.9e-4)))
+    assert not FRAME.has_cells_of(replace(FRAME, gsd_m=0.1 * (1 + 2.2e-4)))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"gsd_m": 0.0}, "needs a positive cell size and at least one cell, got 0.0 m and 5 x 3"),
+        ({"width": 0}, "at least one cell, got 0.1 m and 0 x 3"),
+        ({"height": -1}, "at least one cell, got 0.1 m and 5 x -1"),
+        ({"gsd_m": math.nan}, "needs a positive cell size"),
+        ({"u_world": np.zeros(2)}, "an origin and axes of three numbers each"),
+        ({"v_world": -FRAME.v_world}, "these axes mirror the image"),
+        ({"normal_world": -FRAME.normal_world}, "these axes mirror the image"),
+    ],
+)
+def test_what_is_no_frame_is_refused(change: dict[str, object], sentence: str) -> None:
+    with pytest.raises(GeometryError, match=sentence):
+        replace(FRAME, **change)  # type: ignore[arg-type]
+
+
+def leaning(deg: float) -> NDArray[np.float64]:
+    """A normal to the south that rises by so much."""
+    return np.array([0.0, -math.cos(math.radians(deg)), math.sin(math.radians(deg))])
+
+
+@pytest.mark.parametrize("rise_deg", [0.0, 45.0, 79.9, -79.9])
+def test_on_walls_and_slopes_u_is_level_and_to_the_right(rise_deg: float) -> None:
+    u, v = wall_axes(leaning(rise_deg), UP)
+    np.testing.assert_allclose(u, [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.cross(u, v), -leaning(rise_deg), atol=1e-12)
+    # Downwards as far as the plane lets it.
+    assert v[2] == pytest.approx(-math.cos(math.radians(rise_deg)))
+
+
+@pytest.mark.parametrize("rise_deg", [80.1, 90.0, -80.1])
+def test_floors_read_like_a_map_whichever_way_they_lean(rise_deg: float) -> None:
+    for around_deg in (0.0, 77.0, 200.0):
+        turn = math.radians(around_deg)
+        south = leaning(rise_deg)
+        normal = np.array([-math.sin(turn) * south[1], math.cos(turn) * south[1], south[2]])
+        u, v = wall_axes(normal, UP)
+        # e1 laid into the plane: within ten degrees of it.
+        assert u[0] > math.cos(math.radians(10.0))
+        assert u @ normal == pytest.approx(0.0, abs=1e-12)
+        assert np.linalg.norm(u) == pytest.approx(1.0)
+        np.testing.assert_allclose(np.cross(u, v), -normal, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("size_m", "cells"),
+    [
+        ((0.5, 0.3), (5, 3)),
+        ((0.5 + 9e-8, 0.3), (5, 3)),
+        ((0.5 + 2e-7, 0.3), (6, 3)),
+        ((0.51, 0.39), (6, 4)),
+        ((0.01, 0.02), (1, 1)),
+        ((1e-9, 0.3), (1, 3)),
+    ],
+)
+def test_a_grid_covers_its_rectangle_to_a_millionth_of_a_cell(
+    size_m: tuple[float, float], cells: tuple[int, int]
+) -> None:
+    right, down = np.array([size_m[0], 0, 0]), np.array([0, 0, -size_m[1]])
+    corner = np.array([1.0, 2.0, 3.0])
+    corners = np.array([corner, corner + down, corner + down + right, corner + right])
+    frame = frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
+    assert (frame.width, frame.height) == cells
+    np.testing.assert_array_equal(frame.origin_world, corner)
+    np.testing.assert_allclose(frame.u_world, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(frame.v_world, [0.0, 0.0, -1.0])
+
+
+def test_corners_that_are_a_little_off_the_plane_give_axes_on_it() -> None:
+    corners = np.array([[0, 0, 1.0], [0, 0, 0], [2, 0.02, 0], [2, 0.02, 1]])
+    frame = frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
+    np.testing.assert_allclose(frame.u_world, [1.0, 0.0, 0.0], atol=1e-12)
+    assert frame.width == 21
+
+
+@pytest.mark.parametrize("flat", [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+def test_a_rectangle_without_an_area_is_refused(flat: list[float]) -> None:
+    right, down = np.array([flat[0], 0, 0]), np.array([0, 0, -flat[1]])
+    corners = np.array([0 * right, down, down + right, right])
+    with pytest.raises(GeometryError, match="a rectangle needs an area"):
+        frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
