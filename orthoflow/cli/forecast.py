@@ -65,7 +65,7 @@ class CellState:
 
 
 def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
-    """Say how long a run still takes; empty when nobody knows of more than half of its cells.
+    """Say how long a run still takes, or that nobody knows it; empty where nothing is left.
 
     Args:
         cells: all of them.
@@ -73,13 +73,21 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
         jobs: how many run at the same time.
     """
     open_cells = [cell for cell in cells if cell.state in ("waiting", "running")]
-    left = [cell.left_s(now_s) for cell in open_cells]
+    # What is stored or skipped takes no time, and says nothing of the others.
+    working = [cell for cell in open_cells if cell.state == "running" or cell.took_s != 0.0]
+    if not working:
+        return ""
+    left = [cell.left_s(now_s) for cell in working]
     known = [seconds for seconds in left if seconds is not None]
     # The few seconds of the known ones would be true, and mislead.
     if not known or 2 * len(known) < len(left):
-        return ""
+        return "time left not known yet"
     seconds = max(*known, sum(known) / jobs, 0.0)
-    return f"{'about' if len(known) == len(left) else 'at least'} {about(seconds)} left"
+    if len(known) == len(left):
+        return f"about {about(seconds)} left"
+    unknown = len(left) - len(known)
+    more = "a step that takes" if unknown == 1 else f"{unknown} steps that take"
+    return f"at least {about(seconds)} left, and {more} nobody knows how long"
 
 
 def left_of_cell(cell: CellState, now_s: float) -> str:

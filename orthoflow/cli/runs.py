@@ -22,7 +22,7 @@ from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_tab
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary
 
-_STATES: Final = ("ok", "failed", "unfinished", "damaged")
+_STATES: Final = ("ok", "failed", "running", "unfinished", "damaged")
 _COLUMNS: Final = ("folder", "started", "workflow", "status")
 # As many numbers stand beside the rest on a wide terminal.
 _METRICS_MOST: Final = 4

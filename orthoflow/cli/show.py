@@ -143,8 +143,10 @@ def _print_environments(run: Run) -> None:
 
 
 def _print_files(run: Run) -> None:
-    n_files = sum(len(files) for files in run.files.values())
-    echo("", f"products: {run.products_folder}, {counted(n_files, 'file')}")
+    published = run.record.published
+    n_files = sum((run.folder / file.path).exists() for file in published)
+    of_all = "" if n_files == len(published) else f" of the {len(published)} that were published"
+    echo("", f"products: {run.products_folder}, {counted(n_files, 'file')}{of_all}")
     for image in run.orthoimages:
         echo(f"orthoimage: {image}")
 

@@ -7,7 +7,7 @@ import json
 import os
 import uuid
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from orthoflow.engine.clock import now, time_in_a_name
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.results import CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
+from orthoflow.files.regular_files import open_file
 from orthoflow.system import file_lock, flags
 
 JOURNAL: Final = "journal.jsonl"
@@ -268,6 +269,17 @@ def _check_folder(folder: Path) -> None:
         raise ArgumentError(
             f"{folder} is not empty and holds no unfinished run; choose another folder with -o"
         )
+
+
+def is_running(folder: Path) -> bool:
+    """Whether a living process is at work on the run in a folder."""
+    path = folder / JOURNAL
+    try:
+        with open_file(path) as journal, closing(file_lock(path, journal.fileno())) as lock:
+            # Shared, so that two who ask do not take each other for runs.
+            return not lock.take(is_shared=True, waits=False)
+    except OSError:
+        return False
 
 
 def new_run_id() -> str:

@@ -16,7 +16,7 @@ from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord, 
 from orthoflow_provenance.payloads import StoredPayload
 from orthoflow_provenance.reader import open_outputs, read_record
 
-from orthoflow.engine.run_folder import RECORD_FILE
+from orthoflow.engine.run_folder import RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
 from orthoflow.foreign_text import shown
 from orthoflow.products.product import Payload, Product
@@ -222,6 +222,10 @@ def find_record(path: str | Path) -> Path:
         inside = given / RECORD_FILE
         if inside.is_file():
             return inside
+        if is_running(given):
+            raise ArgumentError(
+                f"{given} holds no {RECORD_FILE} yet: its run is under way; wait for its end"
+            )
         raise ArgumentError(
             f"{given} holds no {RECORD_FILE}: it is no run folder, or its run was not finished; "
             f"repeat the run with -o {given} to finish it"

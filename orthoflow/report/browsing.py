@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from orthoflow.engine.run_folder import JOURNAL
+from orthoflow.engine.run_folder import JOURNAL, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.regular_files import open_file
@@ -23,7 +23,7 @@ from orthoflow.report.metric_words import words_of
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.format import DATA
 
-RunState: TypeAlias = Literal["ok", "failed", "unfinished", "damaged"]
+RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 
 # Runs lie in runs/, sorted into folders at most; deeper lies something else.
 _DEEPEST: Final = 6
@@ -38,8 +38,8 @@ class RunSummary:
 
     Attributes:
         folder: of the run, as its finder named it.
-        state: `ok`; `failed`, some cell did; `unfinished`, there is no record yet; `damaged`, the
-            record cannot be read, or its seal does not hold.
+        state: `ok`; `failed`, some cell did; `running`, just now; `unfinished`, it was broken off;
+            `damaged`, the record cannot be read, or its seal does not hold.
         reason: what failed, first, or why it cannot be read; empty where all is well.
         workflow: name of the workflow.
         run_id: of the run.
@@ -221,10 +221,11 @@ def _unfinished(folder: Path) -> RunSummary:
         reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
     said = first if isinstance(first, dict) else {}
+    is_under_way = is_running(folder)
     return RunSummary(
         folder=folder,
-        state="unfinished",
-        reason=f"goes on with the same command and -o {folder}, if it does not run just now",
+        state="running" if is_under_way else "unfinished",
+        reason="" if is_under_way else f"goes on with the same command and -o {folder}",
         workflow=str(said.get("workflow", "")),
         run_id=str(said.get("run_id", "")),
         started=str(said.get("time", "")),

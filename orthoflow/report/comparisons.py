@@ -20,6 +20,12 @@ _NOTHING: Final = "-"
 # Distances to a plane are of the points that its tolerances let in.
 _CUT: Final = frozenset(("rms_mm", "fit_rms_mm"))
 _CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
+# Of detectors: whether they found what there is, before how well.
+_FOUND: Final = ("main_found", "true_planes_found", "label_iou")
+# Seconds of the clock beyond those of the processor, and how many times these, that a machine with
+# other work is known by.
+_BUSY_S: Final = 5.0
+_BUSY_TIMES: Final = 3.0
 _NAMED: Final = 3  # numbers that a combination is best in
 
 
@@ -58,6 +64,7 @@ class Row:
         values: one per column.
         time: seconds of the cells that the variants have a part in.
         memory: largest memory of these cells.
+        is_busy: the time hangs on what else the machine did, so that no times are ranked.
         remark: what was cached and what else to know, in words.
     """
 
@@ -69,6 +76,7 @@ class Row:
     values: tuple[Value, ...]
     time: Value
     memory: Value
+    is_busy: bool
     remark: str
 
     @property
@@ -228,6 +236,12 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         wanted = [
             key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
         ]
+        wanted += [
+            key
+            for name in _FOUND
+            for key in last
+            if key[1] == name and first[key].method.startswith("inspect.")
+        ]
         # What a plugin says to have a good side is worth a column, too.
         wanted += [key for key, row in first.items() if row.good]
     return tuple(_column(first[key], combinations) for key in wanted)
@@ -267,6 +281,9 @@ def _row(
     group = origins.letters(one.run, varied[0].environment if varied else "")
     has_cost = failed is None and not one.missing and bool(varied)
     time_s = sum(cell.wall_s for cell in varied)
+    cpu_s = sum(cell.cpu_s for cell in varied)
+    # Old records do not know the seconds of the processor.
+    is_busy = has_cost and cpu_s > 0.0 and max(cpu_s + _BUSY_S, _BUSY_TIMES * cpu_s) < time_s
     memory_mib = max((cell.peak_rss_mib for cell in varied), default=0.0)
     cost_group = "".join(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
@@ -284,7 +301,18 @@ def _row(
         memory=(
             Value(text=f"{memory_mib:.0f}", sort=memory_mib, group=group) if has_cost else Value()
         ),
-        remark=_remark(one),
+        is_busy=is_busy,
+        remark="; ".join(
+            part
+            for part in (
+                f"{cpu_s:.1f} s of processor in {time_s:.1f} s: the machine was busy, so that no "
+                "time is ranked"
+                if is_busy
+                else "",
+                _remark(one),
+            )
+            if part
+        ),
     )
 
 
@@ -333,7 +361,8 @@ def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
         rank([row.values[index] for row in rows], column.sense, column.metric)
         for index, column in enumerate(columns)
     ]
-    times = rank([row.time for row in rows], Sense.LESS, "wall_s")
+    is_busy = any(row.is_busy for row in rows)
+    times = rank([row.time for row in rows], Sense.NEITHER if is_busy else Sense.LESS, "wall_s")
     memories = rank([row.memory for row in rows], Sense.LESS, "peak_rss_mib")
     return tuple(
         replace(

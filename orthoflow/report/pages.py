@@ -7,6 +7,7 @@ import hashlib
 import os
 import re
 import secrets
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
 from orthoflow.records import COSTS, RecordedCell, Run, compare_runs, figure_files
 from orthoflow.records.datasets import pages_of, parts_of
+from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.runs import FIGURES_FOLDER
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
@@ -123,6 +125,7 @@ class _Section:
     diagram: Markup
     citations: Mapping[str, tuple[str, ...]]
     viewers: Mapping[str, str]
+    files: Mapping[str, Mapping[str, str]]
     title: str = ""
     whole: str = ""
     doubt: str = ""
@@ -412,6 +415,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
             for text, page in _VIEWERS.items()
             if (run.folder / page).is_file()
         },
+        files=_files(run, from_page),
         title=place.title if place.whole else run.record.name,
         whole=place.whole,
         doubt=place.doubts.get(run.path, ""),
@@ -431,6 +435,20 @@ def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Gro
         )
         for overlay in overlays(run, walls, share=share)
     )
+
+
+def _files(run: Run, from_page: Path) -> dict[str, dict[str, str]]:
+    """The files that cells published: address -> name -> where it lies from the page."""
+    published = {file.path for file in run.record.published}
+    found = {
+        address: {
+            path.name: (from_page / PRODUCTS_FOLDER / path.parent.name / path.name).as_posix()
+            for path in files
+            if path.name != METRICS_FILE and path.relative_to(run.folder).as_posix() in published
+        }
+        for address, files in run.files.items()
+    }
+    return defaultdict(dict, {address: files for address, files in found.items() if files})
 
 
 def _photo_names(run: Run) -> tuple[str, ...]:

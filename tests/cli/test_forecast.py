@@ -70,10 +70,16 @@ def test_a_run_takes_as_long_as_its_longest_cell_or_its_share_of_all() -> None:
 
 
 def test_a_run_of_which_part_is_not_known_takes_at_least_the_rest() -> None:
-    assert left_of_run([CellState(took_s=40.0), CellState()], 100.0) == "at least 40 s left"
+    said = "at least 40 s left, and a step that takes nobody knows how long"
+    assert left_of_run([CellState(took_s=40.0), CellState()], 100.0) == said
     # Of a few seconds of one cell a run of minutes would look short.
-    assert left_of_run([CellState(took_s=4.0), CellState(), CellState()], 100.0) == ""
-    assert left_of_run([CellState(), running()], 100.0) == ""
+    unknown = "time left not known yet"
+    assert left_of_run([CellState(took_s=4.0), CellState(), CellState()], 100.0) == unknown
+    assert left_of_run([CellState(), running()], 100.0) == unknown
+    # Nor do cells that are skipped or stored make it known.
+    idle = [CellState(took_s=0.0)] * 9
+    assert left_of_run([*idle, CellState(took_s=4.0), CellState(), CellState()], 0.0) == unknown
+    assert left_of_run(idle, 0.0) == ""
     assert left_of_run([CellState(state="ok")], 100.0) == ""
     assert left_of_run([], 100.0) == ""
 

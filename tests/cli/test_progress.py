@@ -97,7 +97,8 @@ def test_the_live_table_keeps_warnings_readable_and_shows_every_state(
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
         assert columns[4] == ["", "peeling", "", ""]
-        assert str(progress.drawn().renderables[1]) == "1 of 4 steps ended"
+        whole = "1 of 4 steps ended, time left not known yet"
+        assert str(progress.drawn().renderables[1]) == whole
     assert "plane: warning: the side is a [guess]" in capsys.readouterr().err
 
 
@@ -173,8 +174,9 @@ def test_a_run_takes_as_long_as_what_is_left_of_it() -> None:
     ended = CellState(state="ok", took_s=500.0)
     assert left_of_run([running, waiting, ended], 10.0) == "about 1 min 10 s left"
     assert left_of_run([running, waiting, ended], 10.0, jobs=2) == "about 50 s left"
-    assert left_of_run([running, waiting, unknown], 10.0) == "at least 1 min 10 s left"
-    assert left_of_run([unknown, ended], 10.0) == ""
+    said = "at least 1 min 10 s left, and a step that takes nobody knows how long"
+    assert left_of_run([running, waiting, unknown], 10.0) == said
+    assert left_of_run([unknown, ended], 10.0) == "time left not known yet"
 
 
 def test_a_forecast_is_no_more_exact_than_it_can_be() -> None:

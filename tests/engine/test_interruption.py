@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine import RunOutcome, collect_garbage, execute
-from orthoflow.errors import CancelledStepError, StoreError
+from orthoflow.engine.run_folder import is_running
+from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
+from orthoflow.records.runs import find_record
 from tests.engine_world import World, digests, start_coordinator, toy_world
 from tests.long_loops import IS_LONG
 
@@ -156,8 +158,12 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
         wait_for(world, "run", "started", "second")
         with pytest.raises(StoreError, match="is in use by another run; wait for its end"):
             world.run(STEPS)
+        assert is_running(world.folder / "run")
+        with pytest.raises(ArgumentError, match=r"holds no run\.h5 yet: its run is under"):
+            find_record(world.folder / "run")
         with pytest.raises(StoreError, match="is in use by a run"):
             collect_garbage(world.store)
     finally:
         process.kill()
         process.communicate()
+    assert not is_running(world.folder / "run")

@@ -148,7 +148,7 @@ def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path
     assert told == RunSummary(
         folder=folder,
         state="unfinished",
-        reason=f"goes on with the same command and -o {folder}, if it does not run just now",
+        reason=f"goes on with the same command and -o {folder}",
         workflow="hall",
         run_id="x",
         started="2026-01-02T11:00:00Z",

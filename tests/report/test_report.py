@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_provenance.model import PublishedFile
 
 from orthoflow.errors import StoreError
 from orthoflow.records import NOT_YET, Run
@@ -173,6 +174,52 @@ def test_the_answers_tell_the_final_orientation_and_the_sharper_completeness() -
     assert [(answer.value, answer.cell) for answer in answers(photographed)] == [
         ("99.0 %", "check"),
         ("5 of 6", "orient"),
+    ]
+
+
+def test_check_points_of_the_own_orthoimage_are_told_before_those_of_others() -> None:
+    made = given("mosaic.orthoimages", "1", "orthoimages")
+    read = given("theirs.orthoimages", "2", "orthoimages")
+    own = cell("points", inputs={"orthoimages": made}, metrics=metrics(rms_mm=5.9))
+    theirs = cell("points_theirs", inputs={"orthoimages": read}, metrics=metrics(rms_mm=5.8))
+    makers = (cell("mosaic"), cell("theirs", method="read.orthoimage"))
+    points = [replace(one, method="inspect.checkpoints") for one in (own, theirs)]
+    for order in (points, points[::-1]):
+        (answer,) = answers(run(*makers, *order))
+        assert (answer.what, answer.cell) == ("check points, RMS", "points")
+    (answer,) = answers(run(*makers, points[1]))
+    assert answer.cell == "points_theirs"
+
+
+def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
+    folder = tmp_path / "products" / "shade"
+    folder.mkdir(parents=True)
+    for name in ("shades 1.json", "metrics.csv", "stray.txt"):
+        (folder / name).write_text("{}")
+    published = tuple(
+        PublishedFile(path=f"products/shade/{name}", size_bytes=2, sha256="0" * 64)
+        for name in ("shades 1.json", "metrics.csv", "gone.json")
+    )
+    made = record([cell("shade"), cell("plain")], published=published)
+    write_page(HeldRun(path=tmp_path / "run.h5", record=made), tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert re.findall(r'href="(products/[^"]*)"', page) == ["products/shade/shades%201.json"]
+    assert "0 metrics, 1 file</span>" in page
+
+
+def test_a_busy_machine_ranks_no_times() -> None:
+    def row(name: str, wall_s: float, cpu_s: float) -> object:
+        return cell(f"plane@plane={name}", wall_s=wall_s, cpu_s=cpu_s)
+
+    calm = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", 9.0, 6.0))])
+    busy = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", 22.0, 1.6))])
+    assert calm is not None
+    assert busy is not None
+    assert [one.time.mark for one in calm.rows] == [Mark.BEST, Mark.WORST]
+    assert [one.time.mark for one in busy.rows] == [Mark.NONE, Mark.NONE]
+    assert [one.remark for one in busy.rows] == [
+        "",
+        "1.6 s of processor in 22.0 s: the machine was busy, so that no time is ranked",
     ]
 
 
