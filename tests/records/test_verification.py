@@ -1,0 +1,176 @@
+"""What is said of files beside a record, of its signature, and of what differs."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from orthoflow.errors import RecordError
+from orthoflow.records import verification as module
+from orthoflow.records.verification import Verification, published_state, require_unchanged
+
+CONTENT = b"a picture"
+
+
+def published(path: str, content: bytes = CONTENT) -> Any:
+    return SimpleNamespace(
+        path=path, size_bytes=len(content), sha256=hashlib.sha256(content).hexdigest()
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Files that are as they were, changed in bytes or in length, gone, or something else."""
+    products = tmp_path / "products"
+    products.mkdir()
+    for name, content in (
+        ("same", CONTENT), ("other", b"A picture"), ("longer", CONTENT + b"s"), ("shorter", b"a"),
+    ):  # fmt: skip
+        (products / name).write_bytes(content)
+    (products / "link").symlink_to(products / "same")
+    (products / "folder").mkdir()
+    os.mkfifo(products / "pipe")
+    return tmp_path
+
+
+STATES = {
+    "same": "same",
+    "other": "changed",
+    "longer": "changed",
+    "shorter": "changed",
+    "gone": "missing",
+    "same/below": "missing",
+    "link": "no file",
+    "folder": "no file",
+    "pipe": "no file",
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_published_file_is_as_it_was_or_it_is_said_how_not(folder: Path, name: str) -> None:
+    assert published_state(folder, published(f"products/{name}")) == STATES[name]
+
+
+def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(*_: object) -> None:
+        raise PermissionError(13, "denied")
+
+    monkeypatch.setattr(module, "open_below", refuses)
+    assert published_state(folder, published("products/same")) == "unreadable"
+
+
+def checked(folder: Path, *names: str) -> Any:
+    record: Any = SimpleNamespace(published=[published(f"products/{name}") for name in names])
+    return module._check_published(folder, record)
+
+
+def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
+    found = checked(folder, "same", "other", "link", "gone", "same/below")
+    assert found.n_same == 1
+    assert found.changed == (
+        "products/other: changed since it was published",
+        "products/link: a link, a folder or a device stands where a file was published; "
+        "it was not read",
+    )
+    assert found.notes == (
+        "2 of 5 published files are not in products/ any more: products/gone, products/same/below",
+    )
+    assert checked(folder, "same") == module._PublishedCheck(n_same=1)
+    # A record that travels alone.
+    (note,) = checked(folder, "gone").notes
+    assert note == (
+        "the 1 published files of the record are not beside it, so they were not checked"
+    )
+    assert checked(folder) == module._PublishedCheck()
+
+
+def test_what_shows_a_record_is_not_covered(folder: Path) -> None:
+    for name in module._VIEWS[:2]:
+        (folder / name).symlink_to("nowhere")
+    (note,) = checked(folder, "same").notes
+    assert note.startswith(f"not covered: {module._VIEWS[0]}, {module._VIEWS[1]}, which show")
+    assert f"`orthoflow report {folder}`" in note
+
+
+def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
+    run: Any = SimpleNamespace(
+        folder=folder,
+        record=SimpleNamespace(
+            published=[published(f"products/{name}") for name in ("same", "other", "link", "gone")]
+        ),
+    )
+    products = folder / "products"
+    require_unchanged(run, products / "same")
+    require_unchanged(run)
+    for name, sentence in (
+        ("folder", "is not named in the record of the run, so nothing vouches for it"),
+        ("other", "other was changed after the run: the record says that it has the digest"),
+        ("link", "link cannot be read: no file"),
+        ("gone", "gone cannot be read: missing"),
+    ):
+        with pytest.raises(RecordError, match=sentence):
+            require_unchanged(run, products / "same", products / name)
+
+
+@pytest.mark.parametrize(
+    ("signed", "changed", "said"),
+    [
+        ((), (), ""),
+        (("x",), (), "r is as it was written, but its signature is not the one asked for"),
+        (
+            (),
+            ("y",),
+            "r is as it was written, but published files beside it are not as they were written",
+        ),
+        (
+            ("x",),
+            ("y",),
+            "r is as it was written, but its signature is not the one asked for and published "
+            "files beside it are not as they were written",
+        ),
+    ],
+)
+def test_what_is_wrong_beside_a_whole_record_is_named(
+    signed: tuple[str, ...], changed: tuple[str, ...], said: str
+) -> None:
+    signature = Verification(path=Path("r"), findings=signed)
+    check = module._PublishedCheck(changed=changed)
+    assert module._wrong_beside(Path("r"), signature, check) == said
+
+
+def refusing(*_: object) -> None:
+    raise RecordError("the signature is of another record")
+
+
+@pytest.mark.parametrize("is_asked", [True, False])
+def test_a_signature_counts_where_it_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, is_asked: bool
+) -> None:
+    signer = Path("key.pub") if is_asked else None
+    key: Any = SimpleNamespace(fingerprint="SHA256:abc")
+    monkeypatch.setattr(module, "check_signature", lambda *_: key)
+    monkeypatch.setattr(module, "read_signature", lambda *_: key)
+    found = module._check_signature(Path("r"), signer)
+    assert found.findings == ()
+    assert found.signed_with == ("SHA256:abc" if is_asked else "")
+    assert len(found.notes) == (0 if is_asked else 1)
+    assert all("said to be of the key SHA256:abc, that was not checked" in x for x in found.notes)
+    monkeypatch.setattr(module, "check_signature", refusing)
+    monkeypatch.setattr(module, "read_signature", refusing)
+    found = module._check_signature(Path("r"), signer)
+    said = ("the signature is of another record",)
+    assert (found.findings, found.notes) == ((said, ()) if is_asked else ((), said))
+    assert found.signed_with == ""
+
+
+def test_a_record_without_a_signature_has_nothing_said_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "read_signature", lambda *_: None)
+    found = module._check_signature(Path("r"), None)
+    assert (found.findings, found.notes, found.signed_with) == ((), (), "")
