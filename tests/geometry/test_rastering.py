@@ -14,7 +14,12 @@ from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import topmost_points, values_of_winners, wall_from_offset
+from orthoflow.geometry.rastering import (
+    places_of_winners,
+    topmost_points,
+    values_of_winners,
+    wall_from_offset,
+)
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
@@ -236,3 +241,26 @@ def test_inputs_may_be_read_only_and_mapped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         topmost_points(points, slab, threads=1)["point"], sorted_winners(cloud, slab)
     )
+
+
+def test_places_are_told_of_points_up_to_two_cells_beside_a_gap() -> None:
+    wall = scenes.upright_wall(shape=(20, 30))
+    rows, columns = np.indices(wall.shape)
+    rng = np.random.default_rng(2)
+    offsets = rng.uniform(-0.4, 0.4, (*wall.shape, 2))
+    is_gap = np.zeros(wall.shape, dtype=np.bool_)
+    is_gap[4, 5] = is_gap[12:14, 20:25] = is_gap[19, 0] = True
+    u, v = columns + 0.5 + offsets[..., 0], rows + 0.5 + offsets[..., 1]
+    kept = ~is_gap
+    cloud = scenes.cloud_of(wall.world(u[kept], v[kept], np.zeros(kept.sum())))
+    winners = topmost_points(cloud, slab_of(wall), threads=1)
+    for threads in (1, 3):
+        places = places_of_winners(cloud, slab_of(wall), winners, threads=threads)
+        places = places.reshape(*wall.shape, 2)
+        assert np.isnan(places[is_gap]).all()
+        is_near = np.zeros(wall.shape, dtype=np.bool_)
+        for row, column in np.argwhere(is_gap):
+            is_near[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3] = True
+        told = is_near & ~is_gap
+        np.testing.assert_allclose(places[told], offsets[told], atol=2e-3)
+        assert (places[~is_near] == 0.0).all()

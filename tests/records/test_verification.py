@@ -74,8 +74,10 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
     assert found.n_same == 1
     assert found.changed == (
         "products/other: changed since it was published",
-        "products/link: a link, a folder or a device stands where a file was published; "
-        "it was not read",
+        (
+            "products/link: a link, a folder or a device stands where a file was published; "
+            "it was not read"
+        ),
     )
     assert found.notes == (
         "2 of 5 published files are not in products/ any more: products/gone, products/same/below",
@@ -130,8 +132,10 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
         (
             ("x",),
             ("y",),
-            "r is as it was written, but its signature is not the one asked for and published "
-            "files beside it are not as they were written",
+            (
+                "r is as it was written, but its signature is not the one asked for and published "
+                "files beside it are not as they were written"
+            ),
         ),
     ],
 )
