@@ -47,7 +47,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.records import Run, open_run
+from orthoflow.records.runs import Run, open_run
 from orthoflow.sdk import StepContext
 
 STRETCH = 24

@@ -26,8 +26,12 @@ os.environ["ORTHOFLOW_KERNELS"] = kernels
 from numba.core import event  # noqa: E402 - it reads the variable
 
 from orthoflow.catalog import discover_catalog  # noqa: E402
-from orthoflow.engine import RunOptions, Store, execute, plan_run  # noqa: E402
-from orthoflow.workflow import expand_cells, load_workflow, shipped_workflow  # noqa: E402
+from orthoflow.engine.plan import RunOptions, plan_run  # noqa: E402
+from orthoflow.engine.scheduling import execute  # noqa: E402
+from orthoflow.engine.store import Store  # noqa: E402
+from orthoflow.workflow.cells import expand_cells  # noqa: E402
+from orthoflow.workflow.document import load_workflow  # noqa: E402
+from orthoflow.workflow.recipes import shipped_workflow  # noqa: E402
 
 
 @dataclass

@@ -25,12 +25,17 @@ from typing import Any
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.cli.warm import _RECIPES, _new_cells
-from orthoflow.engine import RunOptions, Store, execute, executors, plan_run
+from orthoflow.engine import executors
 from orthoflow.engine.compiling_ahead import FORETOLD
+from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.running import run_task
+from orthoflow.engine.scheduling import execute
+from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task
-from orthoflow.workflow import expand_cells, load_workflow, shipped_workflow
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.recipes import shipped_workflow
 
 Kernel = tuple[str, str, str]
 found: dict[str, dict[Kernel, None]] = {}

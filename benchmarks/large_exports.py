@@ -22,8 +22,8 @@ from orthoflow_provenance.writer import write_record
 
 from benchmarks.tiled_orthoimage import GSD_M, large_orthoimage, largest_mib
 from orthoflow.cli.program import program
-from orthoflow.engine import Store
 from orthoflow.engine.file_digests import file_sha256
+from orthoflow.engine.store import Store
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Layer, LayerMask, Layers
 from tests.report_runs import cell, record

@@ -18,11 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run, store
+from orthoflow.engine import store
 from orthoflow.engine.durability import folder_size
-from orthoflow.records import Run, executed_and_written, write_run, writing
+from orthoflow.engine.plan import RunOptions, plan_run
+from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.store import Store
+from orthoflow.records import writing
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import executed_and_written, write_run
 from orthoflow.report import write_page
-from orthoflow.workflow import Workflow, expand_cells, load_workflow
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import Workflow
 
 CHECKING = ((Store, "damage"), (Store, "take"), (Store, "blob"), (store, "describe_product"))
 SYNCING = ((writing, "sync_tree"),)

@@ -17,11 +17,14 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import Catalog, discover_catalog
-from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, plan_run
 from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.engine.events import RunEvent
+from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
+from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.store import Store
 from orthoflow.errors import OrthoflowError
-from orthoflow.workflow import expand_cells, load_workflow
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
 from tests.engine_mischief import MISCHIEF, NAMES
 from tests.engine_toys import HOOKS, MAKES, PRODUCTS, WORKS
 

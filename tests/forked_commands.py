@@ -103,8 +103,12 @@ def _close(server: subprocess.Popen[str]) -> None:
 
 def _serve() -> None:
     import orthoflow.cli
-    import orthoflow.records
-    import orthoflow.workflow
+    import orthoflow.records.comparison
+    import orthoflow.records.distances
+    import orthoflow.records.verification
+    import orthoflow.records.writing
+    import orthoflow.workflow.document
+    import orthoflow.workflow.schema
     from orthoflow.report.pages import environment
 
     for name in environment().list_templates(["j2"]):

@@ -13,7 +13,9 @@ import pytest
 
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
-from orthoflow.workflow import InvalidWorkflowError, Workflow, load_workflow
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.problems import InvalidWorkflowError
 
 LABORATORY = Path(__file__).parent / "laboratory"
 GOOD = """\

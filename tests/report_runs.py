@@ -29,8 +29,9 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.products.product import Payload, Product
-from orthoflow.records import ComparedMetric, ProductDistance, Run
-from orthoflow.records.distances import Distance
+from orthoflow.records.comparison import ComparedMetric
+from orthoflow.records.distances import Distance, ProductDistance
+from orthoflow.records.runs import Run
 from tests import samples
 
 FRAME = samples.facing_south(0.01, 120, 80, (4.0e5, 5.0e6, 3.0))

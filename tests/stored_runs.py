@@ -12,7 +12,8 @@ from functools import cached_property
 from pathlib import Path
 
 from orthoflow.engine.compiled_code import VARIABLE
-from orthoflow.records import open_run, verify_run
+from orthoflow.records.runs import open_run
+from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys
 from tests.killed_runs import Answer, RunServer, run_server
 

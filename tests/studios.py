@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from orthoflow.cli.program import program
-from orthoflow.records import Run, open_run
+from orthoflow.records.runs import Run, open_run
 from tests.workshop_runs import KERNELS, WORKSHOP, write_studio
 
 

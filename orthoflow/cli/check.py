@@ -14,7 +14,7 @@ from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow import Workflow
+    from orthoflow.workflow.format import Workflow
 
 
 @click.command(cls=Command)
@@ -52,7 +52,9 @@ class _Verdict:
 
 def _check(workflow: str, changes: Changes) -> _Verdict:
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import doubts_about, expand_cells, resolve_input_files
+    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.doubts import doubts_about
+    from orthoflow.workflow.inputs import resolve_input_files
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)
@@ -71,7 +73,7 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
 
 def _baseline_text(workflow: Workflow) -> str:
     """Which variants the others are compared with: of a sweep, nobody named it."""
-    from orthoflow.workflow import variants_text
+    from orthoflow.workflow.cells import variants_text
 
     named = variants_text(workflow.baseline)
     return f"; baseline {named}" if named else ""

@@ -17,13 +17,9 @@ from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_table, number
 
 if TYPE_CHECKING:
-    from orthoflow.records import (
-        ComparedMetric,
-        Pair,
-        ParameterValue,
-        RecordedFile,
-        RunComparison,
-    )
+    from orthoflow_provenance.model import RecordedFile
+
+    from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
@@ -43,8 +39,9 @@ def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
     has one method with the same parameters; what only one run has is counted apart. --json has
     also what is equal. Ends with 3 where the seal of a record does not hold.
     """
-    from orthoflow.engine import Store
-    from orthoflow.records import compare_runs, open_run
+    from orthoflow.engine.store import Store
+    from orthoflow.records.comparison import compare_runs
+    from orthoflow.records.runs import open_run
     from orthoflow.records.verification import broken_seal
 
     stores = (Store(store),) if store.is_dir() else ()

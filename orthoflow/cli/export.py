@@ -17,7 +17,7 @@ from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
 
 # In the run's folder, with a folder per format.
 _EXPORT_FOLDER: Final = "export"
@@ -161,7 +161,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     """Write the results of a run for other programs; 3 where the record's seal does not hold."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
-    from orthoflow.records import open_run
+    from orthoflow.records.runs import open_run
     from orthoflow.records.verification import broken_seal
 
     chosen = Choices(**choices)
@@ -205,10 +205,10 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
-    from orthoflow.engine import Store
-    from orthoflow.records import REPORT_FILE
+    from orthoflow.engine.store import Store
     from orthoflow.records.datasets import parts_of, write_part
     from orthoflow.records.run_files import path_inside
+    from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report import write_page
 
     parts = parts_of(run)

@@ -114,7 +114,7 @@ def _written(datasets: Mapping[str, Any], table: Path) -> Path:
 
 
 def _refuse_unknown(options: Mapping[str, object]) -> None:
-    from orthoflow.engine import RunOptions
+    from orthoflow.engine.plan import RunOptions
 
     known = [*(field.name for field in fields(RunOptions)), *(signature(run).parameters), *_POPPED]
     known.remove("options")

@@ -12,7 +12,7 @@ import click
 
 if TYPE_CHECKING:
     from orthoflow.catalog import Catalog
-    from orthoflow.workflow import Workflow
+    from orthoflow.workflow.format import Workflow
 
 # Any: click decorates functions as well as commands.
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
@@ -32,7 +32,7 @@ class Changes:
 
     def load(self, workflow: str, catalog: Catalog) -> Workflow:
         """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
-        from orthoflow.workflow import load_workflow
+        from orthoflow.workflow.document import load_workflow
 
         return load_workflow(workflow, catalog, **vars(self))
 

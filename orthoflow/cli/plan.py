@@ -20,7 +20,7 @@ from orthoflow.cli.options import (
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 
 if TYPE_CHECKING:
-    from orthoflow.engine import PlannedCell
+    from orthoflow.engine.plan import PlannedCell
 
 
 @click.command(cls=Command)
@@ -42,8 +42,9 @@ def plan(
     Nothing is computed. "unknown yet" means that it depends on results that are not there yet.
     """
     from orthoflow.catalog import discover_catalog
-    from orthoflow.engine import RunOptions, Store, plan_run
-    from orthoflow.workflow import expand_cells
+    from orthoflow.engine.plan import RunOptions, plan_run
+    from orthoflow.engine.store import Store
+    from orthoflow.workflow.cells import expand_cells
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-    from orthoflow.engine import PlannedCell
+    from orthoflow.engine.plan import PlannedCell
 
 _REFRESH_PER_S: Final = 4
 # A log file gets a line at least so often.

@@ -25,9 +25,11 @@ from orthoflow.cli.tables import echo, echo_distances, echo_json
 from orthoflow.errors import CancelledStepError, ClusterError
 
 if TYPE_CHECKING:
-    from orthoflow.engine import RunOutcome, Store
-    from orthoflow.records import ProductDistance, Run
+    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.store import Store
+    from orthoflow.records.distances import ProductDistance
     from orthoflow.records.replaying import Replay
+    from orthoflow.records.runs import Run
 
 
 @click.command(cls=RecordCommand)
@@ -61,11 +63,12 @@ def replay(
     when one differs.
     """
     from orthoflow.catalog import discover_catalog
-    from orthoflow.engine import RunOptions, Store
+    from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.run_folder import new_run_folder, new_run_id
-    from orthoflow.records import open_run
+    from orthoflow.engine.store import Store
     from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
+    from orthoflow.records.runs import open_run
 
     options = RunOptions(**choices)
     original = open_run(run)
@@ -152,8 +155,9 @@ class _Call:
 
     def _make(self) -> Run:
         from orthoflow.cli.progress import make_progress
-        from orthoflow.engine import execute
-        from orthoflow.records import REPORT_FILE, executed_and_written, write_run
+        from orthoflow.engine.scheduling import execute
+        from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.records.writing import executed_and_written, write_run
         from orthoflow.report import write_report
 
         plan = self.replay.plan
@@ -177,8 +181,8 @@ class _Call:
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog import discover_catalog
-        from orthoflow.engine import Store
-        from orthoflow.records import RunProducts, product_distances
+        from orthoflow.engine.store import Store
+        from orthoflow.records.distances import RunProducts, product_distances
 
         earlier = (Store(DEFAULT_STORE),) if DEFAULT_STORE.is_dir() else ()
         return product_distances(

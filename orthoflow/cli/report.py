@@ -28,7 +28,7 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
     SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
     Where a record's seal does not hold, the page says so, and this ends with 3.
     """
-    from orthoflow.records import REPORT_FILE, open_run
+    from orthoflow.records.runs import REPORT_FILE, open_run
     from orthoflow.records.verification import broken_seal
     from orthoflow.report import write_page, write_report
 

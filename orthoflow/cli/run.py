@@ -31,9 +31,14 @@ from orthoflow.cli.tables import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow.engine import RunOutcome, RunPlan, Store
-    from orthoflow.records import RecordedCell, Run, WrittenRun
-    from orthoflow.workflow import Workflow
+    from orthoflow_provenance.model import RecordedCell
+
+    from orthoflow.engine.plan import RunPlan
+    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.store import Store
+    from orthoflow.records.runs import Run
+    from orthoflow.records.writing import WrittenRun
+    from orthoflow.workflow.format import Workflow
 
 
 @click.command(cls=Command)
@@ -89,8 +94,9 @@ def prepared(
         # What takes a second to load is loaded in here.
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog import discover_catalog
-        from orthoflow.engine import RunOptions, Store, plan_run
-        from orthoflow.workflow import expand_cells
+        from orthoflow.engine.plan import RunOptions, plan_run
+        from orthoflow.engine.store import Store
+        from orthoflow.workflow.cells import expand_cells
 
         options = RunOptions(**choices)
         catalog = discover_catalog()
@@ -117,8 +123,8 @@ class Call:
         """Execute, record, report and say what came out."""
         from orthoflow.engine.run_folder import LOGS
         from orthoflow.errors import DiskSpaceError
-        from orthoflow.records import REPORT_FILE
-        from orthoflow.workflow import doubts_about
+        from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.workflow.doubts import doubts_about
 
         made = self.make()
         folder = made.run.folder
@@ -138,7 +144,8 @@ class Call:
         from orthoflow.cli.progress import working_on
         from orthoflow.engine.run_folder import new_run_folder, new_run_id
         from orthoflow.errors import DamageError, StoreError
-        from orthoflow.records import REPORT_FILE, executed_and_written, write_run
+        from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.records.writing import executed_and_written, write_run
         from orthoflow.report import write_page
 
         run_id = new_run_id()
@@ -170,7 +177,7 @@ class Call:
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
-        from orthoflow.engine import execute
+        from orthoflow.engine.scheduling import execute
 
         with make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress:
             return execute(
@@ -184,7 +191,8 @@ class Call:
 
     def _show_unfinished(self, folder: Path, outcome: RunOutcome) -> None:
         """Write the report of a run that was broken off: what is there, and how to go on."""
-        from orthoflow.records import REPORT_FILE, show_unfinished
+        from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.records.writing import show_unfinished
         from orthoflow.report import write_page
 
         report = folder / REPORT_FILE
@@ -228,7 +236,7 @@ def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> Non
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))
     from orthoflow.report.combinations import baseline_of
-    from orthoflow.workflow import variants_text
+    from orthoflow.workflow.cells import variants_text
 
     if baseline := variants_text(baseline_of(run)):
         echo(f"baseline: {baseline}, with which the others are compared")

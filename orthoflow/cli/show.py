@@ -25,7 +25,9 @@ from orthoflow.cli.tables import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow.records import RecordedCell, Run
+    from orthoflow_provenance.model import RecordedCell
+
+    from orthoflow.records.runs import Run
 
 _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
@@ -39,7 +41,8 @@ def show(run: Path, *, as_json: bool) -> int:
     Of a folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the
     seal of the record does not hold.
     """
-    from orthoflow.records import RECORD_FILE, open_run
+    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.records.runs import open_run
     from orthoflow.records.verification import broken_seal
 
     if run.is_dir() and not (run / RECORD_FILE).exists():

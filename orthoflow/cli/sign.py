@@ -29,8 +29,8 @@ def sign(run: Path, key: Path) -> int:
     The signature lies beside the record as run.h5.sig and changes nothing in it. Only a record that
     verifies is signed. `orthoflow verify RUN --signer FILE` checks it with your public key.
     """
-    from orthoflow.records import verify_run
     from orthoflow.records.signatures import SIGNATURE_SUFFIX, sign_record
+    from orthoflow.records.verification import verify_run
 
     verification = verify_run(run)
     if verification.findings:

@@ -14,7 +14,9 @@ import click
 from orthoflow.foreign_text import shown, shown_json
 
 if TYPE_CHECKING:
-    from orthoflow.records import Distance, ProductDistance, RecordedCell
+    from orthoflow_provenance.model import RecordedCell
+
+    from orthoflow.records.distances import Distance, ProductDistance
 
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
 # How people say the units of tolerances; `1` stands for plain numbers.

@@ -13,7 +13,7 @@ from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, echo, echo_json
 
 if TYPE_CHECKING:
-    from orthoflow.records import Verification
+    from orthoflow.records.verification import Verification
 
 
 @click.command(cls=Command)
@@ -34,7 +34,7 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     report` makes them anew from the record. With --signer the record must be signed with that key.
     Ends with 3 when something differs.
     """
-    from orthoflow.records import verify_run
+    from orthoflow.records.verification import verify_run
 
     verification = verify_run(run, signer=signer)
     findings = verification.findings

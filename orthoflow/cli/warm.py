@@ -18,7 +18,9 @@ from orthoflow.cli.tables import counted, duration, echo, echo_json, size
 
 if TYPE_CHECKING:
     from orthoflow.catalog import Catalog
-    from orthoflow.engine import CellResult, RunPlan, Store
+    from orthoflow.engine.plan import RunPlan
+    from orthoflow.engine.results import CellResult
+    from orthoflow.engine.store import Store
     from orthoflow.workflow.cells import Cell
 
 # Shipped recipes that between them run our methods on simulated rooms, and what makes these small.
@@ -138,7 +140,8 @@ def _made(folder: Path) -> Path:
 
 
 def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
-    from orthoflow.workflow import expand_cells, load_workflow
+    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.document import load_workflow
 
     loaded = load_workflow(workflow, catalog)
     calls = {_Call.of(cell) for cell in expand_cells(loaded, catalog)}
@@ -151,8 +154,10 @@ def _results(
     catalog: Catalog, wanted: Collection[_Call] | None, folder: Path
 ) -> dict[str, CellResult]:
     """Run the recipes in a store that goes away; give one result per method, a good one first."""
-    from orthoflow.engine import RunOptions, Store, plan_run
-    from orthoflow.workflow import expand_cells, load_workflow
+    from orthoflow.engine.plan import RunOptions, plan_run
+    from orthoflow.engine.store import Store
+    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.document import load_workflow
 
     found: dict[str, CellResult] = {}
     methods = None if wanted is None else {call.method for call in wanted}
@@ -174,7 +179,7 @@ def _results(
 
 
 def _recipes() -> dict[Path, tuple[str, ...]]:
-    from orthoflow.workflow import shipped_workflow
+    from orthoflow.workflow.recipes import shipped_workflow
 
     return {shipped_workflow(name): sets for name, sets in _RECIPES.items()}
 
@@ -203,7 +208,7 @@ def _new_cells(
 
 def _executed(plan: RunPlan, folder: Path, store: Store) -> list[tuple[str, CellResult]]:
     from orthoflow.cli.progress import make_progress
-    from orthoflow.engine import execute
+    from orthoflow.engine.scheduling import execute
 
     if not plan.cells:
         return []

@@ -29,7 +29,7 @@ from orthoflow.workflow.format import DATA
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthoflow.engine import Store
+    from orthoflow.engine.store import Store
 
 Side = TypeVar("Side")
 # Seconds and memory that methods measured themselves hang on the machine, too.

@@ -19,7 +19,7 @@ from orthoflow.records.runs import Run
 
 if TYPE_CHECKING:
     from orthoflow.catalog import Catalog
-    from orthoflow.engine import Store
+    from orthoflow.engine.store import Store
 
 Verdict = Literal["identical", "within tolerance", "different", "not measured"]
 

@@ -18,12 +18,13 @@ from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.records.runs import Run, record_errors
-from orthoflow.workflow import Workflow, WorkflowInputSpec, resolve_input_files
+from orthoflow.workflow.format import Workflow, WorkflowInputSpec
 from orthoflow.workflow.inputs import (
     InputOption,
     override_inputs,
     read_input_options,
     read_inputs,
+    resolve_input_files,
 )
 from orthoflow.workflow.problems import ProblemLog
 

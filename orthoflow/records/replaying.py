@@ -19,12 +19,14 @@ from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
-from orthoflow.workflow import Cell, CellOutput, StepVariant, Workflow, WorkflowInput
+from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
+from orthoflow.workflow.format import StepVariant, Workflow
 from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:
     from orthoflow.catalog import Catalog
-    from orthoflow.engine import RunOptions, Store
+    from orthoflow.engine.plan import RunOptions
+    from orthoflow.engine.store import Store
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 

@@ -38,14 +38,15 @@ from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
-from orthoflow.workflow import resolved_json
-from orthoflow.workflow.resolved import workflow_from_resolved
+from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 if TYPE_CHECKING:
-    from orthoflow.engine import RunOutcome, RunPlan, Store
+    from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import FigureRef
-    from orthoflow.workflow import Workflow
+    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.store import Store
     from orthoflow.workflow.cells import Cell
+    from orthoflow.workflow.format import Workflow
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
@@ -223,7 +224,7 @@ def executed_and_written(
     """Execute a run and write it; what the store turns out to have lost is computed again.
 
     Args:
-        execute: goes on with the run each time it is called, as `engine.execute` does.
+        execute: goes on with the run each time it is called, as `engine.scheduling.execute` does.
         write: calls `write_run`.
 
     Raises:

@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from orthoflow.engine.run_folder import JOURNAL, is_running
+from orthoflow.engine.run_folder import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.regular_files import open_file
 from orthoflow.products import JsonValue
-from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
 from orthoflow.records.datasets import parts_of
+from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import words_of

@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.files.json_texts import parse_json
-from orthoflow.records import NOT_YET, RecordedCell, Run, cell_metrics
+from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import NOT_YET
 from orthoflow.workflow.cells import variants_text
 
 

@@ -8,7 +8,10 @@ from fnmatch import fnmatchcase
 from string import ascii_uppercase
 from typing import Final
 
-from orthoflow.records import COSTS, MetricRow, RecordedEnvironment, Run, cell_metrics
+from orthoflow_provenance.model import COSTS, RecordedEnvironment
+
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread

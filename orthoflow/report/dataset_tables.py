@@ -8,7 +8,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Final
 
-from orthoflow.records import MetricRow, Run, cell_metrics
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells, is_missing
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number

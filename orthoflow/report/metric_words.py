@@ -11,7 +11,9 @@ from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow.records import COSTS, MetricRow
+from orthoflow_provenance.model import COSTS
+
+from orthoflow.records.metrics import MetricRow
 
 # What stands before a name, and what is said behind the words of the rest.
 _BEFORE: Final[tuple[tuple[re.Pattern[str], str], ...]] = (

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from orthoflow_provenance.model import RecordedFigure
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError
@@ -20,15 +21,11 @@ from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask
-from orthoflow.records import (
-    RecordedFigure,
-    Run,
-    RunComparison,
-    cell_metrics,
-    compare_runs,
-)
-from orthoflow.records import open_run as open_plain_run
+from orthoflow.records.comparison import RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
+from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.runs import Run
+from orthoflow.records.runs import open_run as open_plain_run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers

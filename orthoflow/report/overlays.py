@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Inspection, TieRole, Ties
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.report.pictures import Picture, embedded_products
 
 _MARKS_MOST: Final = 600  # in one drawing

@@ -20,14 +20,16 @@ from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup, escape
+from orthoflow_provenance.model import COSTS, RecordedCell
 
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
-from orthoflow.records import COSTS, RecordedCell, Run, compare_runs, figure_files
+from orthoflow.records.comparison import compare_runs
 from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
-from orthoflow.records.runs import FIGURES_FOLDER
+from orthoflow.records.run_files import figure_files
+from orthoflow.records.runs import FIGURES_FOLDER, Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
 from orthoflow.report.cursors import cursor_places

@@ -14,7 +14,7 @@ from orthoflow.alike import first_few
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Planes
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.legends import length_words, round_length_m
 from orthoflow.report.pictures import Picture, embedded_products

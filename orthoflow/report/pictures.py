@@ -17,7 +17,7 @@ from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.cursors import CoarseDepths, coarse_depths
 from orthoflow.report.legends import depth_bar, scale_bar

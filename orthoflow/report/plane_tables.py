@@ -10,7 +10,7 @@ import numpy as np
 
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes, Spread, Thickness
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.report.pictures import embedded_products
 
 

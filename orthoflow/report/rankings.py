@@ -9,7 +9,7 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow.records import MetricRow
+from orthoflow.records.metrics import MetricRow
 
 # Without repeats nobody knows how far values of the same method lie apart. What is nearer than this
 # share of the best is no difference then; times and memory scatter more, times from run to run by

@@ -8,7 +8,8 @@ from typing import Final
 
 from orthoflow.alike import alike
 from orthoflow.products import Orthoimages
-from orthoflow.records import MetricRow, Run, cell_metrics
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import Run
 from orthoflow.records.warnings import standing_warnings
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS, words_of

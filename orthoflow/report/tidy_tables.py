@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from orthoflow_provenance.model import RecordedCell
+
 from orthoflow.foreign_text import Value
-from orthoflow.records import RecordedCell, Run, cell_metrics
+from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.figures import baseline_addresses
 

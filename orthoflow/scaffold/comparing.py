@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from orthoflow.catalog import Catalog
 from orthoflow.sdk import port_specs
-from orthoflow.workflow import shipped_workflow
+from orthoflow.workflow.recipes import shipped_workflow
 
 # The first recipe that has a step of the kind is taken; coarse cells of one wall let it run in
 # seconds, and without a warning.

@@ -35,9 +35,12 @@ def make(name: str) -> Path:
     from orthoflow_provenance.writer import write_record
 
     from orthoflow.catalog import discover_catalog
-    from orthoflow.engine import RunOptions, Store, execute, plan_run
+    from orthoflow.engine.plan import RunOptions, plan_run
+    from orthoflow.engine.scheduling import execute
+    from orthoflow.engine.store import Store
     from orthoflow.records.writing import build_record
-    from orthoflow.workflow import expand_cells, load_workflow
+    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.document import load_workflow
 
     catalog = discover_catalog()
     recipe, sets, embed = RECORDS[name]

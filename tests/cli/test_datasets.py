@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records import open_run, verify_run
+from orthoflow.records.runs import open_run
+from orthoflow.records.verification import verify_run
 from tests.workshop_runs import orthoflow
 
 ROOMS = """\

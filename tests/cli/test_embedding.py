@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from orthoflow_provenance.verify import verify_record
 
-from orthoflow.records import open_run
+from orthoflow.records.runs import open_run
 from tests.studios import Studio, open_copy, open_finished_studio
 
 

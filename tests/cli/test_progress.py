@@ -12,17 +12,17 @@ from rich.console import Console
 
 from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.progress import LiveProgress, PlainProgress, visible_cells, working_on
-from orthoflow.engine import (
+from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
     CellProgress,
-    CellResult,
     CellStarted,
     CellWarned,
-    PlannedCell,
     RunEvent,
     RunStarted,
 )
+from orthoflow.engine.plan import PlannedCell
+from orthoflow.engine.results import CellResult
 from orthoflow.workflow.cells import Cell
 
 OK = CellResult(status="ok", started="2026-01-02T03:04:05.000Z", wall_s=1.25, compile_s=1.9)

@@ -15,7 +15,7 @@ from orthoflow_provenance.model import RecordedCell
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
-from orthoflow.engine import Store
+from orthoflow.engine.store import Store
 from tests.studios import Studio, open_copy, open_finished_studio, open_studio
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import pytest
 from click.testing import CliRunner
-from orthoflow_provenance.model import RunRecord
+from orthoflow_provenance.model import RecordedFile, RunRecord
 from pydantic import Field
 
 from orthoflow.cli import plugins as plugins_commands
@@ -22,13 +22,7 @@ from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.products import PointCloud
-from orthoflow.records import (
-    CellFacts,
-    Pair,
-    ParameterValue,
-    RecordedFile,
-    RunComparison,
-)
+from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
 from orthoflow.records.distances import Distance
 from orthoflow.sdk import MethodParams, Ports
 from orthoflow.sdk.units import unit_of

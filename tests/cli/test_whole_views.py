@@ -11,11 +11,12 @@ import h5py
 import pytest
 from orthoflow_provenance.reader import open_record
 
-from orthoflow import engine
 from orthoflow.cli.plan import _as_json, _summary
 from orthoflow.cli.verify import _summary as verified
-from orthoflow.engine import GarbageReport
-from orthoflow.records import Verification
+from orthoflow.engine import garbage
+from orthoflow.engine.garbage import GarbageReport
+from orthoflow.engine.store import Store
+from orthoflow.records.verification import Verification
 from tests.provenance_records import write_sample
 from tests.studios import said
 
@@ -129,11 +130,11 @@ def test_what_was_verified_is_counted(n_inputs: int, n_published: int, words: st
 def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: list[tuple[Any, ...]] = []
 
-    def collect(store: engine.Store, *, older_than_days: float | None, dry_run: bool) -> object:
+    def collect(store: Store, *, older_than_days: float | None, dry_run: bool) -> object:
         asked.append((store.folder, older_than_days, dry_run))
         return GarbageReport(n_results=1, n_objects=2, n_damaged=0, freed_bytes=1536)
 
-    monkeypatch.setattr(engine, "collect_garbage", collect)
+    monkeypatch.setattr(garbage, "collect_garbage", collect)
     store = ("--store", tmp_path)
     assert said("cache", "gc", *store) == "removed 1 result and 2 objects, 1.5 KiB\n"
     dry = said("cache", "gc", *store, "--dry-run", "--older-than", "2.5")

@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine import compiling_ahead, execute
+from orthoflow.engine import compiling_ahead
 from orthoflow.engine.compiled_code import DONE
 from orthoflow.engine.compiling_ahead import FORETOLD, AheadCompiler
 from orthoflow.engine.events import CellFinished, RunEvent
 from orthoflow.engine.keys import MethodFacts, method_facts
+from orthoflow.engine.scheduling import execute
 from orthoflow.geometry.kernel_types import type_of
 from tests.engine_world import World, toy_world
 from tests.workshop_runs import WORKSHOP

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster
 
-from orthoflow.engine import RunOutcome, RunPlan, dask_executor, execute, local_executor, memory
+from orthoflow.engine import dask_executor, local_executor, memory
 from orthoflow.engine.dask_executor import CORES, DaskExecutor
 from orthoflow.engine.dask_worker import look_around
 from orthoflow.engine.events import (
@@ -26,6 +26,8 @@ from orthoflow.engine.events import (
 from orthoflow.engine.executors import Capacity
 from orthoflow.engine.memory import AvailableMemory
 from orthoflow.engine.method_versions import methods_text, misfit
+from orthoflow.engine.plan import RunPlan
+from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
 from tests.engine_world import World, digests, has_ended, toy_world
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import Store
-from orthoflow.records import open_run, verify_run
+from orthoflow.engine.store import Store
+from orthoflow.records.runs import open_run
+from orthoflow.records.verification import verify_run
 from tests.killed_runs import Answer, RunServer, run_server
 from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio

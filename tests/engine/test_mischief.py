@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import RunOutcome
 from orthoflow.engine.results import CellResult
+from orthoflow.engine.scheduling import RunOutcome
 from tests.engine_world import World, has_ended
 
 WHO = "method work.{} of toy-plugin 1.0"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import collect_garbage
 from orthoflow.engine.failures import Failures
+from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest
 from orthoflow.engine.plan import explain
 from orthoflow.engine.results import ProductRef, RecordedFile

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import RunOutcome, execute
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
 from orthoflow.engine.executors import compiled_code_in
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.errors import ArgumentError, InputError, StoreError
 from tests.engine_world import World, digests
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import RunOutcome, collect_garbage, execute
 from orthoflow.engine.events import CellFinished, CellProgress, CellStarted, RunEvent
+from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.results import CellResult
+from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.splitting import _parts, parts_folder
 from orthoflow.errors import CancelledStepError
 from tests.engine_world import World, toy_world

@@ -18,15 +18,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.engine import CellResult, ProductRef, Store, collect_garbage, list_results
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.results import (
+    CellResult,
     FigureRef,
     Metric,
+    ProductRef,
     result_from_json,
     result_to_json,
 )
-from orthoflow.engine.store import Publisher, digest_of
+from orthoflow.engine.store import Publisher, Store, digest_of
+from orthoflow.engine.stored_results import list_results
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
 from tests.report_runs import environment

@@ -18,7 +18,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.compiled_code import VARIABLE as KERNELS
-from orthoflow.records import open_run, verify_run
+from orthoflow.records.runs import open_run
+from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command
 from tests.killed_runs import ROOT, run_here

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import Store
-from orthoflow.records import compare_runs, open_run
+from orthoflow.engine.store import Store
+from orthoflow.records.comparison import compare_runs
+from orthoflow.records.runs import open_run
 from tests.studios import Studio, open_studio
 
 

@@ -13,7 +13,7 @@ import h5py
 import pytest
 from orthoflow_provenance.encoding import write_table, write_texts
 
-from orthoflow.records import verify_run
+from orthoflow.records.verification import verify_run
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 
@@ -362,7 +362,7 @@ def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
     with h5py.File(folder / "run" / "run.h5", "r+") as file:
         hostile.set_text(file["cells/paint"], "key_preimage", "{")
     # Nothing there reads the preimage, so let something fail in its place.
-    monkeypatch.setattr("orthoflow.records.open_run", lambda _: {}["missing"])
+    monkeypatch.setattr("orthoflow.records.runs.open_run", lambda _: {}["missing"])
     runs = (finished.folder / "first", folder / "run") if command[0] == "compare" else ("run",)
     done = finished(command[0], *runs)
     assert done.exit_code == 3, done.output

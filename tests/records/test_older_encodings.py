@@ -6,10 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from orthoflow.engine import RunOptions, Store, execute, plan_run
-from orthoflow.records import ProductDistance, Run, RunProducts, product_distances, write_run
+from orthoflow.engine.plan import RunOptions, plan_run
+from orthoflow.engine.scheduling import execute
+from orthoflow.engine.store import Store
+from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
-from orthoflow.workflow import expand_cells, load_workflow
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import write_run
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
 from tests.engine_world import World, forget_toys
 
 WORKFLOW = """

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 
 import pytest
+from orthoflow_provenance.model import RunRecord
 from prov.model import (
     ProvActivity,
     ProvAgent,
@@ -18,8 +19,8 @@ from prov.model import (
     ProvUsage,
 )
 
-from orthoflow.records import RunRecord, open_run
 from orthoflow.records.prov import prov_document
+from orthoflow.records.runs import open_run
 from tests.studios import Studio, open_finished_studio
 
 

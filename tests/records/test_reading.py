@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from orthoflow_provenance import reader
-from orthoflow_provenance.model import RunRecord
+from orthoflow_provenance.model import (
+    Metric,
+    RecordedCell,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedProduct,
+    RunRecord,
+)
 from orthoflow_provenance.payloads import write_product_file
 from orthoflow_provenance.writer import write_record
 
@@ -19,20 +27,10 @@ import orthoflow
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
-from orthoflow.records import (
-    Metric,
-    RecordedCell,
-    RecordedFigure,
-    RecordedFile,
-    RecordedInput,
-    RecordedProduct,
-    Run,
-    cell_metrics,
-    open_run,
-    verify_run,
-)
-from orthoflow.records.metrics import write_metrics_csv
+from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 from orthoflow.records.published import publish_products
+from orthoflow.records.runs import Run, open_run
+from orthoflow.records.verification import verify_run
 from tests import samples
 from tests.report_runs import environment
 

@@ -6,10 +6,15 @@ import dataclasses
 
 import pytest
 
-from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run
-from orthoflow.records import Run, write_run
+from orthoflow.engine.plan import RunOptions, plan_run
+from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.store import Store
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
-from orthoflow.workflow import cells, expand_cells, load_workflow
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import write_run
+from orthoflow.workflow import cells
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
 from tests.engine_world import World
 
 WORKFLOW = """

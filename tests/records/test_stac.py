@@ -15,7 +15,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages
-from orthoflow.records import Run
+from orthoflow.records.runs import Run
 from orthoflow.records.stac import write_stac
 from tests import samples
 from tests.report_runs import cell, record

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records import Run, open_run
 from orthoflow.records.crates import NO_LICENSE, write_crate
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.published import _by_number, publish_products, published_files
+from orthoflow.records.runs import Run, open_run
 from orthoflow.records.spreadsheets import write_csv_tables
 from tests.provenance_records import sample_record, write_sample
 

@@ -15,12 +15,18 @@ import numpy as np
 import pytest
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, plan_run
+from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
+from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.store import Store
 from orthoflow.errors import StoreError
-from orthoflow.records import Run, open_run, show_unfinished, verify_run, write_run
 from orthoflow.records.published import publish_products
-from orthoflow.workflow import Workflow, expand_cells, load_workflow
+from orthoflow.records.runs import Run, open_run
+from orthoflow.records.verification import verify_run
+from orthoflow.records.writing import show_unfinished, write_run
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import Workflow
 from tests import photo_files
 from tests.engine_world import toy_world
 from tests.faulty_files import FaultyFiles

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.errors import StoreError
-from orthoflow.records import NOT_YET, RecordedCell, Run
 from orthoflow.records.datasets import datasets_of, parts_of
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import NOT_YET
 from orthoflow.report import dataset_tables, write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.paired import (

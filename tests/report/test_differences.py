@@ -6,7 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from orthoflow.records import CellFacts, Pair
+from orthoflow.records.comparison import CellFacts, Pair
 from orthoflow.report import differences
 from orthoflow.report.differences import Difference
 

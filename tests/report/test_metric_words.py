@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from orthoflow_provenance.model import Metric
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.records import Metric, cell_metrics
+from orthoflow.records.metrics import cell_metrics
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.metric_words import (

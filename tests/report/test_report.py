@@ -12,7 +12,8 @@ import pytest
 from orthoflow_provenance.model import PublishedFile
 
 from orthoflow.errors import StoreError
-from orthoflow.records import NOT_YET, Run
+from orthoflow.records.runs import Run
+from orthoflow.records.writing import NOT_YET
 from orthoflow.report import write_figures, write_page, write_report
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram

@@ -7,14 +7,9 @@ import re
 from pathlib import Path
 
 import pytest
+from orthoflow_provenance.model import RecordedFile
 
-from orthoflow.records import (
-    CellFacts,
-    Pair,
-    ParameterValue,
-    RecordedFile,
-    RunComparison,
-)
+from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
 from orthoflow.records.distances import Distance
 from orthoflow.report import numbers
 from orthoflow.report.combinations import (

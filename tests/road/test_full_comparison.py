@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records import Run, open_run, verify_run
+from orthoflow.records.runs import Run, open_run
+from orthoflow.records.verification import verify_run
 from tests.browser import PROGRAM, Page, browser
 from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Shell

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 import orthoflow
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine import RunOptions, Store, execute, plan_run
+from orthoflow.engine.plan import RunOptions, plan_run
+from orthoflow.engine.scheduling import execute
+from orthoflow.engine.store import Store
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
-from orthoflow.records import Run
-from orthoflow.workflow import expand_cells, load_workflow
+from orthoflow.records.runs import Run
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
 from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Shell, metrics_of
 from tests.scan_files import write_las

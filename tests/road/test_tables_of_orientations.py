@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records import open_run
-from orthoflow.workflow import shipped_workflow
+from orthoflow.records.runs import open_run
+from orthoflow.workflow.recipes import shipped_workflow
 from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of, without_variants
 

@@ -19,7 +19,9 @@ from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
-from orthoflow.workflow import doubts_about, expand_cells, load_workflow
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.doubts import doubts_about
 from tests.long_loops import IS_LONG
 
 ROOT = Path(__file__).resolve().parents[2]

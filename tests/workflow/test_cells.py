@@ -9,7 +9,7 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, WorkflowError
-from orthoflow.workflow import (
+from orthoflow.workflow.cells import (
     Cell,
     CellOutput,
     Selection,
@@ -17,8 +17,8 @@ from orthoflow.workflow import (
     check_step_names,
     derive_seed,
     expand_cells,
-    load_workflow,
 )
+from orthoflow.workflow.document import load_workflow
 from tests.laboratories import GOOD, load
 
 TWO_ORTHOS = """\

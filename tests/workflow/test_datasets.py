@@ -9,14 +9,11 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
-from orthoflow.workflow import (
-    Cell,
-    Workflow,
-    doubts_about,
-    expand_cells,
-    load_workflow,
-    resolve_input_files,
-)
+from orthoflow.workflow.cells import Cell, expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.doubts import doubts_about
+from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.inputs import resolve_input_files
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 ROOMS = """\

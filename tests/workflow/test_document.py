@@ -10,11 +10,11 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
-from orthoflow.workflow import (
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.problems import (
     InvalidArgumentsError,
     InvalidWorkflowError,
     UnusablePluginError,
-    load_workflow,
 )
 from tests.laboratories import (
     GOOD,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import Catalog
-from orthoflow.workflow import doubts_about
+from orthoflow.workflow.doubts import doubts_about
 from tests.laboratories import GOOD, load
 
 

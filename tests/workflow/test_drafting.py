@@ -14,8 +14,9 @@ import pytest
 from orthoflow.catalog import discover_catalog
 from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
-from orthoflow.workflow import load_workflow, resolve_input_files
+from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.drafting import draft_workflow
+from orthoflow.workflow.inputs import resolve_input_files
 from orthoflow.workflow.recognising import Recognised
 from tests.studios import asked, said
 

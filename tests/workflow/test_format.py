@@ -11,9 +11,10 @@ from ruamel.yaml import YAML
 
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.files.yaml_positions import read_yaml
-from orthoflow.workflow import InvalidWorkflowError, load_workflow, workflow_schema
+from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import INPUTS, STEPS
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
+from orthoflow.workflow.schema import workflow_schema
 from orthoflow.workflow.shapes import Key
 from tests import workflow_format
 from tests.laboratories import with_steps

@@ -13,9 +13,15 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import InputError
-from orthoflow.workflow import inputs, load_workflow, present_inputs, resolve_input_files
+from orthoflow.workflow import inputs
+from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import WorkflowInputSpec
-from orthoflow.workflow.inputs import read_input_options, some_of
+from orthoflow.workflow.inputs import (
+    present_inputs,
+    read_input_options,
+    resolve_input_files,
+    some_of,
+)
 from orthoflow.workflow.problems import ProblemLog
 
 

@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import Catalog
-from orthoflow.workflow import (
-    InvalidWorkflowError,
-    load_workflow,
-)
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.problems import InvalidWorkflowError
 from tests.laboratories import (
     GOOD,
     problems,

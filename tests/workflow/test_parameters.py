@@ -8,10 +8,8 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import ArgumentError
-from orthoflow.workflow import (
-    InvalidArgumentsError,
-    load_workflow,
-)
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.problems import InvalidArgumentsError
 from tests.laboratories import (
     GOOD,
     load,

@@ -11,7 +11,8 @@ import pytest
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.errors import WorkflowError
-from orthoflow.workflow import Workflow, load_workflow
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import Workflow
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 RECIPES = sorted((Path(__file__).resolve().parents[2] / "workflows").glob("*.yaml"))

@@ -9,17 +9,13 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import ArgumentError
-from orthoflow.workflow import (
-    InvalidArgumentsError,
-    InvalidWorkflowError,
-    Workflow,
-    expand_cells,
-    load_workflow,
-    resolved_json,
-    sweeps,
-    workflow_schema,
-)
-from orthoflow.workflow.resolved import workflow_from_resolved
+from orthoflow.workflow import sweeps
+from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.problems import InvalidArgumentsError, InvalidWorkflowError
+from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.schema import workflow_schema
 from tests.laboratories import laboratory_catalog
 
 ROOM = """\

@@ -10,14 +10,11 @@ import pytest
 from ruamel.yaml import YAML
 
 from orthoflow.catalog import Catalog
-from orthoflow.workflow import (
-    load_workflow,
-    resolved_json,
-    shipped_workflow,
-    shipped_workflows,
-    workflow_schema,
-)
+from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.mermaid import mermaid
+from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
+from orthoflow.workflow.resolved import resolved_json
+from orthoflow.workflow.schema import workflow_schema
 from tests.laboratories import GOOD, laboratory_catalog, load, write_distribution
 
 

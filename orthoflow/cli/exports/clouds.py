@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
     from orthoflow.geometry.slabs import Slab
     from orthoflow.products import Photo, Planes, PointCloud, PointLabels, Walls
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
 
 
 def export_laz(run: Run, folder: Path, chosen: Choices) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from orthoflow.files.drawings.sheet_contents import MarkedArea, SheetText, WallDrawing
     from orthoflow.files.drawings.title_blocks import TitleBlock
     from orthoflow.products import Orthoimage
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
     from orthoflow.records.wall_results import RoomResults, WallResult
 
 _DEFAULT_PAPER: Final = "A3"

@@ -12,7 +12,7 @@ from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
 
 
 class Writer(Protocol):

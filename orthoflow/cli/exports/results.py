@@ -10,7 +10,7 @@ from orthoflow.cli.tables import counted
 
 if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
 
 
 def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
@@ -45,7 +45,7 @@ def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     """Write the figures of all cells, or of one."""
-    from orthoflow.records import figure_files
+    from orthoflow.records.run_files import figure_files
     from orthoflow.report import write_figures
 
     addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
@@ -115,8 +115,8 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
     """Write a record with every product and input file in it; gives it opened."""
-    from orthoflow.engine import Store
-    from orthoflow.records import RECORD_FILE
+    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.engine.store import Store
     from orthoflow.records.writing import write_embedded
 
     return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)

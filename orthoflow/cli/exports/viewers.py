@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from orthoflow.cli.exports.choices import Choices
     from orthoflow.files.ortho_files import OrthoFile
-    from orthoflow.records import Run
+    from orthoflow.records.runs import Run
 
 
 def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
