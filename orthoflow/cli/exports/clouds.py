@@ -7,11 +7,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import (
     branch_of,
     last_product,
@@ -22,42 +23,38 @@ from orthoflow.cli.exports.products import (
 )
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from orthoflow.cli.exports.choices import Choices
-    from orthoflow.files.clouds.dressing import Colouring, DressedCloud
-    from orthoflow.files.clouds.photo_colours import PointColours
-    from orthoflow.geometry.cameras import ViewingCamera
-    from orthoflow.geometry.slabs import Slab
-    from orthoflow.products import Photo, Planes, PointCloud, PointLabels, Walls
-    from orthoflow.records.runs import Run
+from orthoflow.files.clouds.copc import write_copc
+from orthoflow.files.clouds.description import describe_cloud
+from orthoflow.files.clouds.dressing import Colouring, DressedCloud
+from orthoflow.files.clouds.e57 import write_e57
+from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
+from orthoflow.files.clouds.photo_colours import UNSEEN_GREY, PointColours, colour_points
+from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.geotiff import epsg_of, epsg_wkt
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Cameras, Photo, Photos, Planes, PointCloud, PointLabels, Walls
+from orthoflow.records.runs import Run
 
 
 def export_laz(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `cloud.laz` and what it holds as `cloud.json`."""
-    from orthoflow.files.clouds.las import write_laz
-
     return _export(run, folder, chosen, ("cloud.laz", write_laz))
 
 
 def export_copc(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `cloud.copc.laz` and what it holds as `cloud.json`."""
-    from orthoflow.files.clouds.copc import write_copc
-
     return _export(run, folder, chosen, ("cloud.copc.laz", write_copc))
 
 
 def export_ply(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `cloud.ply` and what it holds as `cloud.json`."""
-    from orthoflow.files.clouds.ply import write_ply
-
     return _export(run, folder, chosen, ("cloud.ply", write_ply))
 
 
 def export_e57(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `cloud.e57` and what it holds as `cloud.json`."""
-    from orthoflow.files.clouds.e57 import write_e57
-
     return _export(run, folder, chosen, ("cloud.e57", write_e57))
 
 
@@ -88,10 +85,6 @@ def _export(
     chosen: Choices,
     target: tuple[str, Callable[[Path, DressedCloud], int]],
 ) -> str:
-    from orthoflow.files.clouds.description import describe_cloud
-    from orthoflow.files.clouds.dressing import DressedCloud
-    from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
-
     name, write = target
     found = _found(run, chosen)
     colouring = chosen.colour or found.can_show[0]
@@ -130,8 +123,6 @@ def _export(
 
 
 def _found(run: Run, chosen: Choices) -> _Found:
-    from orthoflow.products import Planes, PointCloud, PointLabels, Walls
-
     is_labelled = chosen.cell is not None or any(
         output.type_name == "labels"
         for cell in run.cells.values()
@@ -193,8 +184,6 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
 
 def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
     """Photos and cameras of the last cell of a branch that oriented any."""
-    from orthoflow.products import Cameras, Photos
-
     makers = _makers_of_cameras(cells)
     if not makers:
         return ()
@@ -212,8 +201,6 @@ def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, Viewi
 
 def _photo_colours(found: _Found, scratch: Path) -> PointColours:
     """Colours in files that are mapped, so that memory does not follow the points."""
-    from orthoflow.files.clouds.photo_colours import UNSEEN_GREY, PointColours, colour_points
-
     n_points = len(found.cloud)
 
     def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:
@@ -255,8 +242,6 @@ def _box(text: str | None) -> NDArray[np.float64] | None:
 
 def _crs_wkt(walls: Walls | None) -> str:
     """What the workflow said of the scan's coordinates (`crs` of `raster.grid`)."""
-    from orthoflow.files.geotiff import epsg_of, epsg_wkt
-
     if walls is None:
         return ""
     known = {epsg_of(wall.frame.map_crs) for wall in walls.walls} - {None}

@@ -3,25 +3,40 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import make_empty, wanted_wall
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from orthoflow.cli.exports.choices import Choices
-    from orthoflow.files.drawings.papers import Paper, Part, View
-    from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines
-    from orthoflow.files.drawings.sheet_contents import MarkedArea, SheetText, WallDrawing
-    from orthoflow.files.drawings.title_blocks import TitleBlock
-    from orthoflow.products import Orthoimage
-    from orthoflow.records.runs import Run
-    from orthoflow.records.wall_results import RoomResults, WallResult
+from orthoflow.files.drawings.cad_pictures import write_cad_picture
+from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
+from orthoflow.files.drawings.geojson import (
+    write_room_geojson,
+    write_seams_geojson,
+    write_wall_geojson,
+)
+from orthoflow.files.drawings.key_plans import key_plan
+from orthoflow.files.drawings.papers import (
+    Paper,
+    Part,
+    View,
+    fitting_scale,
+    nice_step,
+    paper_of,
+    placed_views,
+)
+from orthoflow.files.drawings.printed_pictures import stretch_of
+from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, room_lines
+from orthoflow.files.drawings.sheet_contents import MarkedArea, Sheet, SheetText, WallDrawing
+from orthoflow.files.drawings.sheets import axes_of, write_sheet
+from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
+from orthoflow.products import Orthoimage, Orthoimages
+from orthoflow.records.runs import Run
+from orthoflow.records.wall_results import RoomResults, WallResult, content_digest, room_results
 
 _DEFAULT_PAPER: Final = "A3"
 _GRID_MM: Final = 20.0
@@ -29,10 +44,6 @@ _GRID_MM: Final = 20.0
 
 def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
-    from orthoflow.files.drawings.papers import fitting_scale, paper_of
-    from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
-    from orthoflow.records.wall_results import content_digest, room_results
-
     paper = paper_of(chosen.paper or _DEFAULT_PAPER)
     block = read_title_block(chosen.title_block) if chosen.title_block else TitleBlock()
     results = room_results(run, chosen.cell, chosen.wall)
@@ -65,12 +76,6 @@ def _size_m(wall: WallResult) -> tuple[float, float]:
 def _drawing(
     results: RoomResults, wall: WallResult, chosen: Choices, scale: int, text: SheetText
 ) -> WallDrawing:
-    from orthoflow.files.drawings.key_plans import key_plan
-    from orthoflow.files.drawings.papers import nice_step
-    from orthoflow.files.drawings.printed_pictures import stretch_of
-    from orthoflow.files.drawings.sheet_contents import WallDrawing
-    from orthoflow.files.drawings.sheets import axes_of
-
     kinds = _kinds(wall, chosen)
     grid_m = nice_step(1e-3 * _GRID_MM * scale) if chosen.grid_m is None else chosen.grid_m
     if 0.0 < grid_m < 2e-3 * scale:
@@ -96,8 +101,6 @@ def _drawing(
 
 def _areas(results: RoomResults, wall: WallResult) -> tuple[MarkedArea, ...]:
     """Openings of a wall, from the top-left corner of its raster."""
-    from orthoflow.files.drawings.sheet_contents import MarkedArea
-
     corner_m = wall.frame.raster_corner_m
     return tuple(
         MarkedArea(text=opening.said, outline_m=(opening.outline_m - corner_m) * [1.0, -1.0])
@@ -118,8 +121,6 @@ def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
 
 
 def _sheet_text(run: Run, wall: WallResult, block: TitleBlock, digest: str) -> SheetText:
-    from orthoflow.files.drawings.sheet_contents import SheetText
-
     notes = [f"accuracy: {'; '.join(wall.accuracy)}" if wall.accuracy else "accuracy: not measured"]
     if wall.colours:
         notes.append(wall.colours)
@@ -135,10 +136,6 @@ def _sheet_text(run: Run, wall: WallResult, block: TitleBlock, digest: str) -> S
 
 def _write_wall(folder: Path, drawing: WallDrawing, wall: WallResult, paper: Paper) -> int:
     """Write the sheets of a wall, and give how many there are besides the index."""
-    from orthoflow.files.drawings.papers import fitting_scale, placed_views
-    from orthoflow.files.drawings.sheet_contents import Sheet
-    from orthoflow.files.drawings.sheets import write_sheet
-
     kinds = tuple(drawing.rasters)
     way, views = placed_views(
         kinds, _size_m(wall), paper, scale=drawing.scale, grid_m=drawing.grid_m
@@ -177,10 +174,6 @@ def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, 
 
 def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>.dxf` and `room.dxf`, and the pictures that they refer to."""
-    from orthoflow.files.drawings.cad_pictures import write_cad_picture
-    from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
-    from orthoflow.records.wall_results import room_results
-
     results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     lines = _lines(results)
@@ -200,13 +193,6 @@ def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>.geojson`, `wall_<k>_seams.geojson` and `room.geojson`."""
-    from orthoflow.files.drawings.geojson import (
-        write_room_geojson,
-        write_seams_geojson,
-        write_wall_geojson,
-    )
-    from orthoflow.records.wall_results import room_results
-
     results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     lines = _lines(results)
@@ -225,8 +211,6 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
 
 def _images(run: Run, address: str) -> Sequence[Orthoimage]:
     """The orthoimages of a cell; none where it gives other rasters."""
-    from orthoflow.products import Orthoimages
-
     for port, output in run.cell(address).outputs.items():
         if output.type_name == Orthoimages.type_name and output.embedded:
             return Orthoimages.from_payload(run.payload(address, port)).images
@@ -234,16 +218,12 @@ def _images(run: Run, address: str) -> Sequence[Orthoimage]:
 
 
 def _lines(results: RoomResults) -> RoomLines | None:
-    from orthoflow.files.drawings.room_lines import room_lines
-
     if results.planes is None:
         return None
     return room_lines(results.planes, results.checkpoints, results.inspections, results.openings)
 
 
 def _drawn(results: RoomResults, wall: WallResult, image: str) -> DrawnWall:
-    from orthoflow.files.drawings.room_lines import DrawnWall
-
     return DrawnWall(
         number=wall.number,
         name=wall.name,

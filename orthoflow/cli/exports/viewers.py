@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import (
     branch_of,
     last_product,
@@ -14,20 +15,17 @@ from orthoflow.cli.exports.products import (
 )
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from orthoflow.cli.exports.choices import Choices
-    from orthoflow.files.ortho_files import OrthoFile
-    from orthoflow.records.runs import Run
+from orthoflow.files.gltf import write_page, write_room
+from orthoflow.files.ortho_files import OrthoFile, ortho_files
+from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
+from orthoflow.products import Planes
+from orthoflow.records.runs import Run
+from orthoflow.records.verification import require_unchanged
+from orthoflow.records.wall_results import room_results
 
 
 def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `room.glb`, and `room.html` that shows it."""
-    from orthoflow.files.gltf import write_page, write_room
-    from orthoflow.products import Planes
-
     address, orthos = _orthos(run, chosen)
     planes = last_product(run, branch_of(run, address), Planes, chosen.store)
     if planes is None:
@@ -46,8 +44,6 @@ def _depths(
     run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
 ) -> dict[int, Path]:
     """The published depths of walls, by number."""
-    from orthoflow.records.wall_results import room_results
-
     walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
@@ -61,8 +57,6 @@ def _depths(
 
 def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
     """Write the tiles of each orthoimage, and `index.html`."""
-    from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
-
     address, orthos = _orthos(run, chosen)
     images = {f"wall_{ortho.wall}_ortho": ortho for ortho in orthos}
     make_empty(folder)
@@ -73,9 +67,6 @@ def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
 
 def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
     """The published orthoimages of the wanted cell, or the last one that gave any."""
-    from orthoflow.files.ortho_files import ortho_files
-    from orthoflow.records.verification import require_unchanged
-
     address, _ = output_of(run, "orthoimages", chosen.cell)
     paths = [path for path in run.files.get(address, ()) if path.name.endswith("_ortho.tif")]
     for path in paths:

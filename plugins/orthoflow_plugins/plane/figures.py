@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from orthoflow.geometry.directions import basis_from_up
@@ -18,10 +20,6 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly
 from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.measuring import Materials, Normality, RowPoints
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +76,6 @@ _WITH_NAMES: Final = replace(_THICKNESS, across=1.3)
 
 def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
     """Draw how the points of the first planes lie about them, with the Gauss curve of the fit."""
-    from matplotlib.figure import Figure
-
     deviations, names = assembly.deviations, assembly.planes.names
     count = min(_PANELS_MOST, len(names))
     figure = Figure(figsize=(3.2 * count, 5.4))
@@ -129,8 +125,6 @@ def draw_planes(
         plane_of_point: (m,) plane of each, -1 for none.
         cloud: where they are from.
     """
-    from matplotlib.figure import Figure
-
     every = max(1, len(points_m) // _POINTS_MOST)
     shown = points_m[::every]
     view = _view(planes.up)
@@ -175,8 +169,6 @@ def draw_thickness(
     materials: Materials,
 ) -> None:
     """Draw what is known about the thickness; nothing where no plane has enough points."""
-    from matplotlib.figure import Figure
-
     known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
     if not known:
         return

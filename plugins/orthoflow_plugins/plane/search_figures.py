@@ -5,24 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.accumulators import Accumulator
+from orthoflow_plugins.plane.block_kernels import PlanGrid
 from orthoflow_plugins.plane.figures import Margins, space_out
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from orthoflow_plugins.plane.accumulators import Accumulator
-    from orthoflow_plugins.plane.block_kernels import PlanGrid
-    from orthoflow_plugins.plane.regions import Regions
-    from orthoflow_plugins.plane.space_accumulators import SpacePicture
+from orthoflow_plugins.plane.regions import Regions
+from orthoflow_plugins.plane.space_accumulators import SpacePicture
 
 _PIXELS_MOST: Final = 900
 # Between the panels stands the legend of the first.
@@ -64,8 +62,6 @@ def draw_accumulator(
         planes: the planes, world.
         cloud: where they are from.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(11.0, 4.6))
     space_out(figure, _ACCUMULATOR, n_rows=1, n_columns=2)
     left, right = figure.subplots(1, 2)
@@ -126,8 +122,6 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
         cloud: the cloud.
         cell_m: side of a voxel; drawn larger where a scene would need too many.
     """
-    from matplotlib.figure import Figure
-
     every = max(1, len(cloud) // _SECTION_POINTS_MOST)
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
     basis = basis_from_up(planes.up)
@@ -216,8 +210,6 @@ def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _draw_best(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(7.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.imshow(
@@ -244,8 +236,6 @@ def _draw_best(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
 
 
 def _draw_sections(ctx: StepContext, picture: SpacePicture) -> None:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     axes = figure.subplots(2, 3)
     for place, cut_deg in enumerate(picture.sections_deg):
@@ -303,8 +293,6 @@ def _draw_normals(
     picture: NDArray[np.float64],
     size_m: NDArray[np.float64],
 ) -> None:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(14.0, 4.0), layout="constrained")
     *histograms, right = figure.subplots(1, 3, width_ratios=(2.0, 2.0, 3.0))
     for axes, (name, values_deg) in zip(histograms, angles_deg.items(), strict=True):

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.geometry import Plane, frame_over, wall_axes
 from orthoflow.geometry.rows import Rows
-from orthoflow.geometry.scene_views import render_frame
+from orthoflow.geometry.scene_views import SceneCameras, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints, JsonValue, Photos, Planes, PointCloud, Truth
 from orthoflow.sdk import StepContext
@@ -25,10 +26,6 @@ from orthoflow_plugins.simulate.scanning import (
     SPOILT,
     Scan,
 )
-
-if TYPE_CHECKING:
-    from orthoflow.geometry.scene_views import SceneCameras
-
 
 _CHUNK = 1 << 20
 _PICTURE_GSD_M = 0.01
@@ -189,8 +186,6 @@ def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> 
 
 
 def _contact_sheet(photos: Photos) -> bytes:
-    from orthoflow.files.images import decode_image, encode_webp
-
     small = []
     for photo in photos.photos:
         step = max(1, photo.width // _THUMB_PX)
@@ -229,8 +224,6 @@ def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _picture(truth: Truth, cores: int) -> bytes:
-    from orthoflow.files.images import encode_webp
-
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)
     image = render_frame(truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2)
     return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))

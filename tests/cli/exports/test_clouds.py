@@ -229,7 +229,7 @@ def test_points_that_no_photo_sees_stay_grey(
         assert oriented == ("the photos",)
         colours.rgb[0], colours.photo[0] = (1, 2, 3), 0
 
-    monkeypatch.setattr("orthoflow.files.clouds.photo_colours.colour_points", colour_points)
+    monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
     found: Any = SimpleNamespace(cloud=cloud(), oriented=("the photos",))
     colours = module._photo_colours(found, tmp_path)
     assert colours.photo is not None
@@ -247,7 +247,7 @@ def test_photos_colour_a_cloud_where_any_is_oriented(
     def colour_points(_cloud: object, _oriented: object, colours: Any) -> None:
         colours.rgb[:], colours.photo[:] = (9, 8, 7), 0
 
-    monkeypatch.setattr("orthoflow.files.clouds.photo_colours.colour_points", colour_points)
+    monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
     oriented = ((SimpleNamespace(name="a.jpg"), "its camera"),)
     monkeypatch.setattr(module, "_oriented", lambda *_args: oriented)
     said, dressed = exported(tmp_path, labelled(), colour=colour)

@@ -63,7 +63,7 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, WallDrawing, She
     """Sheets that would have been written."""
     kept: list[tuple[str, WallDrawing, Sheet]] = []
     monkeypatch.setattr(
-        "orthoflow.files.drawings.sheets.write_sheet",
+        "orthoflow.cli.exports.drawings.write_sheet",
         lambda path, drawn, sheet: kept.append((path.name, drawn, sheet)),
     )
     return kept
@@ -238,10 +238,10 @@ def test_sheets_are_counted_and_have_one_scale(
     walls = (wall(3.8, 2.3, "ortho"), wall(9.0, 3.0, "ortho"))
     walls[1].number = 9
     monkeypatch.setattr(
-        "orthoflow.records.wall_results.room_results",
+        "orthoflow.cli.exports.drawings.room_results",
         lambda _run, _cell, _wall: results(walls=walls),
     )
-    monkeypatch.setattr("orthoflow.records.wall_results.content_digest", lambda _run: "d" * 64)
+    monkeypatch.setattr("orthoflow.cli.exports.drawings.content_digest", lambda _run: "d" * 64)
     run: Any = SimpleNamespace(record=SimpleNamespace(run_id="r", name="hall", created_by="o"))
     # On A3 the longer one fits at 1:50, and the other follows.
     said = module.export_sheets(run, tmp_path / "out", Choices())
@@ -272,24 +272,21 @@ def test_what_a_room_has_is_counted() -> None:
 def drawn_files(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """Which writer would have written which file."""
     kept: list[tuple[str, str]] = []
-    places = {
-        "dxf": ("write_wall_dxf", "write_room_dxf"),
-        "geojson": ("write_wall_geojson", "write_room_geojson", "write_seams_geojson"),
-    }
-    for file, writers in places.items():
-        for writer in writers:
-            monkeypatch.setattr(
-                f"orthoflow.files.drawings.{file}.{writer}",
-                lambda path, *_args, writer=writer: kept.append((writer, path.name)),
-            )
+    walls, rooms = (
+        ("write_wall_dxf", "write_room_dxf"),
+        ("write_wall_geojson", "write_room_geojson"),
+    )
+    for writer in (*walls, *rooms, "write_seams_geojson"):
+        monkeypatch.setattr(
+            f"orthoflow.cli.exports.drawings.{writer}",
+            lambda path, *_args, writer=writer: kept.append((writer, path.name)),
+        )
     monkeypatch.setattr(
-        "orthoflow.files.drawings.cad_pictures.write_cad_picture",
+        "orthoflow.cli.exports.drawings.write_cad_picture",
         lambda _raster, path: kept.append(("picture", path.name)),
     )
     lines = SimpleNamespace(surfaces=(1, 2), edges=(1,), corners=(1, 2, 3), openings=())
-    monkeypatch.setattr(
-        "orthoflow.files.drawings.room_lines.room_lines", lambda *_args, **_more: lines
-    )
+    monkeypatch.setattr("orthoflow.cli.exports.drawings.room_lines", lambda *_args, **_more: lines)
     return kept
 
 
@@ -305,7 +302,7 @@ def of_room(monkeypatch: pytest.MonkeyPatch, *, has_planes: bool) -> Any:
         openings=(),
     )
     monkeypatch.setattr(
-        "orthoflow.records.wall_results.room_results", lambda _run, _cell, _wall: told
+        "orthoflow.cli.exports.drawings.room_results", lambda _run, _cell, _wall: told
     )
     images = [
         SimpleNamespace(number=7, sources=("a.jpg", "b.jpg")),
