@@ -50,5 +50,4 @@ def _password(key: Path) -> str:
             f"the key {key} is protected by a password, and there is no terminal to ask for it: "
             "sign on a terminal, or with another key"
         )
-    answer: str = click.prompt(shown(f"password of {key}"), hide_input=True, err=True)
-    return answer
+    return click.prompt(shown(f"password of {key}"), hide_input=True, err=True)

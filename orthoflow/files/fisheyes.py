@@ -84,8 +84,7 @@ class FisheyeLens:
     def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which pixels (..., 2) lie inside the image; NaN does not."""
         u, v = pixels[..., 0], pixels[..., 1]
-        inside: NDArray[np.bool_] = (u >= 0.0) & (u < self.width) & (v >= 0.0) & (v < self.height)
-        return inside
+        return (u >= 0.0) & (u < self.width) & (v >= 0.0) & (v < self.height)
 
     @property
     def limit_rad(self) -> float:

@@ -175,8 +175,7 @@ def _stretched(
         return np.zeros(values.shape, dtype=np.uint8)
     low, span = stretch
     scaled = (np.where(np.isfinite(values), values, low) - low) / span
-    grey: NDArray[np.uint8] = np.rint(np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return grey
+    return np.rint(np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def preview_png(

@@ -58,8 +58,7 @@ class ViewingCamera:
     @property
     def centre_world(self) -> NDArray[np.float64]:
         """Projection centre (3,) in metres."""
-        centre: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return centre
+        return -self.rotation.T @ self.translation
 
     @cached_property
     def flat(self) -> NDArray[np.float64]:
@@ -121,8 +120,7 @@ class ViewingCamera:
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which pixels (n, 2) lie inside the image; NaN does not."""
         u, v = pixels_photo[:, 0], pixels_photo[:, 1]
-        inside: NDArray[np.bool_] = (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
-        return inside
+        return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     def rays_camera(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
         """Directions (n, 3) with z = 1 in camera axes of pixels (n, 2).

@@ -111,10 +111,7 @@ class WallFrame:
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
         """X and Y (n, 2), metres, in the raster's GeoTIFF of wall positions (n, 2)."""
-        places: NDArray[np.float64] = np.array(self.raster_corner_m) + (
-            self.gsd_m * pixels_wall * [1.0, -1.0]
-        )
-        return places
+        return np.array(self.raster_corner_m) + (self.gsd_m * pixels_wall * [1.0, -1.0])
 
     def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Wall positions (n, 2) = (column, row) of X and Y (n, 2) in the raster's GeoTIFF."""

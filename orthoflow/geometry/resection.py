@@ -215,10 +215,7 @@ def predicted_covariances(
 ) -> NDArray[np.float64]:
     """Covariances (n, 2, 2) in pixels squared of where the camera sees points (n, 3)."""
     by_parameters = linearised(resection.camera, points_world, resection.lens).by_parameters
-    predicted: NDArray[np.float64] = (
-        by_parameters @ resection.covariance @ by_parameters.transpose(0, 2, 1)
-    )
-    return predicted
+    return by_parameters @ resection.covariance @ by_parameters.transpose(0, 2, 1)
 
 
 def pixels_by_point(
@@ -226,8 +223,7 @@ def pixels_by_point(
 ) -> NDArray[np.float64]:
     """Derivatives (n, 2, 3) in pixels per metre of the pixels of world points (n, 3)."""
     linear = linearised(camera, points_world, LensFreedom())
-    derivatives: NDArray[np.float64] = linear.by_camera_point @ camera.rotation
-    return derivatives
+    return linear.by_camera_point @ camera.rotation
 
 
 def moved_origin(

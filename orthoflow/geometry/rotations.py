@@ -15,8 +15,7 @@ def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     if angle < 1e-8:
         return np.eye(3) + cross + 0.5 * cross @ cross
     first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-    rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * cross @ cross
-    return rotation
+    return np.eye(3) + first * cross + second * cross @ cross
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:

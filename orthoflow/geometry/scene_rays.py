@@ -103,8 +103,7 @@ def points_on(
     starts: NDArray[np.float64], ways: NDArray[np.float64], hits: Hits
 ) -> NDArray[np.float64]:
     """Points (3, n) that rays meet; the start where they meet nothing."""
-    points: NDArray[np.float64] = starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
-    return points
+    return starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
 
 
 def _cast_table(scene: Scene) -> CastTable:

@@ -326,10 +326,7 @@ class _Renderer:
     def _starts(self, cells: NDArray[np.int64], right: float, down: float) -> NDArray[np.float64]:
         """Points (3, n) before places in cells, where looking begins."""
         rows, columns = np.divmod(cells, self._width)
-        starts: NDArray[np.float64] = (
-            self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
-        )
-        return starts
+        return self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
 
 
 def _exposed(
@@ -349,8 +346,7 @@ def _exposed(
         ways = (base + s * right + t * down + (s * t) * twist).reshape(3, -1)
         hits = rays.cast(centre, ways)
         total += rays.colours(hits.rectangle, points_on(centre, ways, hits))[:3]
-    mean: NDArray[np.float32] = (total / np.float32(n_sub * n_sub)).T.reshape(*shape, 3)
-    return mean
+    return (total / np.float32(n_sub * n_sub)).T.reshape(*shape, 3)
 
 
 def _pixel_ways(camera: ViewingCamera, first: int, last: int) -> tuple[NDArray[np.float64], ...]:

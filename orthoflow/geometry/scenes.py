@@ -110,8 +110,7 @@ class Scene:
         """Corners (r, 4, 3) of all rectangles, metres from `origin`, in order round each."""
         a = self.extent[:, [0, 1, 1, 0], None] * self.axis_a[:, None, :]
         b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
-        corners: NDArray[np.float64] = self.centre[:, None, :] + a + b
-        return corners
+        return self.centre[:, None, :] + a + b
 
     def only(self, chosen: NDArray[np.bool_]) -> Scene:
         """Give the chosen rectangles (r,) alone, with their holes."""

@@ -79,8 +79,7 @@ def _keys(
     offsets: NDArray[np.float64], low: NDArray[np.float64], side_m: float
 ) -> NDArray[np.int64]:
     places = np.clip(np.floor((offsets - low) / side_m), 3, _LARGEST).astype(np.int64)
-    keys: NDArray[np.int64] = (places[:, 0] << 42) | (places[:, 1] << 21) | places[:, 2]
-    return keys
+    return (places[:, 0] << 42) | (places[:, 1] << 21) | places[:, 2]
 
 
 def _moments(
@@ -136,5 +135,4 @@ def _alone(keys: NDArray[np.int64], counts: NDArray[np.float64]) -> NDArray[np.b
     parts = [(keys >> 42) // _COARSER, ((keys >> 21) & mask) // _COARSER, (keys & mask) // _COARSER]
     coarse, inverse = np.unique((parts[0] << 42) | (parts[1] << 21) | parts[2], return_inverse=True)
     about = _neighbour_sums(coarse, np.bincount(inverse, counts, len(coarse)).astype(np.float64))
-    alone: NDArray[np.bool_] = (about < _ALONE_FEWER_THAN)[inverse]
-    return alone
+    return (about < _ALONE_FEWER_THAN)[inverse]

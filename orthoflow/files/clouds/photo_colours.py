@@ -176,10 +176,7 @@ def _points_in_photo(cloud: PointCloud, camera: ViewingCamera) -> Iterator[_Show
 def _is_seen(shown: _ShownPoints, buffer: DepthBuffer, tolerance_m: float) -> NDArray[np.bool_]:
     """Which points (n,) no nearer surface hides by more than the tolerance."""
     places = (shown.pixels / buffer.reduction).astype(np.int64)
-    seen: NDArray[np.bool_] = (
-        shown.depth_m <= buffer.nearest[places[:, 1], places[:, 0]] + tolerance_m
-    )
-    return seen
+    return shown.depth_m <= buffer.nearest[places[:, 1], places[:, 0]] + tolerance_m
 
 
 def _quality(shown: _ShownPoints, camera: ViewingCamera) -> NDArray[np.float32]:

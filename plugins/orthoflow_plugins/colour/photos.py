@@ -120,5 +120,4 @@ def _only(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:
         if isinstance(value := getattr(cloud, field.name), np.ndarray)
         and field.name not in ("origin", "up", "stations")
     }
-    thinner: PointCloud = replace(cloud, **per_point)  # type: ignore[arg-type] # arrays only
-    return thinner
+    return replace(cloud, **per_point)  # type: ignore[arg-type] # arrays only

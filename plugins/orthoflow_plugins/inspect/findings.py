@@ -152,8 +152,7 @@ def length_findings(
 
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which lengths (n,) exceed twice the RMS of all."""
-    beyond: NDArray[np.bool_] = length_m > 2.0 * rms(length_m)
-    return beyond
+    return length_m > 2.0 * rms(length_m)
 
 
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:

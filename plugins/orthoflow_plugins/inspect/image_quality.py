@@ -69,8 +69,7 @@ def shown(image: Orthoimage) -> NDArray[np.bool_]:
 
 
 def _shows(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    shows: NDArray[np.bool_] = np.isin(mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
-    return shows
+    return np.isin(mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
 
 
 def n_shown(image: Orthoimage) -> int:
@@ -192,8 +191,7 @@ def cells_per_pixel(
         spread = 1.0 / np.linalg.svd(np.nan_to_num(jacobian), compute_uv=False)[:, 1]
         # The image of a surface seen from the front runs as the wall does: u right, v down.
         spread[np.linalg.det(jacobian) <= 0.0] = np.inf
-    known: NDArray[np.float64] = spread[np.isfinite(jacobian).all(axis=(1, 2))]
-    return known
+    return spread[np.isfinite(jacobian).all(axis=(1, 2))]
 
 
 def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
@@ -321,8 +319,7 @@ def _neighbours(
     with np.errstate(invalid="ignore"):
         is_after = np.isnan(before) | (np.abs(after) <= np.abs(before))
     slope = np.nan_to_num(np.where(is_after & ~np.isnan(after), after, before))
-    points: NDArray[np.float64] = frame.world_from_wall(places + step, depth + slope)
-    return points
+    return frame.world_from_wall(places + step, depth + slope)
 
 
 def _depth_at(

@@ -254,10 +254,7 @@ def _smoothed(image: GreyImage) -> GreyImage:
 def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float64]:
     from scipy.ndimage import gaussian_filter
 
-    smooth: NDArray[np.float64] = gaussian_filter(
-        values.astype(np.float64), _SMOOTH_CELLS, mode="constant"
-    )
-    return smooth
+    return gaussian_filter(values.astype(np.float64), _SMOOTH_CELLS, mode="constant")
 
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
@@ -433,8 +430,7 @@ def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
     s = 1.0 - t
     value = [s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3]
     slope = [-3.0 * s**2, 9.0 * t**2 - 12.0 * t, 12.0 * s - 9.0 * s**2, 3.0 * t**2]
-    weights: NDArray[np.float64] = np.moveaxis(np.array([value, slope]), 1, 2) / 6.0
-    return weights
+    return np.moveaxis(np.array([value, slope]), 1, 2) / 6.0
 
 
 def _filtered(

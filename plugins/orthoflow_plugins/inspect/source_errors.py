@@ -225,8 +225,7 @@ def _seen_by_photos(
 def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Displacements (n, 2) of the chosen cells, without ghosts and pixels that show nothing."""
     values = errors.displacement_m[chosen & ~errors.ghosts]
-    known: NDArray[np.float64] = values[np.isfinite(values).all(axis=1)]
-    return known
+    return values[np.isfinite(values).all(axis=1)]
 
 
 def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:

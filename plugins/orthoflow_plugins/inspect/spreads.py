@@ -117,5 +117,4 @@ def in_file(values: NDArray[_Value], name: str, allocate: Allocate) -> NDArray[_
 def _keys(values: NDArray[np.float64]) -> NDArray[np.uint64]:
     """Whole numbers that are ordered as the values are."""
     bits = np.ascontiguousarray(values).view(np.uint64)
-    keys: NDArray[np.uint64] = np.where(bits & _SIGN, ~bits, bits | _SIGN)
-    return keys
+    return np.where(bits & _SIGN, ~bits, bits | _SIGN)

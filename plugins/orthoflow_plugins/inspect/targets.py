@@ -71,8 +71,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
 
     def moment(values: NDArray[np.float64], down: int, right: int) -> NDArray[np.float64]:
         along = correlate1d(values, powers[down], axis=0, mode="constant")
-        both: NDArray[np.float64] = correlate1d(along, powers[right], axis=1, mode="constant")
-        return both
+        return correlate1d(along, powers[right], axis=1, mode="constant")
 
     weight = valid.astype(np.float64)
     orders = ((0, 0), (1, 0), (0, 1))

@@ -219,5 +219,4 @@ def _window(half: int) -> NDArray[np.float64]:
     """Weights of a patch's cells: the middle counts more, the border hardly."""
     steps = np.arange(-half, half + 1) / (0.6 * half)
     bell = np.exp(-0.5 * steps**2)
-    window: NDArray[np.float64] = np.outer(bell, bell)
-    return window
+    return np.outer(bell, bell)

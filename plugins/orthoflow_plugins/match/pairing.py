@@ -407,8 +407,7 @@ def _homography(
 def mapped(homography: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Map pixels (n, 2) by a homography."""
     lifted = np.column_stack([pixels, np.ones(len(pixels))]) @ homography.T
-    on_other: NDArray[np.float64] = lifted[:, :2] / lifted[:, 2:]
-    return on_other
+    return lifted[:, :2] / lifted[:, 2:]
 
 
 def _is_from_the_front(homography: NDArray[np.float64], at: NDArray[np.float64]) -> bool:

@@ -113,8 +113,7 @@ class TurnedPhoto:
 
     def pixels_photo(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (n, 2) of the photo where shares (n, 2) of width and height are."""
-        pixels: NDArray[np.float64] = (shares - 0.5) * self.size_px @ self.axes.T + self.middle_px
-        return pixels
+        return (shares - 0.5) * self.size_px @ self.axes.T + self.middle_px
 
 
 def turned(rgb: NDArray[np.uint8], degrees: float) -> TurnedPhoto:

@@ -162,5 +162,4 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
 
 
 def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    sigma: NDArray[np.float64] = np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)
-    return sigma
+    return np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)

@@ -253,8 +253,7 @@ def _apart(
     values = np.zeros((*says[around].shape, 4), dtype=np.float32)
     values[inside(shared, around)] = np.dstack([apart * weights[..., None], weights])
     values = _blurred(values, _SMOOTH_BLOCKS)
-    smooth: NDArray[np.float32] = values[..., :3] / (values[..., 3:] + np.float32(_KNOWN_LEAST))
-    return smooth
+    return values[..., :3] / (values[..., 3:] + np.float32(_KNOWN_LEAST))
 
 
 @dataclass(frozen=True, kw_only=True)

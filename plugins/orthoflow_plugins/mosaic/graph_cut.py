@@ -61,8 +61,7 @@ class CutLabels:
         first_rows, first_columns = self.blocks.rows, self.blocks.columns
         wanted = np.arange(*rows.indices(int(first_rows[-1])))
         blocks = np.searchsorted(first_rows, wanted, side="right") - 1
-        wide: NDArray[np.int16] = np.repeat(self.small[blocks], np.diff(first_columns), axis=1)
-        return wide
+        return np.repeat(self.small[blocks], np.diff(first_columns), axis=1)
 
 
 def cut_labels(

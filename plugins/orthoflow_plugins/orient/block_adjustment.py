@@ -260,8 +260,7 @@ def _weighed(
 def _in_several(point: NDArray[np.intp], active: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Observations of points that at least two photos still see."""
     counts = np.bincount(point[active], minlength=int(point.max()) + 1)
-    kept: NDArray[np.bool_] = active & (counts[point] > 1)
-    return kept
+    return active & (counts[point] > 1)
 
 
 def _tie_residuals(ties: PhotoTies, block: Block) -> NDArray[np.float64]:

@@ -343,8 +343,7 @@ def _moved_px(
     camera: ViewingCamera, other: ViewingCamera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """How far (n, 2) another camera sees points from where the first sees them, in pixels."""
-    moved: NDArray[np.float64] = other.project(points)[:, :2] - camera.project(points)[:, :2]
-    return moved
+    return other.project(points)[:, :2] - camera.project(points)[:, :2]
 
 
 def _mean_square(moved_px: NDArray[np.float64]) -> float:

@@ -276,8 +276,7 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
                 rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
             except GeometryError:
                 continue
-    straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
-    return straight
+    return rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -215,8 +215,7 @@ def _off_line_px(
     lines = first[1] @ (cross_matrix(baseline) @ rotation).T
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.abs((second[1] * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
-    result: NDArray[np.float64] = np.where(np.isfinite(off), off * second[0].fx, np.inf)
-    return result
+    return np.where(np.isfinite(off), off * second[0].fx, np.inf)
 
 
 def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:

@@ -148,8 +148,7 @@ def of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
     """Index of the ties of a photo."""
     if name not in ties.photo_names:
         return np.empty(0, dtype=np.intp)
-    mine: NDArray[np.intp] = np.flatnonzero(ties.photo == ties.photo_names.index(name))
-    return mine
+    return np.flatnonzero(ties.photo == ties.photo_names.index(name))
 
 
 def tied_photo(

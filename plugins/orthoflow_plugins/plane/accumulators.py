@@ -341,8 +341,7 @@ class Voters:
 
 def plan_centre_m(grid: PlanGrid) -> NDArray[np.float64]:
     """(2,) centre of the plan in the (e1, e2) frame of the cloud's offsets."""
-    centre: NDArray[np.float64] = grid.low_m[:2] + 0.5 * grid.cell_m * np.array(grid.shape[:2])
-    return centre
+    return grid.low_m[:2] + 0.5 * grid.cell_m * np.array(grid.shape[:2])
 
 
 def vote_counts(counts: NDArray[np.int64], accumulation: Accumulation) -> NDArray[np.int64]:
@@ -380,8 +379,7 @@ def _edges(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 
     grey = np.log1p(np.maximum(counts, 0))
     scaled = np.rint(255.0 * grey / max(float(grey.max()), 1e-9)).astype(np.uint8)
-    edges: NDArray[np.bool_] = (cv2.Canny(scaled, _EDGE_LOW, _EDGE_HIGH) > 0) & (counts > 0)
-    return edges
+    return (cv2.Canny(scaled, _EDGE_LOW, _EDGE_HIGH) > 0) & (counts > 0)
 
 
 def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
@@ -394,8 +392,7 @@ def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
     n_bins = votes.shape[1]
     middle = window[:, gap : gap + n_bins]
     left, right = window[:, :n_bins], window[:, 2 * gap : 2 * gap + n_bins]
-    contrast: NDArray[np.float64] = middle - np.minimum(left, right)
-    return contrast
+    return middle - np.minimum(left, right)
 
 
 def parabola(values: NDArray[np.float64], place: int) -> float:

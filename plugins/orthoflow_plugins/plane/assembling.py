@@ -185,8 +185,7 @@ def rectangle_m(
     """
     left, right, top, bottom = bounds_m
     around = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
-    corners: NDArray[np.float64] = around @ axes + plane.offset_m * plane.normal
-    return corners
+    return around @ axes + plane.offset_m * plane.normal
 
 
 def enclosing(

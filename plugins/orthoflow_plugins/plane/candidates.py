@@ -379,8 +379,7 @@ def _cells_near(
 def _spread(placed_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """(2, 2) where the middle 96 % of points (m, 2) begin and end along both axes."""
     some = _thinned(placed_m, _SPREAD_POINTS)
-    spread: NDArray[np.float64] = np.quantile(some, (0.02, 0.98), axis=0)
-    return spread
+    return np.quantile(some, (0.02, 0.98), axis=0)
 
 
 def _inside(
@@ -391,5 +390,4 @@ def _inside(
     n_rows, n_columns = raster.shape
     column = np.clip(placed[:, 0], 0, n_columns - 1)
     row = np.clip(placed[:, 1], 0, n_rows - 1)
-    within: NDArray[np.bool_] = cells[row, column]
-    return within
+    return cells[row, column]

@@ -80,8 +80,7 @@ class CellFit:
 
     def weights(self, observed: CellHeights) -> NDArray[np.float64]:
         """(n,) robust weights over the variances: all, then Tukey's as residuals near the limit."""
-        weights: NDArray[np.float64] = (1.0 - self.faded(observed) ** 2) ** 2 / self.variance_m2
-        return weights
+        return (1.0 - self.faded(observed) ** 2) ** 2 / self.variance_m2
 
     def faded(self, observed: CellHeights) -> NDArray[np.float64]:
         """(n,) how far residuals are from where weights begin to fade, 0, to the limit, 1."""
@@ -167,8 +166,7 @@ def _left_out(
     # A tile without which the rest fixes no plane: its part is damped.
     without = whole - parts + _STEADY * np.diag(np.diag(whole))
     moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
-    covariance: NDArray[np.float64] = (n_tiles - 1) / n_tiles * (moves.T @ moves)
-    return covariance
+    return (n_tiles - 1) / n_tiles * (moves.T @ moves)
 
 
 def _flattening(observed: CellHeights, fit: CellFit, weights: NDArray[np.float64]) -> float:

@@ -224,8 +224,7 @@ def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     rise = math.cos(elevation) * np.array([0.0, 0.0, 1.0]) - math.sin(elevation) * towards
-    view: NDArray[np.float64] = np.array([right, rise]) @ basis_from_up(up)
-    return view
+    return np.array([right, rise]) @ basis_from_up(up)
 
 
 def _draw_rectangles(

@@ -234,10 +234,9 @@ def alike(first: Hypotheses, second: Hypotheses, tolerance_m: float) -> NDArray[
     """(f, s) whether hypotheses are much the same as others."""
     cosines = first.normals @ second.normals.T
     apart_m = np.abs(first.offsets_m[:, None] - np.copysign(1.0, cosines) * second.offsets_m)
-    near: NDArray[np.bool_] = (np.abs(cosines) > math.cos(math.radians(_ALIKE_DEG))) & (
+    return (np.abs(cosines) > math.cos(math.radians(_ALIKE_DEG))) & (
         apart_m < _ALIKE_TOLERANCES * tolerance_m
     )
-    return near
 
 
 def _fewest_false_alarms(
@@ -273,5 +272,4 @@ def _log_choose(
     from scipy.special import gammaln
 
     apart = gammaln(np.subtract(n, k) + 1.0)
-    logarithm: NDArray[np.float64] = gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - apart
-    return logarithm
+    return gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - apart

@@ -362,8 +362,7 @@ def _from_means(
 ) -> NDArray[np.float64]:
     """(m,) deviations of distances from the mean of the so many that are near."""
     # A mean of n follows its own points: deviations from it are too small by this.
-    deviation_m: NDArray[np.float64] = (distance_m - mean_m) / np.sqrt(1.0 - 1.0 / count)
-    return deviation_m
+    return (distance_m - mean_m) / np.sqrt(1.0 - 1.0 / count)
 
 
 def _by_class(
@@ -428,8 +427,7 @@ def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.floa
         return only
     if cloud.scan is None or not len(index) or int(cloud.scan[index].max()) >= len(stations):
         return None
-    seen_from: NDArray[np.float64] = stations[cloud.scan[index]] - cloud.origin
-    return seen_from
+    return stations[cloud.scan[index]] - cloud.origin
 
 
 def _even_edges(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -315,8 +315,7 @@ def _common_direction(
 
 def _unit_mean(normals: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     total = weights @ normals
-    mean: NDArray[np.float64] = total / max(float(np.linalg.norm(total)), 1e-12)
-    return mean
+    return total / max(float(np.linalg.norm(total)), 1e-12)
 
 
 def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:

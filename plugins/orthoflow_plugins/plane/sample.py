@@ -105,8 +105,7 @@ class PreparedCloud:
         """(8, 3) offsets of the corners of the robust box, metres."""
         extent = np.array(self.grid.shape) * self.grid.cell_m
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
-        corners: NDArray[np.float64] = (self.grid.low_m + steps * extent) @ self.grid.basis
-        return corners
+        return (self.grid.low_m + steps * extent) @ self.grid.basis
 
     def claim_alone(self, claim: Claim) -> None:
         """Give one plane all points that it holds, and leave the others unclaimed."""

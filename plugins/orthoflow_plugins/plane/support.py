@@ -189,8 +189,7 @@ def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
         # Far below the usual density a cell is a stray echo beside the wall, not the wall.
         crowded &= sums.n_find >= 0.02 * np.median(sums.n_find[crowded])
     # The cell itself is one of those around it.
-    result: NDArray[np.bool_] = crowded & (summed_around(crowded.astype(np.int64)) >= 4)
-    return result
+    return crowded & (summed_around(crowded.astype(np.int64)) >= 4)
 
 
 def support_of(
@@ -241,5 +240,4 @@ def _bounds(raster: SurfaceRaster, cells: NDArray[np.bool_]) -> NDArray[np.float
     rows = np.flatnonzero(cells.any(axis=1))
     columns = np.flatnonzero(cells.any(axis=0))
     edges = np.array([columns[0], columns[-1] + 1, rows[0], rows[-1] + 1], dtype=np.float64)
-    bounds: NDArray[np.float64] = np.repeat(raster.low_m, 2) + edges * raster.cell_m
-    return bounds
+    return np.repeat(raster.low_m, 2) + edges * raster.cell_m

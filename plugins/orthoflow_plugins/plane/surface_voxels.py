@@ -141,8 +141,7 @@ class SurfaceVoxels:
         """(m, 3) mean of each voxel's points along e1, e2, up; metres in the offsets' frame."""
         steps = self.sums[:, 1:4] / self.counts[:, None]
         middles = self.places + 0.5 + (steps + 0.5) / STEPS_PER_VOXEL
-        centroids: NDArray[np.float64] = self.grid.low_m + self.grid.cell_m * middles
-        return centroids
+        return self.grid.low_m + self.grid.cell_m * middles
 
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
         """(n,) voxel of each point, -1 for none."""

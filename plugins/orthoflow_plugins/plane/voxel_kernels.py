@@ -56,8 +56,7 @@ def voxel_places(bricks: NDArray[np.bool_], occupied: NDArray[np.bool_]) -> NDAr
     corners = np.argwhere(bricks).astype(np.int32) * np.int32(BRICK_SIDE)
     row, voxel = np.divmod(np.flatnonzero(occupied), VOXELS)
     within = np.column_stack(np.unravel_index(voxel, (BRICK_SIDE,) * 3)).astype(np.int32)
-    places: NDArray[np.int32] = corners[row] + within
-    return places
+    return corners[row] + within
 
 
 @kernel_part

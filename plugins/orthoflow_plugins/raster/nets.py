@@ -225,8 +225,7 @@ class _Surface:
         cloud, matrix = self.cloud, wall_from_offset(self.slab.frame, self.cloud.origin)
         offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
         corner = matrix[:2, 3] - (window.left, window.top)
-        places: NDArray[np.float64] = (matrix[:2, :3] @ offsets.astype(np.float64)).T + corner
-        return places
+        return (matrix[:2, :3] @ offsets.astype(np.float64)).T + corner
 
     def _set(
         self,

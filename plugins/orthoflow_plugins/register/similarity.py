@@ -126,8 +126,7 @@ class Similarity:
 
     def apply(self, points_source: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) in target coordinates."""
-        moved: NDArray[np.float64] = self.scale * points_source @ self.rotation.T + self.translation
-        return moved
+        return self.scale * points_source @ self.rotation.T + self.translation
 
 
 def fit_similarity(

@@ -61,10 +61,7 @@ class Delivery:
     @property
     def stations_world(self) -> NDArray[np.float64]:
         """Station (s, 3) of each scan, metres."""
-        stations: NDArray[np.float64] = (
-            self.scan.stations @ self.world_from_room.T + self.shift_world_m
-        )
-        return stations
+        return self.scan.stations @ self.world_from_room.T + self.shift_world_m
 
     @property
     def up_world(self) -> NDArray[np.float64]:
@@ -274,10 +271,7 @@ def _corners_world(
     axes = wall_axes(normal, delivery.up_world)
     low, high = (outline @ axes.T).min(axis=0), (outline @ axes.T).max(axis=0)
     ends = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], high[1]], [high[0], low[1]]])
-    corners: NDArray[np.float64] = (
-        item.plane.offset_m * normal + ends @ axes + delivery.shift_world_m
-    )
-    return corners
+    return item.plane.offset_m * normal + ends @ axes + delivery.shift_world_m
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
@@ -294,8 +288,7 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
             ).distances_m(points[label == index].astype(np.float64))
             # Not as a product: BLAS adds in another order with another number of threads.
             sums[index] += float(np.square(distances).sum())
-    rms: NDArray[np.float64] = np.sqrt(sums / np.maximum(planes.n_points, 1))
-    return rms
+    return np.sqrt(sums / np.maximum(planes.n_points, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,12 +305,11 @@ class _Spots(Rows):
     def points(self, scene: Scene) -> NDArray[np.float64]:
         """Points (n, 3) from the scene's origin."""
         chosen = self.rectangle
-        points: NDArray[np.float64] = (
+        return (
             scene.centre[chosen]
             + self.in_rectangle[:, :1] * scene.axis_a[chosen]
             + self.in_rectangle[:, 1:] * scene.axis_b[chosen]
         )
-        return points
 
 
 def check_points(
@@ -420,8 +412,7 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)
-    level: NDArray[np.bool_] = np.abs(hits.t - _LIFT_M) < 1e-4
-    return level
+    return np.abs(hits.t - _LIFT_M) < 1e-4
 
 
 def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:

@@ -282,15 +282,13 @@ def _where_one_can_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
     place = np.clip(axes @ wanted, _FREE_LOW_M, _FREE_HIGH_M)
     if place[1] < -0.35 or place[1] > 1.2:
         place[2] = max(place[2], _FURNITURE_M + (0.4 if place[1] > 1.2 else 0.0))
-    standing: NDArray[np.float64] = axes.T @ place
-    return standing
+    return axes.T @ place
 
 
 def _rolled(rotation: NDArray[np.float64], roll_deg: float) -> NDArray[np.float64]:
     cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
     about_axis = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    rolled: NDArray[np.float64] = about_axis @ rotation
-    return rolled
+    return about_axis @ rotation
 
 
 def _developed(

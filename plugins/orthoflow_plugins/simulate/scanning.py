@@ -417,8 +417,7 @@ def _range_sigma(
     """Standard deviation of a distance: grows with range and slope, and on cloth."""
     slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
     cloth = np.where(is_cloth, 1.4, 1.0)
-    sigma: NDArray[np.float64] = noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
-    return sigma
+    return noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
 
 
 def _gross(states: NDArray[np.uint64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
