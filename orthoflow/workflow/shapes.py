@@ -51,15 +51,12 @@ class Shape(Protocol[Found_co]):
     @property
     def words(self) -> str:
         """What is expected, as problems and the documentation say it: `true or false`."""
-        raise AssertionError("a protocol is never called")
 
     def schema(self) -> Schema:
         """Say the same as JSON Schema 2020-12."""
-        raise AssertionError("a protocol is never called")
 
     def read(self, value: Value, path: str, log: ProblemLog) -> Found_co | None:
         """Take the value; what does not fit goes to the log, and nothing usable gives None."""
-        raise AssertionError("a protocol is never called")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,7 +380,6 @@ class Item(Shape[Found_co], Protocol[Found_co]):
     @property
     def noun(self) -> str:
         """One of it, e.g. `text`."""
-        raise AssertionError("a protocol is never called")
 
 
 @dataclass(frozen=True)

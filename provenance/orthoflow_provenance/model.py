@@ -62,27 +62,22 @@ class PayloadLike(Protocol):
     @property
     def type_name(self) -> str:
         """Name of the product type."""
-        raise AssertionError("a protocol is never called")
 
     @property
     def encoding_version(self) -> int:
         """Version of the type's layout."""
-        raise AssertionError("a protocol is never called")
 
     @property
     def metadata(self) -> Mapping[str, JsonValue]:
         """Everything that is not an array."""
-        raise AssertionError("a protocol is never called")
 
     @property
     def arrays(self) -> Mapping[str, NDArray[np.generic]]:
         """Arrays by name; names may have `/`."""
-        raise AssertionError("a protocol is never called")
 
     @property
     def mapped(self) -> bool:
         """Store contiguous and uncompressed."""
-        raise AssertionError("a protocol is never called")
 
 
 @dataclass(frozen=True, kw_only=True)
