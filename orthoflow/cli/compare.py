@@ -17,8 +17,7 @@ from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_table, number
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.model import RecordedFile
-
+    from orthoflow.records import RecordedFile
     from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
 
 Value = TypeVar("Value")

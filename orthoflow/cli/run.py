@@ -31,11 +31,10 @@ from orthoflow.cli.tables import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.model import RecordedCell
-
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.scheduling import RunOutcome
     from orthoflow.engine.store import Store
+    from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
     from orthoflow.records.writing import WrittenRun
     from orthoflow.workflow.format import Workflow

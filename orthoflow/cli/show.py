@@ -25,8 +25,7 @@ from orthoflow.cli.tables import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.model import RecordedCell
-
+    from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
 
 _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}

@@ -14,8 +14,7 @@ import click
 from orthoflow.foreign_text import shown, shown_json
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.model import RecordedCell
-
+    from orthoflow.records import RecordedCell
     from orthoflow.records.distances import Distance, ProductDistance
 
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")

@@ -1,1 +1,28 @@
 """Finished runs: writing the record, and the read API."""
+
+from __future__ import annotations
+
+from orthoflow_provenance.model import (
+    COSTS,
+    Metric,
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedProduct,
+    RunRecord,
+)
+
+# The words of a record, for the floors above.
+__all__ = [
+    "COSTS",
+    "Metric",
+    "RecordedCell",
+    "RecordedEnvironment",
+    "RecordedFigure",
+    "RecordedFile",
+    "RecordedInput",
+    "RecordedProduct",
+    "RunRecord",
+]

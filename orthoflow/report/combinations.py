@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.files.json_texts import parse_json
+from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET

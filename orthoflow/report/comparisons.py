@@ -8,8 +8,7 @@ from fnmatch import fnmatchcase
 from string import ascii_uppercase
 from typing import Final
 
-from orthoflow_provenance.model import COSTS, RecordedEnvironment
-
+from orthoflow.records import COSTS, RecordedEnvironment
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics

@@ -10,10 +10,10 @@ from html import escape
 from typing import Final, NamedTuple
 
 import numpy as np
-from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.foreign_text import shown
 from orthoflow.geometry.robust import median_deviation
+from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns

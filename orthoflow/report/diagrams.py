@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Final
 
-from orthoflow_provenance.model import RecordedCell
-
 from orthoflow.foreign_text import shown
+from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.numbers import seconds_in_words
 

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from orthoflow_provenance.model import RecordedFile
-
+from orthoflow.records import RecordedFile
 from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
 from orthoflow.records.distances import ProductDistance
 from orthoflow.report.numbers import number, number_with_unit

@@ -8,12 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.model import RecordedFigure
-
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.files.plain_svg import is_plain_svg
 from orthoflow.geometry.threads import in_order
+from orthoflow.records import RecordedFigure
 from orthoflow.records.run_files import figure_files, write_files
 from orthoflow.records.runs import FIGURES_FOLDER, Run
 from orthoflow.report.combinations import baseline_cells

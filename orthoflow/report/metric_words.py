@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow_provenance.model import COSTS
-
+from orthoflow.records import COSTS
 from orthoflow.records.metrics import MetricRow
 
 # What stands before a name, and what is said behind the words of the rest.

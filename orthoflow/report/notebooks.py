@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_provenance.model import RecordedFigure
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError
@@ -21,6 +20,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask
+from orthoflow.records import RecordedFigure
 from orthoflow.records.comparison import RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics

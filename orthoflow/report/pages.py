@@ -20,11 +20,11 @@ from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup, escape
-from orthoflow_provenance.model import COSTS, RecordedCell
 
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
+from orthoflow.records import COSTS, RecordedCell
 from orthoflow.records.comparison import compare_runs
 from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER

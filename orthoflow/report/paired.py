@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.geometry.robust import median_deviation
+from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import comparison_columns

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from orthoflow_provenance.model import RecordedCell
-
 from orthoflow.foreign_text import Value
+from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of

@@ -11,9 +11,8 @@ from orthoflow.cli.failures import say_error
 from orthoflow.errors import ArgumentError, StoreError
 
 if TYPE_CHECKING:
-    from orthoflow_provenance.model import RecordedCell
-
     from orthoflow.products import Product
+    from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
 
     ProductT = TypeVar("ProductT", bound=Product)
