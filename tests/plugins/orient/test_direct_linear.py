@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,3 +214,76 @@ def test_a_lens_that_bends_more_than_the_model_is_said(k1: float, is_said: bool)
     )
     assert isinstance(found, Estimate)
     assert any("its lens has distortion that a DLT" in note for note in found.notes) == is_said
+
+
+def flat(n: int, *, relief_m: float, sigma_m: float, width_m: float = 2.0) -> SeenPoints:
+    """Ties on a plane 2 m wide and half as high, every second one off it."""
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-0.5, 0.5, (n, 3)) * [width_m, 0.0, 0.5 * width_m]
+    points[:, 1] = relief_m * np.where(np.arange(n) % 2 == 0, -1.0, 1.0)
+    return SeenPoints(
+        pixels_photo=np.zeros((n, 2)),
+        points_world=points,
+        sigma_px=np.ones(n),
+        sigma_m=np.full(n, sigma_m),
+    )
+
+
+@pytest.mark.parametrize(
+    ("relief_m", "sigma_m", "said"),
+    [
+        (0.01, 0.0005, ""),
+        (0.01, 0.0011, "its points are known to 1.1 mm, and a DLT needs 10 times as much relief"),
+        # A five thousandth of what they extend along their longer axis, 0.577 m.
+        (0.00013, 0.0, ""),
+        (0.0001, 0.0, "a DLT needs relief"),
+    ],
+)
+def test_control_too_near_a_plane_is_told_why(relief_m: float, sigma_m: float, said: str) -> None:
+    control = flat(4000, relief_m=relief_m, sigma_m=sigma_m)
+    reason = direct_linear._too_flat(control)
+    assert bool(reason) == bool(said)
+    if said:
+        assert f"within {1000 * relief_m:.1f} mm (RMS) of one plane; {said}: use" in reason
+
+
+def test_equations_of_bad_condition_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = camera()
+    seen = seen_by(viewer, 60)
+    found = direct_linear.direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
+    for most, is_fine in ((1.01 * found.condition, True), (0.99 * found.condition, False)):
+        monkeypatch.setattr(direct_linear, "_CONDITION_MOST", most)
+        said = estimated(viewer, seen)
+        assert isinstance(said, Estimate) == is_fine
+    assert isinstance(said, str)
+    assert f"the equations have condition {found.condition:.0f}: use orient.pnp" in said
+
+
+def test_five_points_and_points_in_one_place_determine_no_camera() -> None:
+    seen = seen_by(camera(), 6)
+    direct_linear.direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
+    with pytest.raises(GeometryError, match="needs six points, got 5"):
+        direct_linear.direct_linear(seen.pixels_photo[:5], seen.points_world[:5], SIZE_PX)
+    with pytest.raises(GeometryError, match="lie in one place"):
+        direct_linear._normalisation(np.ones((7, 2)), 1.0)
+
+
+def test_ties_without_a_pose_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(direct_linear, "robust_start", lambda *_: None)
+    assert estimated(camera(), seen_by(camera(), 60)) == "no pose agrees with enough of its 60 ties"
+
+
+@pytest.mark.parametrize(
+    ("sigma0", "factor", "is_said"),
+    [(1.0, 1.0, False), (1.49, 2.2, False), (1.51, 1.0, True), (1.0, 2.3, True)],
+)
+def test_what_a_lens_model_lacks_is_said_from_half_as_much_again(
+    sigma0: float, factor: float, is_said: bool
+) -> None:
+    estimate: Any = SimpleNamespace(resection=SimpleNamespace(sigma0=sigma0))
+    notes = direct_linear._misfit_notes(estimate, 4.0, factor)
+    assert bool(notes) == is_said
+    if is_said:
+        assert f"deviate {sigma0:.1f} times" in notes[0]
+        assert "would move its points by 2.0 px" in notes[0]
+        assert f"the stated error is {np.sqrt(factor):.1f} times as large" in notes[0]

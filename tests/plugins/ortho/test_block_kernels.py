@@ -14,7 +14,9 @@ from orthoflow_plugins.ortho.block_kernels import (
     UNSURE,
     judge_block,
     look_at_hidden_block,
+    look_at_unoccluded_block,
     parabola,
+    room_for_blocks,
     span_block,
 )
 from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
@@ -23,6 +25,7 @@ from orthoflow_plugins.ortho.views import (
     BLOCK_CELLS,
     NO_SURFACE,
     OCCLUDED,
+    PAINTED,
     TileVisibility,
     WallView,
 )
@@ -226,3 +229,85 @@ def test_a_hidden_block_has_no_places_and_void_stays_void() -> None:
     np.testing.assert_array_equal(visible.mask, expected)
     for values in (visible.u, visible.v):
         np.testing.assert_array_equal(values, np.where(expected == 99, 7.0, 0.0))
+
+
+# A part of the block: its first and last row and column are not in the tile.
+PART: Final = (ROWS[0] + 3, COLUMNS[0] + 2, 20, 25, 4, 6)
+
+
+def looked_at(
+    of: WallView, depths: NDArray[np.float32]
+) -> tuple[int, TileVisibility, NDArray[np.float64]]:
+    """What a photo that sees all of a block has of a part of it; the rest of the tile is 7."""
+    shape = (30, 40)
+    visible = TileVisibility(
+        u=np.full(shape, 7.0, dtype=np.float32),
+        v=np.full(shape, 7.0, dtype=np.float32),
+        mask=np.full(shape, 99, dtype=np.uint8),
+        quality=np.full(shape, 7.0, dtype=np.float32),
+        summary=np.empty(8),
+    )
+    room = room_for_blocks(surface_of(depths).relief, visible)
+    assert span_block(of, DEPTHS, ROWS, COLUMNS, room.nodes)
+    nothing = DepthBuffer(nearest=np.full((1000, 1000), np.inf, dtype=np.float32), reduction=4.0)
+    assert judge_block(of, nothing, DEPTHS[1], ROWS, COLUMNS, room.nodes, room.box) == SEEN
+    n_known = look_at_unoccluded_block(of, room, PART, (ROWS, COLUMNS), DEPTHS)
+    return int(n_known), visible, room.box.copy()
+
+
+def rough() -> NDArray[np.float32]:
+    depths = np.random.default_rng(4).uniform(*DEPTHS, scenes.SHAPE).astype(np.float32)
+    depths[PART[0] + 5, PART[1] + 7 : PART[1] + 9] = np.nan
+    depths[ROWS[0], COLUMNS[0]] = np.nan  # not in the part
+    return depths
+
+
+def at_the_edge(edge: str) -> WallView:
+    """A photo that ends half a pixel beside what it shows of the block."""
+    of = view()
+    box = judged()[1]
+    flat = of.camera.copy()
+    if edge in ("left", "upper"):
+        flat[14 + (edge == "upper")] -= box[0 if edge == "left" else 2] - 0.5
+    else:
+        flat[21 + (edge == "lower")] = box[1 if edge == "right" else 3] + 0.5
+    return of._replace(camera=flat, border_px=40.0)
+
+
+@pytest.mark.parametrize("edge", ["", "left", "right", "upper", "lower"])
+def test_cells_of_a_block_that_is_seen_lie_where_the_camera_has_them(edge: str) -> None:
+    of = at_the_edge(edge) if edge else view()
+    depths = rough()
+    n_known, visible, _ = looked_at(of, depths)
+    first_row, first_column, n_rows, n_columns, tile_row, tile_column = PART
+    rows, columns = np.mgrid[
+        first_row : first_row + n_rows, first_column : first_column + n_columns
+    ].astype(np.float64)
+    at = depths[first_row : first_row + n_rows, first_column : first_column + n_columns]
+    known = np.isfinite(at)
+    assert n_known == known.sum() == n_rows * n_columns - 2
+    exact, points = projected(rows, columns, np.where(known, at, 0.0).ravel().astype(np.float64))
+    # Of the camera as it was: its centre may have been moved in the photo.
+    exact[:, 0] += of.camera[14] - view().camera[14]
+    exact[:, 1] += of.camera[15] - view().camera[15]
+    towards = CAMERA.centre_world - points
+    cosine = towards @ WHERE.normal_world / np.linalg.norm(towards, axis=1)
+    quality = cosine * CAMERA.fx * CAMERA.fy * WHERE.gsd_m**2 / exact[:, 2] ** 2
+    width, height = of.camera[21], of.camera[22]
+    inside = np.min([exact[:, 0], exact[:, 1], width - exact[:, 0], height - exact[:, 1]], axis=0)
+    quality *= np.minimum(1.0, inside / of.border_px)
+    assert (inside.min() < of.border_px) == bool(edge)
+    tile = (slice(tile_row, tile_row + n_rows), slice(tile_column, tile_column + n_columns))
+    flat = known.ravel()
+    for found, expected, slack in (
+        (visible.u, exact[:, 0], 2.0 * PARABOLA_PX),
+        (visible.v, exact[:, 1], 2.0 * PARABOLA_PX),
+        (visible.quality, quality, 2e-3 * quality.max()),
+    ):
+        np.testing.assert_allclose(found[tile].ravel()[flat], expected[flat], atol=slack)
+        outside = np.ones(found.shape, dtype=np.bool_)
+        outside[tile] = False
+        assert (found[outside] == 7.0).all()
+    expected_mask = np.full((30, 40), 99)
+    expected_mask[tile] = np.where(known, PAINTED, NO_SURFACE)
+    np.testing.assert_array_equal(visible.mask, expected_mask)

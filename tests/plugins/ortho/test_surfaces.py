@@ -1,0 +1,203 @@
+"""What is prepared of a wall before photos look at it: bounds of its blocks, and cameras before it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho import surfaces
+from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.surfaces import (
+    Surface,
+    is_before,
+    relief_of,
+    surfaces_of,
+    transparent_relief_of,
+    view_of,
+)
+from orthoflow_plugins.ortho.views import BLOCK_CELLS, FINE_CELLS, NOTHING, NOTHING_M
+
+from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.products import Wall
+from tests import ortho_scenes as scenes
+from tests import samples
+from tests.raster_scenes import context
+
+GSD_M = 0.01
+
+
+def wall_of(depths: NDArray[np.floating]) -> Wall:
+    rows, columns = depths.shape
+    frame = samples.facing_south(GSD_M, columns, rows, (1.0, 2.0, 3.0))
+    return samples.wall(frame, depth_m=depths.astype(np.float32))
+
+
+def rough(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Depths with a void block, void cells, and a raised part."""
+    rng = np.random.default_rng(5)
+    depths = rng.normal(0.0, 0.003, shape)
+    depths[rng.random(shape) < 0.02] = np.nan
+    depths[shape[0] // 2 :, shape[1] // 3 :] += 0.08
+    depths[: FINE_CELLS + 1, : BLOCK_CELLS + 3] = np.nan
+    return depths.astype(np.float32)
+
+
+def of_blocks(values: NDArray[np.floating], side: int, pick: Any) -> NDArray[np.float64]:
+    rows, columns = (-(-n // side) for n in values.shape)
+    return np.array(
+        [
+            [
+                pick(values[side * r : side * (r + 1), side * c : side * (c + 1)])
+                for c in range(columns)
+            ]
+            for r in range(rows)
+        ],
+        dtype=np.float64,
+    )
+
+
+SHAPES = [(8, 8), (9, 17), (32, 64), (70, 101), (100, 33), (5, 40)]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_bounds_of_blocks_are_those_of_their_cells(shape: tuple[int, int]) -> None:
+    depths = rough(shape)
+    relief = relief_of(wall_of(depths), threads=2)
+    low = np.where(np.isnan(depths), np.inf, depths)
+    high = np.where(np.isnan(depths), -np.inf, depths)
+    np.testing.assert_array_equal(relief.bottoms, of_blocks(low, BLOCK_CELLS, np.min))
+    np.testing.assert_array_equal(relief.crests, of_blocks(high, BLOCK_CELLS, np.max))
+    np.testing.assert_array_equal(relief.fine_bottoms, of_blocks(low, FINE_CELLS, np.min))
+    hiding = relief.occluding.reshape(shape) * relief.step_m
+    hiding = np.where(relief.occluding.reshape(shape) == NOTHING, NOTHING_M, hiding)
+    for tops, side in ((relief.tops, BLOCK_CELLS), (relief.fine_tops, FINE_CELLS)):
+        # The highest of the four blocks that begin a row and a column before, none outside.
+        single = np.pad(of_blocks(hiding, side, np.max), 1, constant_values=NOTHING_M)
+        expected = np.maximum.reduce(
+            [single[:-1, :-1], single[1:, :-1], single[:-1, 1:], single[1:, 1:]]
+        )
+        assert tops.shape == expected.shape
+        np.testing.assert_array_equal(tops == NOTHING_M, expected == NOTHING_M)
+        known = expected > NOTHING_M
+        np.testing.assert_allclose(tops[known], expected[known], atol=0.51 * relief.step_m)
+    assert relief.highest_m == max(NOTHING_M, float(relief.tops.max()))
+
+
+@pytest.mark.parametrize("shape", SHAPES[:3], ids=str)
+def test_a_transparent_relief_has_bounds_and_hides_nothing(shape: tuple[int, int]) -> None:
+    depths = rough(shape)
+    relief, hiding = (of(wall_of(depths), threads=1) for of in (transparent_relief_of, relief_of))
+    for name in ("bottoms", "crests", "fine_bottoms", "depth"):
+        np.testing.assert_array_equal(getattr(relief, name), getattr(hiding, name))
+    assert relief.occluding.size == 0
+    assert (relief.tops == NOTHING_M).all()
+    assert (relief.fine_tops == NOTHING_M).all()
+    assert relief.highest_m == NOTHING_M
+
+
+@pytest.mark.parametrize(
+    ("depths", "step_m"),
+    [
+        ([[0.0, 0.1]], 0.1 / 32_000),
+        ([[-0.4, 0.1]], 0.4 / 32_000),
+        ([[np.nan, 0.1]], 0.1 / 32_000),
+        ([[np.nan, np.nan]], 1e-6),
+        ([[0.001, -0.002]], 1e-6),
+    ],
+)
+def test_heights_fit_into_sixteen_bits(depths: list[list[float]], step_m: float) -> None:
+    relief = relief_of(wall_of(np.array(depths)), threads=1)
+    assert relief.step_m == pytest.approx(step_m)
+    # As fine as a step where anything is.
+    known = relief.occluding != NOTHING
+    assert known.any() == bool(np.isfinite(depths).any())
+    assert np.abs(relief.occluding[known].astype(int)).max(initial=0) <= 32_000
+
+
+PARAMS = VisibilityParams(
+    incidence_max_deg=70.0, border_share=0.05, tolerance_sigma=4.0, tolerance_cells=0.25
+)
+
+
+def surface_of(depths: NDArray[np.floating]) -> Surface:
+    wall = wall_of(depths)
+    return Surface(
+        frame=wall.frame,
+        relief=transparent_relief_of(wall, threads=1),
+        front_m=0.2,
+        tolerance_m=0.007,
+    )
+
+
+def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
+    where = scenes.frame(at_survey=True)
+    camera = replace(scenes.camera(where, aside_m=0.4), skew=2.0)
+    surface = replace(surface_of(np.zeros((4, 5))), frame=where)
+    view = view_of(camera, surface, PARAMS)
+    (foot,) = where.wall_from_world(camera.centre_world[None])
+    # The centre of the first cell is 0.
+    assert (view.column, view.row) == pytest.approx((foot[0] - 0.5, foot[1] - 0.5), abs=1e-6)
+    assert view.height_m == pytest.approx(foot[2], abs=1e-9)
+    assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, 0.2, 0.007)
+    assert view.cosine_least == pytest.approx(math.cos(math.radians(70.0)))
+    assert view.border_px == 0.05 * min(camera.width, camera.height)
+    assert not view.is_exact
+    assert view_of(camera, surface, PARAMS, is_exact=True).is_exact
+    # A pixel at least, or none would fade.
+    borderless = PARAMS.model_copy(update={"border_share": 0.0})
+    assert view_of(camera, surface, borderless).border_px == 1.0
+    # Points in metres right, down and before the wall are seen where the camera sees them.
+    at = np.random.default_rng(2).uniform([0.0, 0.0, -0.1], [1.2, 0.9, 0.1], (20, 3))
+    world = where.world_from_wall(at[:, :2] / where.gsd_m, at[:, 2])
+    flat = view.camera
+    local = flat[:9].reshape(3, 3) @ at.T + flat[9:12, None]
+    expected = camera.rotation @ world.T + camera.translation[:, None]
+    np.testing.assert_allclose(local, expected, atol=1e-6)
+    np.testing.assert_array_equal(flat[12:], camera.flat[12:])
+
+
+@pytest.mark.parametrize(("least_m", "is_seen"), [(0.1, True), (1.99, True), (2.01, False)])
+def test_a_camera_stands_before_a_wall_where_any_of_it_is_lower(
+    least_m: float, is_seen: bool
+) -> None:
+    depths = np.full((40, 40), 2.5)
+    depths[35, 36] = least_m
+    surface = surface_of(depths)
+    frame = surface.frame
+    centre = frame.world_from_wall(np.array([[20.0, 20.0]]), 2.0)[0]
+    camera = scenes.camera(scenes.frame())
+    there = replace(camera, translation=-camera.rotation @ centre)
+    assert is_before(view_of(there, surface, PARAMS), surface) == is_seen
+
+
+def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path) -> None:
+    depths = np.random.default_rng(1).normal(0.0, 0.002, (60, 60))
+    wall = wall_of(depths)
+    walls = samples.walls(wall, replace(wall, plane_index=0), buffer_m=0.15)
+    ctx = context(tmp_path)
+    first, second = surfaces_of(walls, PARAMS, ctx)
+    noise_m = depth_noise_m(wall.depth_m)
+    assert noise_m == pytest.approx(0.002, rel=0.1)
+    assert first.tolerance_m == pytest.approx(4.0 * noise_m + 0.25 * GSD_M)
+    assert first.front_m == 0.15
+    assert first.frame is wall.frame
+    assert first.relief.occluding.size == second.relief.occluding.size == 3600
+    (clear, _) = surfaces_of(walls, PARAMS, ctx, hides=False)
+    assert clear.relief.occluding.size == 0
+    assert clear.tolerance_m == first.tolerance_m
+
+
+@pytest.mark.parametrize(("most", "is_file"), [(11, True), (12, False)])
+def test_what_hides_of_a_large_wall_lies_in_a_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, most: int, is_file: bool
+) -> None:
+    monkeypatch.setattr(surfaces, "_IN_MEMORY_MOST", most)
+    ctx = context(tmp_path)
+    given = surfaces._allocated(ctx, 3, "occluding", (3, 4), np.int16)
+    assert (given.shape, given.dtype) == ((3, 4), np.int16)
+    assert isinstance(given, np.memmap) == is_file
