@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -153,3 +155,83 @@ def test_a_moved_thing_does_not_count() -> None:
     apart[:, :8] = 1.5
     found = estimate(two(apart), [None, None], is_local=False)
     assert (found.exposures[0] - found.exposures[1]) == pytest.approx([0.3] * 3, abs=0.01)
+
+
+def blocks(sizes: list[int]) -> Any:
+    """Overlaps of so many blocks."""
+    nothing = np.zeros((0, 2), dtype=np.int64)
+    return [
+        module._Overlap(layers=(0, k + 1), places=(nothing, nothing), apart=np.zeros((size, 3)))
+        for k, size in enumerate(sizes)
+    ]
+
+
+def pull(
+    matrix: NDArray[np.float64],
+    found: NDArray[np.float64],
+    apart: NDArray[np.float64],
+    priors: NDArray[np.float64],
+    sizes: list[int],
+) -> NDArray[np.float64]:
+    """How far each unknown would move by itself: nothing where robust least squares ended.
+
+    A pair's residuals have a spread, of a hundredth at least; of more than fifty blocks the others
+    say nothing new; what lies two spreads off counts half.
+    """
+    left = apart - matrix @ found
+    weights = np.empty(len(apart))
+    first = 0
+    for size in sizes:
+        part = slice(first, first + size)
+        lengths = np.abs(left[part]).mean(axis=1)
+        spread = max(0.01, 1.4826 * float(np.median(lengths)))
+        weights[part] = min(1.0, 50.0 / size) / spread**2 / (1.0 + (lengths / (2.0 * spread)) ** 2)
+        first += size
+    gradient = matrix.T @ (weights[:, None] * left) - found / priors[:, None] ** 2
+    curvature = (weights[:, None] * matrix**2).sum(axis=0) + 1.0 / priors**2
+    return gradient / curvature[:, None]
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.03, 0.3])
+@pytest.mark.parametrize("sizes", [[30, 12], [50, 51], [120, 9, 200]], ids=str)
+def test_what_is_found_is_robust_least_squares(sizes: list[int], noise: float) -> None:
+    from scipy.sparse import csr_array
+
+    rng = np.random.default_rng(9)
+    matrix = rng.normal(size=(sum(sizes), 4))
+    priors = np.array([1.0, 0.5, 0.05, 2.0])
+    true = 0.3 * priors[:, None] * rng.normal(size=(4, 3))
+    apart = matrix @ true + noise * rng.normal(size=(sum(sizes), 3))
+    apart[::9] += 1.0
+    found = module._solved([csr_array(matrix)], apart, priors, blocks(sizes))
+    # Of what the noise leaves unknown of them, a small part; it would be most of it otherwise.
+    assert np.abs(pull(matrix, found, apart, priors, sizes)).max() < 0.02 * noise + 1e-4
+
+
+@pytest.mark.parametrize("is_local", [True, False])
+def test_exposures_lenses_and_fields_are_expected_near_nothing(
+    monkeypatch: pytest.MonkeyPatch, is_local: bool
+) -> None:
+    calls: list[Any] = []
+    solved = module._solved
+
+    def kept(columns: Any, apart: Any, priors: Any, overlaps: Any) -> NDArray[np.float64]:
+        found = solved(columns, apart, priors, overlaps)
+        calls.append((np.hstack([each.toarray() for each in columns]), apart, overlaps, found))
+        return found
+
+    monkeypatch.setattr(module, "_solved", kept)
+    found = estimate(LIGHTS, RADII, is_local=is_local)
+    (first, grey, overlaps, alike), (second, apart, _, rest) = calls
+    sizes = [len(item.apart) for item in overlaps]
+    field = 0.05 if is_local else 1e-9
+    # By e, by half of that and by a twentieth: exposures, the two terms of two lenses, nodes.
+    near = np.repeat([1.0, 0.5], [4, 4])
+    # Blocks of noise: nothing else tells, and what is expected beforehand counts.
+    assert np.abs(pull(first, alike, grey, near, sizes)).max() < 0.02
+    fields = np.repeat([1.0, field], [4, 4 * 16])
+    assert np.abs(pull(second, rest, apart, fields, sizes)).max() < 0.02
+    np.testing.assert_allclose(grey[:, 0], np.concatenate([o.apart for o in overlaps]).mean(axis=1))
+    np.testing.assert_array_equal(found.exposures, rest[:4])
+    np.testing.assert_array_equal(found.lenses.ravel(), alike[4:, 0])
+    np.testing.assert_array_equal(found.nodes.reshape(64, 3), rest[4:])

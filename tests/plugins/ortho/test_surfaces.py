@@ -86,6 +86,9 @@ def test_bounds_of_blocks_are_those_of_their_cells(shape: tuple[int, int]) -> No
         known = expected > NOTHING_M
         np.testing.assert_allclose(tops[known], expected[known], atol=0.51 * relief.step_m)
     assert relief.highest_m == max(NOTHING_M, float(relief.tops.max()))
+    # For others kernels would be compiled once more.
+    assert not relief.depth.flags.writeable
+    assert not relief.occluding.flags.writeable
 
 
 @pytest.mark.parametrize("shape", SHAPES[:3], ids=str)
@@ -201,3 +204,14 @@ def test_what_hides_of_a_large_wall_lies_in_a_file(
     given = surfaces._allocated(ctx, 3, "occluding", (3, 4), np.int16)
     assert (given.shape, given.dtype) == ((3, 4), np.int16)
     assert isinstance(given, np.memmap) == is_file
+
+
+@pytest.mark.parametrize(("step_cells", "is_edge"), [(4.9, False), (5.1, True)])
+def test_a_step_of_five_cells_is_an_edge_that_hides_in_full(
+    step_cells: float, is_edge: bool
+) -> None:
+    depths = np.zeros((20, 20))
+    depths[:, 10:] = step_cells * GSD_M
+    relief = relief_of(wall_of(depths), threads=1)
+    beside = relief.occluding.reshape(20, 20)[5, 9] * relief.step_m
+    assert beside == pytest.approx(step_cells * GSD_M if is_edge else 0.0, abs=1e-5)
