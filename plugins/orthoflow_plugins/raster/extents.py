@@ -35,8 +35,8 @@ _VOXELS_MOST: Final = 1 << 22
 _SIDE_LEAST_M: Final = 0.03
 _SIDE_STEPS: Final = 3.0
 _DEPTH_STEP_M: Final = 0.025
-# Sides of relief are seldom scanned: surfaces hang together across steps of so many in depth.
-_BRIDGED_STEPS: Final = 4
+# Sides of relief are seldom scanned: surfaces hang together across depths that as many steps span.
+_BRIDGED_STEPS: Final = 5
 # A part of the surface has so many voxels on the plane.
 _SEEDS_LEAST: Final = 4
 # A line of cells beside the rectangle belongs to the wall if this share of it is covered.
@@ -291,7 +291,7 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
     occupied = np.zeros(math.prod(shape), dtype=np.bool_)
     occupied[voxels[is_before]] = True
     bridged = ndimage.maximum_filter1d(
-        occupied.reshape(shape).view(np.uint8), 2 * (_BRIDGED_STEPS // 2) + 1, axis=2
+        occupied.reshape(shape).view(np.uint8), _BRIDGED_STEPS, axis=2
     )
     labels, _ = ndimage.label(bridged, structure=np.ones((3, 3, 3)))
     is_near = np.zeros(shape, dtype=np.bool_)

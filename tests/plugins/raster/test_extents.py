@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.raster import extents
 from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.sampled_points import sampled
@@ -363,3 +365,229 @@ def test_a_frame_is_widened_by_whole_cells() -> None:
     grown = Extent(growth_m=(0.25, 0.3, 0.0, 0.59), front_m=0.1, behind_m=0.1).widened(frame)
     assert (grown.width, grown.height) == (20 + 2 + 3, 10 + 5)
     np.testing.assert_allclose(grown.origin_world, frame.origin_world - [0.2, 0.0, 0.0])
+
+
+# --- what adjoins a wall, and how it is told ---
+
+
+def rectangle_of(planes: Planes) -> Any:
+    return extents.frame_of(planes, 0, gsd_m=1.0, margin_m=0.0)
+
+
+def bound_by(adjoining: tuple[NDArray, NDArray], **changes: Any) -> Any:
+    planes = replace(planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), adjoining), **changes)
+    return extents._bound(planes, 1, rectangle_of(planes), (WIDTH_M, HEIGHT_M))
+
+
+@pytest.mark.parametrize("towards", [1.0, -1.0], ids=["from inside", "from outside"])
+@pytest.mark.parametrize("beyond_m", [-0.09, 0.0, 0.3, 0.99])
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_a_plane_bounds_the_side_that_it_lies_beside(
+    side: str, beyond_m: float, towards: float
+) -> None:
+    place = {
+        "left": upright(-beyond_m, (0.0, 3.0), towards=towards),
+        "right": upright(WIDTH_M + beyond_m, (0.0, 3.0), towards=towards),
+        "top": level(HEIGHT_M + beyond_m, (0.0, 3.0), towards=towards),
+        "bottom": level(-beyond_m, (0.0, 3.0), towards=towards),
+    }[side]
+    found = bound_by(place)
+    assert found.side == side
+    assert found.beyond_m == pytest.approx(beyond_m)
+    assert found.askew_m == pytest.approx(0.0, abs=1e-9)
+    # Three deviations of its points, 2 cm at most.
+    assert found.noise_m == pytest.approx(3.0 * NOISE_M)
+    assert found.line_m == pytest.approx(beyond_m - 3.0 * NOISE_M)
+    assert bound_by(place, rms_m=np.full(2, 0.01)).noise_m == 0.02
+    # Positive inside: at the middle of the wall by as much as that is away.
+    middle = found.offset_m + found.slopes @ [0.5 * WIDTH_M, 0.5 * HEIGHT_M, 0.2]
+    away = 0.5 * (WIDTH_M if side in ("left", "right") else HEIGHT_M) + beyond_m
+    assert middle == pytest.approx(away)
+
+
+@pytest.mark.parametrize("beyond_m", [-0.11, 1.01])
+def test_what_stands_on_the_wall_or_far_beside_it_bounds_nothing(beyond_m: float) -> None:
+    assert bound_by(upright(-beyond_m, (0.0, 3.0), towards=1.0)) is None
+    assert bound_by(level(HEIGHT_M + beyond_m, (0.0, 3.0), towards=-1.0)) is None
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 5.0, -5.0, 24.0, 28.0])
+def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
+    turn = np.radians(turn_deg)
+    # Through the left side's middle, turned about the wall's normal.
+    normal = np.array([np.cos(turn), 0.0, np.sin(turn)])
+    corners = upright(0.0, (0.0, 3.0), towards=1.0)[1]
+    point = np.array([-0.7, 0.0, 0.5 * HEIGHT_M])
+    found = bound_by((normal, corners), offset=np.array([0.0, normal @ point]))
+    # Beyond a sine of nine tenths it is neither beside nor above.
+    if abs(np.cos(turn)) < 0.9:
+        assert found is None
+        return
+    half_m = 0.5 * HEIGHT_M * abs(np.tan(turn))
+    assert found.side == "left"
+    assert found.beyond_m == pytest.approx(0.7 - half_m)
+    assert found.askew_m == pytest.approx(2.0 * half_m, abs=1e-9)
+
+
+@pytest.mark.parametrize(("lean_deg", "adjoins"), [(90.0, True), (46.0, True), (44.0, False)])
+def test_what_is_nearly_parallel_to_a_wall_bounds_nothing(
+    monkeypatch: pytest.MonkeyPatch, lean_deg: float, adjoins: bool
+) -> None:
+    monkeypatch.setattr(extents, "_stands", lambda *_: True)
+    lean = np.radians(lean_deg)
+    normal = np.array([np.sin(lean), -np.cos(lean), 0.0])
+    corners = upright(0.0, (0.0, 3.0), towards=1.0)[1]
+    planes = replace(
+        planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), (normal, corners)),
+        offset=np.array([0.0, normal @ [-0.2, 0.0, 0.0]]),
+    )
+    around: Any = None
+    size_m = (WIDTH_M, HEIGHT_M)
+    found = list(extents._bounds(planes, 0, rectangle_of(planes), size_m, around))
+    assert len(found) == adjoins
+
+
+def test_of_several_planes_beside_one_side_the_innermost_bounds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(extents, "_stands", lambda bound, *_: bound.beyond_m != 0.1)
+    planes = planes_of(
+        (0.0, WIDTH_M),
+        (0.0, HEIGHT_M),
+        *(upright(-beyond, (0.0, 3.0), towards=1.0) for beyond in (0.5, 0.1, 0.3, 0.4)),
+        level(HEIGHT_M + 0.2, (0.0, 3.0), towards=-1.0),
+    )
+    around: Any = None
+    found = extents._bounds(planes, 0, rectangle_of(planes), (WIDTH_M, HEIGHT_M), around)
+    # That of 0.1 does not stand there.
+    sides = {bound.side: bound.beyond_m for bound in found}
+    assert sides == {"left": pytest.approx(0.3), "top": pytest.approx(0.2)}
+
+
+@pytest.mark.parametrize("side", ["left", "top"])
+@pytest.mark.parametrize(
+    ("share", "before_m", "off_m", "stands"),
+    [
+        (0.32, 0.5, 0.0, True),
+        (0.28, 0.5, 0.0, False),
+        (0.32, -0.5, 0.0, True),
+        (0.32, 0.5, 0.0029, True),
+        (0.32, 0.5, 0.0031, False),
+    ],
+)
+def test_points_along_three_tenths_of_a_side_tell_that_something_stands_there(
+    side: str, share: float, before_m: float, off_m: float, stands: bool
+) -> None:
+    bound = bound_by(
+        upright(0.0, (0.0, 3.0), towards=1.0)
+        if side == "left"
+        else level(HEIGHT_M, (0.0, 3.0), towards=-1.0)
+    )
+    length_m = HEIGHT_M if side == "left" else WIDTH_M
+    # One point in each of so many steps of a tenth of a metre, and many beside the wall's ends.
+    along = 0.05 + 0.1 * np.arange(round(share * length_m / 0.1))
+    along = np.append(along, np.linspace(-0.9, -0.1, 50))
+    off = np.full(len(along), off_m)
+    places = [off, along] if side == "left" else [along, off]
+    around = extents._Around(places_m=np.stack([*places, np.full(len(along), before_m)]))
+    assert extents._stands(bound, (WIDTH_M, HEIGHT_M), around) == stands
+    # Some before and some behind the plane do not add up.
+    mixed = around.places_m.copy()
+    mixed[2, ::2] *= -1.0
+    mixed_around = extents._Around(places_m=mixed)
+    assert not extents._stands(bound, (WIDTH_M, HEIGHT_M), mixed_around)
+
+
+def test_a_plane_covers_its_parts_or_all_of_its_rectangle() -> None:
+    planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), ROOM[0])
+
+    def parts(*areas_m2: float) -> Planes:
+        corners = [[[0, 0, 1], [0, 0, 0], [a, 0, 0], [a, 0, 1]] for a in areas_m2]
+        return replace(
+            planes,
+            part_corners=np.array(corners, dtype=np.float64),
+            part_plane=np.array([0] * (len(areas_m2) - 1) + [1]),
+        )
+
+    assert extents._covered_m2(planes, 0) == pytest.approx(12.0)
+    assert extents._covered_m2(parts(2.0, 3.0, 50.0), 0) == pytest.approx(5.0)
+    # Parts may overlap, and none may be known of a plane.
+    assert extents._covered_m2(parts(9.0, 8.0, 50.0), 0) == pytest.approx(12.0)
+    assert extents._covered_m2(parts(50.0), 0) == pytest.approx(12.0)
+    assert extents._covered_m2(parts(0.0, 50.0), 0) == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize(("set_m", "searched_m"), [(None, 0.6), (0.2, 0.2), (0.5, 0.5), (0.9, 0.5)])
+def test_relief_is_looked_for_a_tenth_of_a_metre_farther_than_it_counts(
+    set_m: float | None, searched_m: float
+) -> None:
+    assert extents._searched_m(set_m, 0.5) == pytest.approx(searched_m)
+
+
+@pytest.mark.parametrize(
+    ("shape", "block", "relief_m"),
+    [
+        # Of 2000 cells one is enough, and of 8000 four: what is left of a block without its rim.
+        ((40, 50), (3, 3), 0.3),
+        ((40, 50), (2, 9), 0.0),
+        ((80, 100), (4, 4), 0.3),
+        ((80, 100), (3, 5), 0.0),
+        ((80, 100), (3, 6), 0.3),
+    ],
+)
+def test_relief_is_what_stands_out_over_more_than_a_rim(
+    shape: tuple[int, int], block: tuple[int, int], relief_m: float
+) -> None:
+    depth_m = np.zeros(shape)
+    depth_m[10 : 10 + block[0], 20 : 20 + block[1]] = 0.3
+    # Deeper than any relief, and not known.
+    depth_m[20:30, 2:12], depth_m[5:9, 5:9] = 0.61, np.inf
+    search: Any = SimpleNamespace(inside=(slice(0, shape[0]), slice(0, shape[1])))
+    found = extents._relief_m(depth_m, 0.6, search)
+    # Half a step in depth of 2.5 cm on top.
+    assert found == pytest.approx(relief_m + 0.0125)
+    nothing = np.full(shape, -np.inf)
+    assert extents._relief_m(nothing, 0.6, search) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("n_points", "size_m", "side_m"),
+    [
+        # Three steps of the points, 3 cm at least.
+        (1_000_000, (4.0, 3.0), 0.03),
+        (120_000, (4.0, 3.0), 0.03),
+        (12_000, (4.0, 3.0), 3.0 * np.sqrt(1e-3)),
+        (1_200, (4.0, 3.0), 0.3),
+        # A quarter of the shorter side at most.
+        (100, (4.0, 3.0), 0.75),
+        (10, (0.4, 0.2), 0.05),
+    ],
+)
+def test_voxels_are_as_fine_as_the_points_lie(
+    n_points: int, size_m: tuple[float, float], side_m: float
+) -> None:
+    planes = replace(
+        planes_of((0.0, size_m[0]), (0.0, size_m[1])), n_points=np.array([2 * n_points])
+    )
+    cloud = scenes.cloud_of(wall((0.0, size_m[0]), (0.0, size_m[1]))[:10])
+    # Each point of the sample stands for two.
+    points = replace(sampled(cloud), n_represented=2.0)
+    reach = Reach(front_m=None, behind_m=None, least_m=0.15)
+    search = extents._Search.of(points, planes, 0, reach)
+    assert search.slab.frame.gsd_m == pytest.approx(side_m)
+    assert (search.width_m, search.height_m) == pytest.approx(size_m)
+    # What lies a tenth of a metre farther than relief may tells that it goes on.
+    assert (search.slab.front_m, search.slab.behind_m) == pytest.approx((0.6, 1.1))
+    assert search.seed_m == planes.tolerance_m
+    # Whole cells of a metre and more about the rectangle.
+    n_beside = int(np.ceil(1.0 / side_m))
+    assert search.n_beside == n_beside
+    rows, columns = search.inside
+    assert (rows.start, columns.start) == (n_beside, n_beside)
+    lengths = (rows.stop - rows.start, columns.stop - columns.start)
+    for n_cells, length_m in zip(lengths, size_m[::-1], strict=True):
+        assert -1e-9 <= length_m - n_cells * side_m < side_m + 1e-9
+    corner = search.slab.frame.world_from_wall(np.array([[n_beside, n_beside]], dtype=float))[0]
+    np.testing.assert_allclose(corner, planes.corners[0, 0], atol=1e-9)
+    inside: Any = SimpleNamespace(places=np.array([[n_beside + 2.0, n_beside + 1.0]]))
+    np.testing.assert_allclose(search.places_m(inside)[:, 0], [2.0 * side_m, side_m])
