@@ -1,4 +1,4 @@
-"""What is prepared of a wall before photos look at it: bounds of its blocks, and cameras before it."""
+"""What is prepared of a wall before photos look at it: bounds of its blocks, cameras before it."""
 
 from __future__ import annotations
 
