@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -12,26 +12,25 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.geometry.bands import Allocate, holds_cells
-from orthoflow.products import Layer, LayerMask, Layers
-from orthoflow.sdk import Determinism, Method, Part, Ports, StepContext
+from orthoflow.products import Layer, LayerMask
+from orthoflow.sdk import Determinism, Method, Part, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
     PaintedPart,
     count_shown,
-    joined_layers,
     total_seconds,
 )
 from orthoflow_plugins.ortho.photos_on_walls import (
+    LayersOfPhotos,
     OpenedPhoto,
     PhotosOnWalls,
     VisibilityParams,
+    layers_of_photos,
     level_of_all,
     oriented_photos,
     pixels_of,
     places_in_part,
-    shared_profile,
-    warn_of_heads,
 )
 
 if TYPE_CHECKING:
@@ -109,18 +108,14 @@ class DsmBackward(Method):
             description="Cells so near to a hidden patch are not painted: edges smear there.",
         )
 
-    class In(PhotosOnWalls):
-        """The walls, the cloud they were made from, and the oriented photos."""
-
-    class Out(Ports):
-        """A layer for each wall and photo that paints on it."""
-
-        layers: Layers
-
+    In = PhotosOnWalls
+    Out = LayersOfPhotos
     maps_over: ClassVar[str] = "cameras"
     PartOut: ClassVar[type[Part]] = PaintedTiles
 
-    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PaintedTiles:
+    def run_part(
+        self, inputs: PhotosOnWalls, items: range, params: Params, ctx: StepContext
+    ) -> PaintedTiles:
         """Take photo by photo, and lay each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -165,15 +160,12 @@ class DsmBackward(Method):
         )
 
     def join(
-        self, inputs: In, parts: Sequence[PaintedTiles], params: Params, ctx: StepContext
-    ) -> Out:
+        self, inputs: PhotosOnWalls, parts: Sequence[PaintedTiles], params: Params, ctx: StepContext
+    ) -> LayersOfPhotos:
         """Put the layers of all photos in order."""
-        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
-        warn_of_heads(inputs.walls.up, oriented, ctx)
-        profile = shared_profile([photo for photo, _ in oriented], ctx)
-        layers = joined_layers(inputs.walls, parts, ctx)
-        _report(ctx, count_shown(inputs.walls, layers), parts)
-        return self.Out(layers=replace(layers, icc_profile=profile))
+        out = layers_of_photos(inputs, parts, ctx)
+        _report(ctx, count_shown(inputs.walls, out.layers), parts)
+        return out
 
 
 def _lay(

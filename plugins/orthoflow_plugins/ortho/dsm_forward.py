@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -21,26 +21,25 @@ from orthoflow.geometry.bands import (
     in_memory,
 )
 from orthoflow.geometry.levels import level_of
-from orthoflow.products import Layer, LayerMask, Layers
-from orthoflow.sdk import Determinism, Method, Part, Ports, StepContext
+from orthoflow.products import Layer, LayerMask
+from orthoflow.sdk import Determinism, Method, Part, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
     PaintedPart,
     count_shown,
-    joined_layers,
     total_seconds,
 )
 from orthoflow_plugins.ortho.photos_on_walls import (
+    LayersOfPhotos,
     OpenedPhoto,
     PhotosOnWalls,
     VisibilityParams,
+    layers_of_photos,
     level_of_all,
     oriented_photos,
     pixels_of,
     places_in_part,
-    shared_profile,
-    warn_of_heads,
 )
 
 if TYPE_CHECKING:
@@ -86,18 +85,14 @@ class DsmForward(Method):
             "the gap; 0 fills nothing.",
         )
 
-    class In(PhotosOnWalls):
-        """The walls, the cloud they were made from, and the oriented photos."""
-
-    class Out(Ports):
-        """A layer for each wall and photo that paints on it."""
-
-        layers: Layers
-
+    In = PhotosOnWalls
+    Out = LayersOfPhotos
     maps_over: ClassVar[str] = "cameras"
     PartOut: ClassVar[type[Part]] = PaintedPart
 
-    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PaintedPart:
+    def run_part(
+        self, inputs: PhotosOnWalls, items: range, params: Params, ctx: StepContext
+    ) -> PaintedPart:
         """Take photo by photo, and throw each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -133,15 +128,12 @@ class DsmForward(Method):
         )
 
     def join(
-        self, inputs: In, parts: Sequence[PaintedPart], params: Params, ctx: StepContext
-    ) -> Out:
+        self, inputs: PhotosOnWalls, parts: Sequence[PaintedPart], params: Params, ctx: StepContext
+    ) -> LayersOfPhotos:
         """Put the layers of all photos in order."""
-        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
-        warn_of_heads(inputs.walls.up, oriented, ctx)
-        profile = shared_profile([photo for photo, _ in oriented], ctx)
-        layers = joined_layers(inputs.walls, parts, ctx)
-        _report(ctx, count_shown(inputs.walls, layers), parts)
-        return self.Out(layers=replace(layers, icc_profile=profile))
+        out = layers_of_photos(inputs, parts, ctx)
+        _report(ctx, count_shown(inputs.walls, out.layers), parts)
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -14,8 +14,9 @@ from orthoflow.errors import MethodError
 from orthoflow.files.containers import icc_profile, stated_bits
 from orthoflow.files.images import decode_image, decode_levels
 from orthoflow.geometry.levels import Colours, Level, in_levels
-from orthoflow.products import Camera, Cameras, Photo, Photos, PointCloud, Walls
+from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import MethodParams, Ports, StepContext
+from orthoflow_plugins.ortho.layers import PaintedPart, joined_layers
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
@@ -34,6 +35,12 @@ class PhotosOnWalls(Ports):
     photos: Photos
     cameras: Cameras
     cloud: PointCloud | None = None
+
+
+class LayersOfPhotos(Ports):
+    """A layer for each wall and photo that paints on it."""
+
+    layers: Layers
 
 
 class VisibilityParams(MethodParams):
@@ -126,6 +133,17 @@ def warn_of_heads(
         f"down, so do walls, orthoimages and the names of floor and ceiling; set up: {opposite} "
         "of read.scan"
     )
+
+
+def layers_of_photos(
+    inputs: PhotosOnWalls, parts: Sequence[PaintedPart], ctx: StepContext
+) -> LayersOfPhotos:
+    """Put the layers of all photos in order, with the profile of their colours."""
+    oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+    warn_of_heads(inputs.walls.up, oriented, ctx)
+    profile = shared_profile([photo for photo, _ in oriented], ctx)
+    layers = joined_layers(inputs.walls, parts, ctx)
+    return LayersOfPhotos(layers=replace(layers, icc_profile=profile))
 
 
 def places_in_part(cameras: Cameras, items: range) -> list[int]:
