@@ -25,7 +25,7 @@ os.environ["ORTHOFLOW_KERNELS"] = kernels
 
 from numba.core import event  # noqa: E402 - it reads the variable
 
-from orthoflow.catalog import discover_catalog  # noqa: E402
+from orthoflow.catalog.discovery import discover_catalog  # noqa: E402
 from orthoflow.engine.plan import RunOptions, plan_run  # noqa: E402
 from orthoflow.engine.scheduling import execute  # noqa: E402
 from orthoflow.engine.store import Store  # noqa: E402

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.loading import LoadingMeter
 from orthoflow.engine.store import Store
 from orthoflow.products import PointCloud

@@ -23,7 +23,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli.warm import _RECIPES, _new_cells
 from orthoflow.engine import executors
 from orthoflow.engine.compiling_ahead import FORETOLD

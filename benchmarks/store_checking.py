@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine import store
 from orthoflow.engine.durability import folder_size
 from orthoflow.engine.plan import RunOptions, plan_run

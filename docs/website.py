@@ -22,7 +22,8 @@ from typing import Final
 
 import click
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli.program import program
 from orthoflow.report.metric_words import metric_words
 from orthoflow.report.rankings import Sense, sense_of

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.engine.events import RunEvent
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run

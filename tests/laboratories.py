@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import Workflow

@@ -99,7 +99,7 @@ def imported_modules(tree: ast.Module, known: Collection[str]) -> set[str]:
 
 def test_loading_every_method_loads_no_heavy_or_slow_library() -> None:
     loaded = run_python(
-        "from orthoflow.catalog import discover_catalog\n"
+        "from orthoflow.catalog.discovery import discover_catalog\n"
         "catalog = discover_catalog()\n"
         "[entry.load() for entry in catalog.methods.values()"
         " if entry.distribution.name == 'orthoflow-tls']\n"

@@ -22,7 +22,8 @@ from unittest import mock
 import click
 import pytest
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli.options import Changes
 from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,8 @@ from types import ModuleType
 
 import pytest
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -51,7 +51,7 @@ class _Verdict:
 
 
 def _check(workflow: str, changes: Changes) -> _Verdict:
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.cells import expand_cells
     from orthoflow.workflow.doubts import doubts_about
     from orthoflow.workflow.inputs import resolve_input_files

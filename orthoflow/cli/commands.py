@@ -161,7 +161,7 @@ class LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            from orthoflow.catalog import nearest
+            from orthoflow.catalog.wording import nearest
 
             near = nearest(args[0], self._lazy)
             if not near or "did you mean" in error.message.lower():

@@ -68,7 +68,7 @@ def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
 
 def _diagnose_plugins() -> list[Diagnosis]:
     try:
-        from orthoflow.catalog import discover_catalog
+        from orthoflow.catalog.discovery import discover_catalog
 
         catalog = discover_catalog()
     except ImportError as error:

@@ -14,7 +14,7 @@ from orthoflow.cli.tables import echo
 @workflow_arguments
 def graph(workflow: str, changes: Changes) -> int:
     """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.mermaid import mermaid
 
     catalog = discover_catalog()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from orthoflow.catalog import Catalog
+    from orthoflow.catalog.catalog import Catalog
     from orthoflow.workflow.format import Workflow
 
 # Any: click decorates functions as well as commands.

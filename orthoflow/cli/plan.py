@@ -41,7 +41,7 @@ def plan(
 
     Nothing is computed. "unknown yet" means that it depends on results that are not there yet.
     """
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
     from orthoflow.workflow.cells import expand_cells

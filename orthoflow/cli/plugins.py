@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.catalog import Catalog, DistributionInfo, MethodEntry, discover_catalog
+from orthoflow.catalog.catalog import Catalog, MethodEntry
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
 from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import json_option

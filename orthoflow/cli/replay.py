@@ -62,7 +62,7 @@ def replay(
     it has the same bits, is equal within the tolerance of its type, or differs, and ends with 3
     when one differs.
     """
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.run_folder import new_run_folder, new_run_id
     from orthoflow.engine.store import Store
@@ -180,7 +180,7 @@ class _Call:
         return executed_and_written(run, write).run
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
-        from orthoflow.catalog import discover_catalog
+        from orthoflow.catalog.discovery import discover_catalog
         from orthoflow.engine.store import Store
         from orthoflow.records.distances import RunProducts, product_distances
 

@@ -92,7 +92,7 @@ def prepared(
     with working_on("reading the workflow, its inputs and what is stored"):
         # What takes a second to load is loaded in here.
         import orthoflow.report  # noqa: F401
-        from orthoflow.catalog import discover_catalog
+        from orthoflow.catalog.discovery import discover_catalog
         from orthoflow.engine.plan import RunOptions, plan_run
         from orthoflow.engine.store import Store
         from orthoflow.workflow.cells import expand_cells

@@ -229,7 +229,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         return
     for name in names:
         if name not in known:
-            from orthoflow.catalog import nearest
+            from orthoflow.catalog.wording import nearest
 
             near = nearest(name, known)
             hint = f"did you mean {near!r}?" if near else "--json has the names of all"

@@ -18,7 +18,7 @@ def schema(*, as_json: bool) -> int:
     Save it and name it in an editor to get completion and checks while writing. The output is
     JSON with or without --json.
     """
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.schema import workflow_schema
 
     del as_json

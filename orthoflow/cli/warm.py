@@ -17,7 +17,7 @@ from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, duration, echo, echo_json, size
 
 if TYPE_CHECKING:
-    from orthoflow.catalog import Catalog
+    from orthoflow.catalog.catalog import Catalog
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import CellResult
     from orthoflow.engine.store import Store
@@ -102,7 +102,7 @@ class _Call:
 
 
 def _warm(workflow: str | None) -> Warmed:
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.compiled_code import VARIABLE, warm_folder
     from orthoflow.engine.durability import size_of, writing_to
     from orthoflow.errors import StoreError

@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final, TypeAlias, cast
 
-from orthoflow.catalog import Catalog, MethodEntry
+from orthoflow.catalog.catalog import Catalog, MethodEntry
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.kernel_sources import kernel_sources

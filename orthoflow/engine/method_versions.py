@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Final
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.environment import python_path
 from orthoflow.engine.keys import MethodFacts, method_facts
 from orthoflow.errors import OrthoflowError

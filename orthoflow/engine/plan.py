@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from orthoflow.alike import first_few
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.keys import (

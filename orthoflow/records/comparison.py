@@ -245,7 +245,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     Raises:
         RecordError: a record is damaged.
     """
-    from orthoflow.catalog import discover_catalog  # noqa: PLC0415 - loads plugins
+    from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     readdressed = _readdressed(left, right)
     # How the second run's cells are called here -> how the run itself calls them.

@@ -12,7 +12,7 @@ from orthoflow_provenance.errors import InputFileError, RecordFormatError
 from orthoflow_provenance.model import PublishedFile, RecordedCell, RunRecord
 from orthoflow_provenance.writer import write_record
 
-from orthoflow.catalog import NAME_PATTERN
+from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
 from orthoflow.engine.store import Store

@@ -18,7 +18,7 @@ from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 from orthoflow.records.runs import Run
 
 if TYPE_CHECKING:
-    from orthoflow.catalog import Catalog
+    from orthoflow.catalog.catalog import Catalog
     from orthoflow.engine.store import Store
 
 Verdict = Literal["identical", "within tolerance", "different", "not measured"]

@@ -52,7 +52,7 @@ def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterat
 
 def _published(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
     """Let the products of a record publish their files: address -> port -> file -> SHA-256."""
-    from orthoflow.catalog import discover_catalog  # noqa: PLC0415 - loads plugins
+    from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     catalog = discover_catalog()
     found: dict[str, dict[str, dict[Path, str]]] = {}

@@ -24,7 +24,7 @@ from orthoflow.workflow.format import StepVariant, Workflow
 from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:
-    from orthoflow.catalog import Catalog
+    from orthoflow.catalog.catalog import Catalog
     from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.store import Store
 

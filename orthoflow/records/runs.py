@@ -169,7 +169,7 @@ class Run:
             RecordError: the record holds only the digest of the output, or is damaged.
             PluginError: no installed plugin knows the product's type.
         """
-        from orthoflow.catalog import discover_catalog  # noqa: PLC0415 - only products need it
+        from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - only products need it
 
         payload = self.payload(address, port)
         return discover_catalog().product_class(payload.type_name).from_payload(payload)

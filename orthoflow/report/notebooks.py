@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame

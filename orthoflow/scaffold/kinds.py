@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow import products
-from orthoflow.catalog import Catalog, MethodEntry
+from orthoflow.catalog.catalog import Catalog, MethodEntry
 from orthoflow.errors import PluginError
 from orthoflow.sdk import PortSpec, port_specs
 

@@ -12,7 +12,9 @@ from typing import Final
 
 import jinja2
 
-from orthoflow.catalog import NAME_PATTERN, Catalog, did_you_mean
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import NAME_PATTERN
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
 from orthoflow.scaffold.kinds import KindPorts, kind_ports, taken_ports

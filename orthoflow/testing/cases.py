@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import ValidationError
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import package_path
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import ArgumentError, OrthoflowError, ProductError

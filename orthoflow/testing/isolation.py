@@ -23,7 +23,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.store import Store
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial

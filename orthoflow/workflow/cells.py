@@ -12,7 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from orthoflow.catalog import Catalog, did_you_mean
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.comparison import (

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Position, Table, Value, join
 from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE

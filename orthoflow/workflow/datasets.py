@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Entry, Table, join, plain
 from orthoflow.workflow.dataset_files import read_rows, read_text

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Entry, Position, Table, plain, read_yaml
 from orthoflow.workflow.comparison import check_baseline, first_variants, read_compare

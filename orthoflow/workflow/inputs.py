@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.alike import first_few
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import InputError
 from orthoflow.files.yaml_positions import Value, join
 from orthoflow.products.input_files import InputFiles

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.format import StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.methods import describe_method
 from orthoflow.workflow.shapes import INPUTS_NAME

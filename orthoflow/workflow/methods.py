@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.sdk.methods import Method, PortSpec, port_specs
 
 

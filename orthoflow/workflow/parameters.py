@@ -12,9 +12,8 @@ from typing import TypeAlias
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from orthoflow.catalog import did_you_mean
 from orthoflow.catalog.foreign_code import foreign_code
-from orthoflow.catalog.wording import describe_error
+from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.files.yaml_positions import (
     Listing,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
 
 _INSTALLED: Final = Path(__file__).parent / "shipped"

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel, Field, ValidationError
 
-from orthoflow.catalog import NAME_PATTERN
+from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import WorkflowError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.format import CALL, FILE, PARAMS, STEP, STEPS, SWEPT, USE, VARIANTS

@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
-from orthoflow.catalog import NAME_PATTERN, did_you_mean
+from orthoflow.catalog.discovery import NAME_PATTERN
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.files.yaml_positions import (
     Entry,
     Listing,

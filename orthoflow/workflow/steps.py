@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Entry, Position, Table, Value, join
 from orthoflow.sdk.hooks import KindSpec

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
-from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.files.yaml_positions import join
 from orthoflow.sdk.hooks import FILES
 from orthoflow.workflow.format import WorkflowStep

@@ -34,7 +34,7 @@ def make(name: str) -> Path:
     from orthoflow_provenance.model import RecordedEnvironment
     from orthoflow_provenance.writer import write_record
 
-    from orthoflow.catalog import discover_catalog
+    from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.scheduling import execute
     from orthoflow.engine.store import Store

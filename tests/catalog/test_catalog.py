@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
@@ -87,7 +88,7 @@ def test_listing_plugins_loads_no_heavy_library() -> None:
     program = textwrap.dedent(
         """
         import sys, json
-        from orthoflow.catalog import discover_catalog
+        from orthoflow.catalog.discovery import discover_catalog
         catalog = discover_catalog()
         heavy = {"numpy", "pydantic", "networkx", "h5py", "ruamel.yaml"} & set(sys.modules)
         print(json.dumps([sorted(catalog.methods), sorted(heavy)]))

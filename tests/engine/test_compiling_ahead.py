@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine import compiling_ahead
 from orthoflow.engine.compiled_code import DONE
 from orthoflow.engine.compiling_ahead import FORETOLD, AheadCompiler

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import MethodEntry, discover_catalog
+from orthoflow.catalog.catalog import MethodEntry
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.kernel_sources import kernel_sources
 from orthoflow.engine.keys import compiled_digest, framework_files
 from tests.laboratories import write_distribution

@@ -13,7 +13,8 @@ from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.read.photos import ReadPhotos
 from orthoflow_plugins.read.scan import ReadScan
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,

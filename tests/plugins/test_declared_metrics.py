@@ -12,7 +12,7 @@ from pathlib import Path
 import orthoflow_plugins
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.sdk import Method
 
 _PLUGINS = Path(orthoflow_plugins.__file__).parent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from tests.parameter_record import RECORD, parameters
 
 METHODS = [

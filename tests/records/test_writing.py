@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
 from orthoflow.engine.scheduling import RunOutcome, execute

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from orthoflow_provenance.model import Metric
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import comparison_columns

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.keys import compiled_digest
 from orthoflow.engine.store import Store
 from tests.forked_commands import run_command

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import orthoflow
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.scheduling import execute
 from orthoflow.engine.store import Store

@@ -9,7 +9,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.files.images import encode_jpeg
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.products import Cameras, InputFiles, Product

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from tests.laboratories import laboratory_catalog
 
 

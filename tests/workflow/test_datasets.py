@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
 from orthoflow.workflow.cells import Cell, expand_cells
 from orthoflow.workflow.document import load_workflow

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.problems import (

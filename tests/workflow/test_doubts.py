@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.doubts import doubts_about
 from tests.laboratories import GOOD, load
 

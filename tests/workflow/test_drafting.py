@@ -11,7 +11,7 @@ import laspy
 import numpy as np
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
 from orthoflow.workflow.document import load_workflow

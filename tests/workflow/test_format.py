@@ -9,7 +9,8 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.files.yaml_positions import read_yaml
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import INPUTS, STEPS

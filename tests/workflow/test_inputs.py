@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import InputError
 from orthoflow.workflow import inputs
 from orthoflow.workflow.document import load_workflow

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.problems import InvalidWorkflowError
 from tests.laboratories import (

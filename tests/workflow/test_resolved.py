@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import Workflow

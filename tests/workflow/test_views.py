@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from orthoflow.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.mermaid import mermaid
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows

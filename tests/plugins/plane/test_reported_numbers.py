@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoflow.catalog import discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes, PointLabels
 from orthoflow.sdk import StepContext
