@@ -6,6 +6,7 @@ All of them first; `--only`, `--from` and `--until` then choose among them.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
@@ -21,6 +22,7 @@ from orthoflow.workflow.comparison import (
     check_cell_count,
     combinations,
     is_excluded,
+    require_few_cells,
 )
 from orthoflow.workflow.format import DATA, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.inputs import present_inputs
@@ -28,6 +30,8 @@ from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.shapes import Reference
 from orthoflow.workflow.wiring import StepGraph, step_graph, topological_steps
 
+# The kind whose methods say how good what others made is.
+_JUDGING: Final = "inspect"
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
 
@@ -63,7 +67,8 @@ class Cell:
         step: name of the step.
         assignment: step -> variant for every varied step that reaches this cell, itself included,
             and `data` -> dataset in front.
-        repeat: 0 for the first; downstream cells use the first.
+        repeat: 0 for the first, which downstream cells use; but inspections of what has randomness
+            are repeated with it.
         method: method id.
         params: resolved parameters, defaults included, JSON.
         params_set: parameters as written in the file or set on the command line, JSON.
@@ -253,7 +258,9 @@ class _Expansion:
                     continue
                 made[frozenset(assignment.items())] = node
                 if node.cell.address not in cells:
-                    cells.update({cell.address: cell for cell in self._repeats(step, node.cell)})
+                    repeats = self._repeats(step, node.cell, cells)
+                    cells.update({cell.address: cell for cell in repeats})
+                    require_few_cells(self.workflow, len(cells))
         return tuple(cells.values())
 
     def _takes_data(self, name: str) -> bool:
@@ -285,7 +292,7 @@ class _Expansion:
         before = graph.before(name) | {name}
         return sorted(before, key=self.rank.__getitem__)
 
-    def _repeats(self, step: WorkflowStep, cell: Cell) -> list[Cell]:
+    def _repeats(self, step: WorkflowStep, cell: Cell, before: Mapping[str, Cell]) -> list[Cell]:
         count = 1 if cell.skip_reason else step.variant(_variant_name(step, cell)).repeat
         repeats = [
             replace(
@@ -296,7 +303,39 @@ class _Expansion:
             )
             for repeat in range(1, count)
         ]
-        return [cell, *repeats]
+        return [cell, *(repeats or self._judged_repeats(cell, before))]
+
+    def _judged_repeats(self, cell: Cell, before: Mapping[str, Cell]) -> Iterator[Cell]:
+        """Give the inspections of the other repeats of what an inspection looks at.
+
+        Without them nobody would know how far what they find scatters. That takes a method with
+        randomness, whose products it takes itself, and nothing that followed from the first only.
+        """
+        if cell.skip_reason or cell.method.partition(".")[0] != _JUDGING:
+            return
+        sources = {given.address for given in cell.inputs.values() if isinstance(given, CellOutput)}
+        repeated = [
+            name
+            for name in sources
+            if f"{name}#1" in before
+            and self.methods[before[name].method].method.determinism != "exact"
+        ]
+        if len(repeated) != 1:
+            return
+        (source,) = repeated
+        if any(source in _all_before(name, before) for name in sources):
+            return
+        for repeat in itertools.count(1):
+            again = f"{source}#{repeat}"
+            if again not in before:
+                return
+            inputs = {
+                port: replace(given, address=again)
+                if isinstance(given, CellOutput) and given.address == source
+                else given
+                for port, given in cell.inputs.items()
+            }
+            yield replace(cell, address=f"{cell.address}#{repeat}", repeat=repeat, inputs=inputs)
 
     def _node(self, step: WorkflowStep, full: Mapping[str, str]) -> _Node:
         variant = step.variant(full.get(step.name, ""))
@@ -409,6 +448,18 @@ class _Expansion:
             timeout_s=variant.timeout_s,
             skip_reason=skip_reason,
         )
+
+
+def _all_before(address: str, cells: Mapping[str, Cell]) -> set[str]:
+    """Addresses of all that a cell comes from."""
+    found: set[str] = set()
+    waiting = [address]
+    while waiting:
+        for given in cells[waiting.pop()].inputs.values():
+            if isinstance(given, CellOutput) and given.address not in found:
+                found.add(given.address)
+                waiting.append(given.address)
+    return found
 
 
 def _reason(*causes: str) -> str:

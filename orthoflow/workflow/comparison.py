@@ -130,7 +130,17 @@ def check_cell_count(
         _count_cells(workflow, steps) * (n_data if name in by_data else 1)
         for name, steps in steps_of.items()
     )
+    require_few_cells(workflow, count)
+
+
+def require_few_cells(workflow: Workflow, count: int) -> None:
+    """Refuse more cells than anybody can run.
+
+    Raises:
+        WorkflowError: there are.
+    """
     if count > MOST_CELLS:
+        n_data = len(workflow.chosen_data)
         of_what = "datasets, combinations" if n_data else "combinations"
         fewer = "fewer datasets (--only-data), fewer variants" if n_data else "fewer variants"
         raise WorkflowError(

@@ -141,7 +141,8 @@ REPEAT: Final = Key(
     name="repeat",
     shape=whole_number(minimum=1, maximum=MOST_REPEATS),
     meaning="How many runs with seeds of their own; of a method without randomness, to time it. "
-    "What follows takes the first.",
+    "An inspection that takes products with randomness looks at every repeat, all else at the "
+    "first.",
     example="10",
     default="1",
 )

@@ -30,6 +30,8 @@ _SCAN_SUFFIXES: Final = tuple(
 )
 _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
+# What a run leaves in its folder: pictures in there are no photos.
+_OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
 DEEPEST: Final = 3
 MOST_FILES: Final = 20_000
 
@@ -73,6 +75,9 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     files = [path for path in inside if path.is_file()]
     names = {path.name.lower() for path in files}
+    if depth and not _OF_RUNS.isdisjoint(names):
+        yield Recognised(kind="unknown", path=folder, said="a folder of results")
+        return
     if any({f"images{end}", f"cameras{end}"} <= names for end in (".bin", ".txt")):
         yield _read("cameras", folder, lambda _: _cameras_said(files))
         return

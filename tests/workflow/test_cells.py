@@ -180,6 +180,52 @@ def test_repeats_have_seeds_of_their_own_and_downstream_uses_the_first(
     )
 
 
+JUDGED = """\
+orthoflow: 1
+steps:
+  room: {use: simulate.room}
+  plane: {use: plane.hough2d, in: {cloud: room.cloud}}
+  other: {use: plane.ransac, in: {cloud: room.cloud}, repeat: 3}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: plane.planes}}
+  ortho: {use: ortho.direct, in: {walls: wall.walls, cloud: room.cloud}}
+  mosaic: {use: mosaic.seams, in: {layers: ortho.layers}}
+  check:
+    use: inspect.truth
+    in: {orthoimages: mosaic.orthoimages, walls: wall.walls, truth: room.truth,
+         planes: other.planes}
+"""
+
+
+def test_an_inspection_looks_at_every_repeat_of_what_has_randomness(
+    catalog: Catalog, write: Path
+) -> None:
+    cells = cells_of(JUDGED, write, catalog)
+    assert addresses(cells, "check") == ["check", "check#1", "check#2"]
+    for repeat, mark in enumerate(("", "#1", "#2")):
+        check = cells[f"check{mark}"]
+        assert check.repeat == repeat
+        assert check.inputs["planes"] == CellOutput(address=f"other{mark}", port="planes")
+        assert check.inputs["walls"] == CellOutput(address="wall", port="walls")
+        # What differs is what it looks at, not how it looks.
+        assert check.seed == cells["check"].seed
+
+
+@pytest.mark.parametrize(
+    ("what", "instead"),
+    [
+        # Repeats that only time a method are all alike.
+        ("other: {use: plane.ransac", "other: {use: plane.hough2d"),
+        # Walls of the first repeat beside planes of another would be no result of anything.
+        ("planes: plane.planes", "planes: other.planes"),
+    ],
+)
+def test_an_inspection_is_not_repeated_for_what_does_not_differ_or_fit(
+    catalog: Catalog, write: Path, what: str, instead: str
+) -> None:
+    assert what in JUDGED
+    assert addresses(cells_of(JUDGED.replace(what, instead), write, catalog), "check") == ["check"]
+
+
 def test_the_seed_is_the_start_of_a_digest_and_exact_in_a_double() -> None:
     digest = hashlib.sha256(b'["orthoflow/seed", 1, 1729, "plane.ransac", 2]').digest()
     seed = derive_seed(1729, "plane.ransac", 2)

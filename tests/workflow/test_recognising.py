@@ -154,6 +154,21 @@ def test_so_many_files_are_looked_at(
         assert len(recognised([tmp_path])) == 3
 
 
+def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "first"
+    (run / "figures").mkdir(parents=True)
+    for name in ("run.h5", "sheet.png", "figures/plan.png"):
+        (run / name).touch()
+    (tmp_path / "photo.jpg").touch()
+    found = {one.path: (one.kind, one.said) for one in recognised([tmp_path])}
+    assert found == {
+        tmp_path / "photo.jpg": ("photos", "a photo"),
+        run: ("unknown", "a folder of results"),
+    }
+    # Who names it means it.
+    assert {one.kind for one in recognised([run])} == {"photos", "unknown"}
+
+
 def test_a_model_of_cameras_is_one_thing(tmp_path: Path) -> None:
     model = tmp_path / "model"
     model.mkdir()
