@@ -119,6 +119,9 @@ def test_a_tie_that_was_rejected_or_of_a_refused_photo_is_not_written(tmp_path: 
     # Grey, and with the length of the residual as their error.
     assert {tuple(line.split()[4:8]) for line in points} == {("128", "128", "128", "5.0")}
     assert [line.split()[0] for line in points] == [str(n + 1) for n in range(len(points))]
+    # Nor one of a photo that is not there at all.
+    fewer = write_colmap_model(tmp_path, replace(all_kept, cameras=cameras.cameras[:3]))
+    assert fewer.n_points == int(kept.sum())
 
 
 def test_without_ties_the_cameras_are_written(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from orthoflow.errors import ProductError
 from orthoflow.products import (
     Camera,
     Cameras,
+    Intrinsics,
     JsonValue,
     Payload,
     ResidualRow,
@@ -192,3 +193,14 @@ def test_walls_and_radii_of_another_shape_are_refused() -> None:
         TieWall(corners_world=((0.0, 0.0, 0.0),), normal_world=(0.0, -1.0, 0.0))
     with pytest.raises(ProductError, match="ties of 2 photos have 1 search radii"):
         ties(search_radius_px=(22.0,))
+
+
+@pytest.mark.parametrize(("skew", "kept"), [(0.0, None), (0.75, 0.75)])
+def test_a_lens_has_a_skew_where_its_axes_are_not_square(skew: float, kept: float | None) -> None:
+    camera = samples.camera(
+        np.eye(3), np.zeros(3), fx=800.0, fy=820.0, cx=500.0, cy=400.0, width=1000, height=800
+    )
+    lens = Intrinsics.of(dataclasses.replace(camera, skew=skew), source="survey")
+    assert (lens.skew, lens.source, lens.width, lens.height) == (kept, "survey", 1000, 800)
+    assert lens.posed().skew == skew
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (800.0, 820.0, 500.0, 400.0)

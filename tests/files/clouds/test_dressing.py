@@ -200,3 +200,19 @@ def test_a_field_is_written_where_it_is_known() -> None:
     assert (full.rgb == 7).all()
     (unnumbered,) = dressed(photo_colours=colours).blocks()
     assert "photo" not in unnumbered.fields()
+
+
+def test_what_no_colour_is_known_for_is_grey() -> None:
+    cloud = corner(intensity=np.linspace(0.0, 1.0, len(CORNER), dtype=np.float32))
+    (plain,) = replace(dressed(cloud), colouring="intensity").blocks()
+    assert (plain.rgb == plain.rgb[:, :1]).all()
+    assert len(np.unique(plain.rgb)) > 100
+    # Without planes there is no deviation, without labels no plane to be told by its colour.
+    for colouring in ("deviation", "plane", "rgb"):
+        (block,) = replace(dressed(cloud), colouring=colouring).blocks()
+        np.testing.assert_array_equal(block.rgb, plain.rgb)
+    labels = PointLabels(plane_index=IS_FLOOR.astype(np.int16))
+    for colouring in ("deviation", "plane"):
+        known = dressed(cloud, planes=planes(), labels=labels)
+        (block,) = replace(known, colouring=colouring).blocks()
+        assert (block.rgb != plain.rgb).any()

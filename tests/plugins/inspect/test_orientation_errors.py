@@ -21,7 +21,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     tie_findings,
 )
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab
@@ -156,6 +156,10 @@ def test_points_on_a_wall_lie_in_its_raster_and_buffer_on_a_surface_that_faces_a
     np.testing.assert_array_equal(_on_walls(seen, walls, scene), [case[4] for case in cases])
 
 
+def no_rays(_: NDArray[np.float64]) -> NDArray[np.float64]:
+    raise GeometryError("the lens model cannot be undone there")
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool) -> None:
     scene: Any = SimpleNamespace(origin=np.array([10.0, 20.0, 30.0]), normal=FACING[2:] * -1.0)
@@ -184,6 +188,8 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     assert pixels.shape == (24 * 18, 2)
     np.testing.assert_allclose(np.unique(pixels[:, 0]), 1000.0 * (np.arange(24) + 0.5) / 24.0)
     np.testing.assert_allclose(np.unique(pixels[:, 1]), 800.0 * (np.arange(18) + 0.5) / 18.0)
+    unknown: Any = SimpleNamespace(shifted=lambda _: SimpleNamespace(rays_world=no_rays))
+    assert _error_on_walls(unknown, true, walls, scene, views) == math.inf
     nothing = one_wall(frame, front_m=0.1, behind_m=-1.0)
     assert _error_on_walls(found, true, nothing, scene, views) is None
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from orthoflow_plugins.inspect import plane_errors
 
 from orthoflow.geometry import Plane
 from orthoflow.products import Finding, Planes
+from orthoflow.sdk import StepContext
 from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -105,6 +109,40 @@ def test_the_worst_of_all_walls_has_no_sign() -> None:
     (worst,) = plane_errors.worst_plane_findings(findings)
     assert worst == Finding(name="plane_offset_mm", value=7.0, unit="mm")
     assert plane_errors.worst_plane_findings([]) == []
+
+
+def test_planes_without_labels_are_compared_alone(tmp_path: Path) -> None:
+    truth: Any = SimpleNamespace(planes=floors(0.0, 3.0))
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    found = plane_errors.inspect_planes(floors(-0.01, 3.004), None, truth, ctx)
+    by_name = counts(list(found.findings))
+    assert by_name["true_planes_found"] == 2.0
+    assert not any("label" in name for name in by_name)
+    # The main one without a name, the worst of both without a sign, and each by its name.
+    offsets_mm = {name: value for name, value in by_name.items() if "offset" in name}
+    assert offsets_mm == pytest.approx(
+        {
+            "plane_offset_mm": -10.0,
+            "worst_plane_offset_mm": 10.0,
+            "plane_offset_mm[floor 0]": -10.0,
+            "plane_offset_mm[floor 1]": 4.0,
+        }
+    )
+    told = {item.name: item.value for item in ctx.metrics}
+    expected = {name: value for name, value in by_name.items() if "[" not in name}
+    assert told == expected | {"main_found": 1.0}
+    assert ctx.warnings == []
+
+
+def test_a_main_wall_that_was_not_found_is_told(tmp_path: Path) -> None:
+    truth: Any = SimpleNamespace(planes=floors(0.0, 3.0))
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    plane_errors.inspect_planes(floors(3.0), None, truth, ctx)
+    (warning,) = ctx.warnings
+    assert "floor 0, is none of the 1 planes" in warning
+    told = {item.name: item.value for item in ctx.metrics}
+    assert (told["main_found"], told["true_planes_found"]) == (0.0, 1.0)
+    assert "plane_offset_mm" not in told
 
 
 def test_points_are_counted_by_both_labels() -> None:

@@ -50,6 +50,23 @@ def test_a_raster_laid_elsewhere_is_told_with_the_way_it_moved(tmp_path: Path) -
     assert f"{30 * GSD_M:+.4g} m right and {-40 * GSD_M:+.4g} m down" in warning
 
 
+@pytest.mark.parametrize(
+    ("n_points", "share", "is_told"),
+    [(4, 0.92, True), (4, 0.88, False), (3, 1.0, True), (2, 1.0, False)],
+)
+def test_three_points_tell_another_raster_where_nine_tenths_of_what_they_are_off_is_alike(
+    tmp_path: Path, n_points: int, share: float, is_told: bool
+) -> None:
+    places = PLACES[:n_points]
+    # Turned about their centre, they are off in no direction and on cells of the same size.
+    turned = (places - places.mean(axis=0)) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    size = np.sqrt((turned**2).sum(axis=1).mean())
+    off = np.array([24.0, -32.0]) + 40.0 * np.sqrt(1.0 / share**2 - 1.0) / size * turned
+    warnings, metrics = said(tmp_path, points_at(surveyed()[:n_points], pixels=places + off))
+    assert metrics["rms_mm"] == pytest.approx(1e3 * GSD_M * 40.0 / share)
+    assert [("laid otherwise" in warning) for warning in warnings] == [True] * is_told
+
+
 @pytest.mark.parametrize("off_cells", [[3.0, 4.0], [-12.0, 9.0]])
 def test_an_orthoimage_that_is_off_by_cells_is_a_result_and_no_doubt(
     tmp_path: Path, off_cells: list[float]
