@@ -241,8 +241,6 @@ def _spread(candidate: Candidate) -> str:
         if candidate.rule.quadrants_are_strict:
             return f"a quarter of the photo has {count} ties, each needs {n_least}"
         worst_m = candidate.worst_in_quarter_m(quarter)
-        if worst_m == 0.0:
-            continue
         most_m = candidate.rule.sigma_wall_most_gsd * candidate.gsd_m if candidate.gsd_m else 0.0
         if worst_m > most_m:
             return (

@@ -271,6 +271,8 @@ def test_quarters_without_ties_must_be_known_from_the_others(quarter: int) -> No
     assert reason(2, 0.01, rule=strict) == ""
     unknown = (replace(WALL, gsd_m=None),)
     assert reason(1, 0.0001, known=unknown).endswith("with a predicted error of 0.1 mm")
+    # A quarter that shows no wall is not asked for, whatever is known.
+    assert reason(0, 0.0, known=unknown) == ""
     assert reason_to_leave_out(candidate(agreeing=in_quarter(quarter, 0))) == ""
 
 

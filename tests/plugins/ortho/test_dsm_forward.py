@@ -1,0 +1,132 @@
+"""Rays of every sixteenth pixel, which cells a photo shows, and what is told of a projection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from orthoflow_plugins.ortho import dsm_forward
+from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL
+from orthoflow_plugins.ortho.layers import CellCounts
+from orthoflow_plugins.ortho.surfaces import Surface, transparent_relief_of
+
+from orthoflow.geometry.bands import in_memory
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import LayerMask
+from tests import ortho_scenes as scenes
+from tests.raster_scenes import context
+
+WHERE = scenes.frame()
+
+
+def surface_of(depths: np.ndarray) -> Surface:
+    wall = scenes.walls(WHERE, depths).walls[0]
+    return Surface(
+        frame=WHERE,
+        relief=transparent_relief_of(wall, threads=1),
+        front_m=scenes.BUFFER_M,
+        tolerance_m=0.008,
+    )
+
+
+FLAT = surface_of(np.zeros(scenes.SHAPE, dtype=np.float32))
+
+
+def sized(width: int, height: int) -> ViewingCamera:
+    return replace(scenes.camera(WHERE, aside_m=0.3), width=width, height=height)
+
+
+@pytest.mark.parametrize("size", [(160, 128), (100, 90), (177, 113), (33, 15)], ids=str)
+def test_rays_between_those_of_the_lattice_are_those_of_the_camera(size: tuple[int, int]) -> None:
+    camera = sized(*size)
+    lattice = dsm_forward._ray_lattice(camera, FLAT)
+    assert lattice.shape == (size[1] // 16 + 2, size[0] // 16 + 2, 3)
+
+    def between(u: float, v: float) -> np.ndarray:
+        """Of the four rays about a place, each as far as the place is near."""
+        column, row = int(u // 16), int(v // 16)
+        a, d = u / 16 - column, v / 16 - row
+        corner = lattice[row : row + 2, column : column + 2]
+        return np.asarray(
+            (1 - d) * ((1 - a) * corner[0, 0] + a * corner[0, 1])
+            + d * ((1 - a) * corner[1, 0] + a * corner[1, 1])
+        )
+
+    axes = np.column_stack(
+        [WHERE.u_world / WHERE.gsd_m, WHERE.v_world / WHERE.gsd_m, WHERE.normal_world]
+    )
+    # At the places of the lattice, and at the border of the photo wherever that lies between two.
+    places = [(u, v) for u in range(0, size[0], 16) for v in range(0, size[1], 16)]
+    places += [(u, size[1]) for u in range(0, size[0], 16)]
+    places += [(size[0], v) for v in range(0, size[1], 16)]
+    exact = camera.rays_camera(np.array(places, dtype=np.float64)) @ camera.rotation @ axes
+    for (u, v), ray in zip(places, exact, strict=True):
+        # Just before the border: what lies beyond is not asked for.
+        found = between(min(u, size[0] - 1e-9), min(v, size[1] - 1e-9))
+        np.testing.assert_allclose(found, ray, atol=1e-5 * np.linalg.norm(ray))
+
+
+def test_cells_are_seen_inside_the_photo_and_worth_their_pixels() -> None:
+    depths = scenes.depth_m()
+    depths[30:60, 20:50] = np.nan
+    surface = surface_of(depths)
+    # A photo of a part of the wall.
+    camera = scenes.camera(WHERE, aside_m=0.4, width=1000)
+    camera = replace(camera, width=700, height=500)
+    rows = slice(20, 200)
+    seen, quality = dsm_forward._seen(camera, surface, rows, border_px=40.0)
+    at = np.stack(np.meshgrid(np.arange(scenes.SHAPE[1]), np.arange(20, 200)), axis=-1) + 0.5
+    heights = depths[rows].ravel().astype(np.float64)
+    points = WHERE.world_from_wall(at.reshape(-1, 2), heights)
+    u, v, along = camera.project(points).T
+    with np.errstate(invalid="ignore"):
+        inside = np.min([u, 700.0 - u, v, 500.0 - v], axis=0)
+        expected = (inside >= 0.0) & (u < 700.0) & (v < 500.0)
+    np.testing.assert_array_equal(seen.ravel(), expected)
+    assert 0.2 < expected.mean() < 0.9
+    towards = camera.centre_world - points
+    cosine = towards @ WHERE.normal_world / np.linalg.norm(towards, axis=1)
+    area = camera.fx * camera.fy * WHERE.gsd_m**2 / along**2
+    worth = np.where(expected, cosine * area * np.clip(inside / 40.0, 0.0, 1.0), 0.0)
+    np.testing.assert_allclose(quality.ravel(), np.nan_to_num(worth), rtol=1e-5, atol=1e-6)
+
+
+def test_an_empty_catch_has_no_pixel_and_all_is_nearer_than_nothing() -> None:
+    catch = dsm_forward._empty_catch((3, 4), in_memory)
+    assert (catch.pixel == NO_PIXEL).all()
+    assert np.isinf(catch.square).all()
+    assert (catch.pixel.dtype, catch.square.dtype) == (np.int32, np.float32)
+
+
+def test_a_projection_is_told_of_by_its_shares_and_times(tmp_path: Path) -> None:
+    def layer(n_painted: int, n_filled: int | None) -> Any:
+        mask = np.full((10, 10), LayerMask.OUTSIDE, dtype=np.uint8)
+        mask.ravel()[:n_painted] = LayerMask.PAINTED
+        filled = None
+        if n_filled is not None:
+            filled = (np.arange(100).reshape(10, 10) < n_filled).astype(np.uint8)
+        return SimpleNamespace(mask=mask, filled=filled)
+
+    def part(layers: list[Any], **seconds: float) -> Any:
+        return SimpleNamespace(layers=layers, seconds=seconds)
+
+    parts = [
+        part([layer(50, 5), layer(30, None)], occluders_s=1.0, painting_s=4.0),
+        part([layer(20, 15)], occluders_s=0.5, painting_s=2.0),
+    ]
+    ctx = context(tmp_path)
+    dsm_forward._report(ctx, CellCounts(n_surface=160, n_painted=40, n_hidden=7), parts)
+    assert {metric.name: metric.value for metric in ctx.metrics} == {
+        "n_layers": 3,
+        "painted_share": 0.25,
+        "filled_share": 0.2,
+        "occluders_s": 1.5,
+        "painting_s": 6.0,
+    }
+    nothing = context(tmp_path)
+    dsm_forward._report(nothing, CellCounts(n_surface=0, n_painted=0, n_hidden=0), [])
+    assert {metric.name: metric.value for metric in nothing.metrics}["painted_share"] == 0.0

@@ -1,0 +1,168 @@
+"""Layers of several parts of the photos: joined by wall, counted, and bare where none paints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.ortho.layers import (
+    NO_SOURCE,
+    CellCounts,
+    LayerStack,
+    PaintedPart,
+    ReachedWall,
+    count_shown,
+    joined_layers,
+    total_seconds,
+)
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Layer, LayerMask, Layers, Walls
+from tests import samples
+from tests.raster_scenes import context
+
+SHAPE = (4, 6)
+OUTSIDE, PAINTED, HIDDEN, VOID = (
+    LayerMask.OUTSIDE,
+    LayerMask.PAINTED,
+    LayerMask.OCCLUDED,
+    LayerMask.NO_SURFACE,
+)
+
+
+def walls(n: int = 3) -> Walls:
+    frame = samples.facing_south(0.01, SHAPE[1], SHAPE[0])
+    depths = np.zeros(SHAPE, dtype=np.float32)
+    depths[3] = np.nan
+    return samples.walls(
+        *(
+            samples.wall(frame, name=f"wall {k}", plane_index=k + 4, depth_m=depths)
+            for k in range(n)
+        )
+    )
+
+
+def mask_of(**rows: LayerMask) -> np.ndarray:
+    """States of the first rows; the last one is void."""
+    mask = np.full(SHAPE, VOID, dtype=np.uint8)
+    mask[:3] = [[state] for state in rows.values()]
+    return mask
+
+
+def layer(wall: int, source: str, mask: np.ndarray, *, deep: bool = False) -> Layer:
+    return Layer(
+        frame=walls().walls[0].frame,
+        wall=wall,
+        source=source,
+        rgb=np.zeros((*SHAPE, 3), dtype=np.uint16 if deep else np.uint8),
+        mask=mask,
+        quality=np.where(mask == PAINTED, 1.0, 0.0).astype(np.float32),
+        filled=None,
+    )
+
+
+def part(*found: Layer, reached: tuple[ReachedWall, ...] = (), **seconds: float) -> PaintedPart:
+    return PaintedPart(layers=found, reached=reached, seconds=seconds)
+
+
+def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
+    shown = mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)
+    first = part(layer(2, "a", shown), layer(0, "a", shown))
+    second = part(layer(1, "b", shown), layer(0, "b", shown))
+    ctx = context(tmp_path)
+    found = joined_layers(walls(), [first, second], ctx)
+    assert [(each.wall, each.source) for each in found.layers] == [
+        (0, "a"), (0, "b"), (1, "b"), (2, "a"),
+    ]  # fmt: skip
+    assert found.names == ("wall 0", "wall 1", "wall 2")
+    assert found.plane_indices == (4, 5, 6)
+    assert ctx.warnings == []
+    with pytest.raises(MethodError, match="no oriented photo sees a wall"):
+        joined_layers(walls(), [part(), part()], ctx)
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_a_wall_that_no_photo_paints_is_bare_but_tells_what_is_hidden(
+    tmp_path: Path, deep: bool
+) -> None:
+    shown = layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE), deep=deep)
+    reached = [
+        ReachedWall(wall=1, mask=mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)),
+        ReachedWall(wall=1, mask=mask_of(a=OUTSIDE, b=HIDDEN, c=OUTSIDE)),
+    ]
+    parts = [part(shown, reached=(reached[0],)), part(reached=(reached[1],))]
+    ctx = context(tmp_path)
+    found = joined_layers(walls(), parts, ctx)
+    first, second, third = found.layers
+    assert first is shown
+    assert ctx.warnings == ["no photo shows wall 1, wall 2: the orthoimage stays empty"]
+    assert (second.wall, second.source, third.wall, third.source) == (1, NO_SOURCE, 2, NO_SOURCE)
+    np.testing.assert_array_equal(second.mask, mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE))
+    np.testing.assert_array_equal(third.mask, mask_of(a=OUTSIDE, b=OUTSIDE, c=OUTSIDE))
+    for bare in (second, third):
+        assert bare.rgb.dtype == shown.rgb.dtype
+        assert not bare.rgb.any()
+        assert not bare.quality.any()
+        assert bare.rgb.shape == (*SHAPE, 3)
+
+
+def test_cells_are_counted_once_however_many_photos_show_them() -> None:
+    layered = Layers(
+        layers=(
+            layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)),
+            layer(0, "b", mask_of(a=PAINTED, b=PAINTED, c=HIDDEN)),
+            layer(1, "a", mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE)),
+            layer(2, "b", mask_of(a=OUTSIDE, b=OUTSIDE, c=OUTSIDE)),
+        ),
+        names=("wall 0", "wall 1", "wall 2"),
+        plane_indices=(4, 5, 6),
+    )
+    # Three of four rows have a depth; two are painted on the first wall, one hidden, and two on
+    # the second one.
+    expected = CellCounts(n_surface=3 * 18, n_painted=12, n_hidden=6 + 12)
+    assert count_shown(walls(), layered) == expected
+
+
+def test_times_are_summed_over_the_parts() -> None:
+    parts = [part(painting_s=2.0, other_s=9.0), part(), part(painting_s=0.5)]
+    assert total_seconds(parts, "painting_s") == 2.5
+    assert total_seconds([], "painting_s") == 0.0
+
+
+def test_arrays_of_each_layer_have_names_of_their_own(tmp_path: Path) -> None:
+    asked: list[str] = []
+    ctx = context(tmp_path)
+    original = ctx.allocate
+
+    def allocate(product: str, name: str, *more: object) -> np.ndarray:
+        asked.append(f"{product} {name}")
+        return original(product, name, *more)  # type: ignore[arg-type]
+
+    ctx.allocate = allocate  # type: ignore[method-assign, assignment]
+    stack = LayerStack(walls(), ctx)
+    stack.allocator(2)("rgb", (2, 3), np.uint8)
+    stack.painted.append(layer(2, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
+    stack.allocator(2)("rgb", (2, 3), np.uint8)
+    stack.scratch(1)("pixel", (2, 3), np.int32)
+    assert asked == ["layers 2.0.rgb", "layers 2.1.rgb", "layers 1.scratch.pixel"]
+
+
+def test_what_photos_reach_counts_until_one_paints(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    stack = LayerStack(walls(), ctx)
+    first = mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)
+    stack.note_reached(1, first)
+    # The mask of the next photo lies where that of the first did.
+    first[:3] = [[OUTSIDE], [HIDDEN], [OUTSIDE]]
+    stack.note_reached(1, first)
+    stack.note_reached(0, mask_of(a=OUTSIDE, b=OUTSIDE, c=HIDDEN))
+    assert [reached.wall for reached in stack.reached] == [0, 1]
+    np.testing.assert_array_equal(stack.reached[1].mask, mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE))
+    with stack.painting_from("a.jpg"):
+        stack.add(layer(1, "a.jpg", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
+        stack.add(layer(2, "a.jpg", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
+    with stack.painting_from("b.jpg"):
+        stack.note_reached(1, mask_of(a=HIDDEN, b=HIDDEN, c=HIDDEN))
+    assert [reached.wall for reached in stack.reached] == [0]
+    assert [painted.wall for painted in stack.painted] == [1, 2]
