@@ -193,6 +193,7 @@ def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
 
 def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.cli.exports.results import embedded
+    from orthoflow.records.wall_results import content_digest
 
     make_empty(folder)
     record = embedded(run, folder, chosen)
@@ -200,7 +201,8 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     n_files = sum(len(entry.files) for entry in record.record.inputs)
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
-        f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes"
+        f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, sealed anew: "
+        f"sha256:{content_digest(record)}"
     )
 
 

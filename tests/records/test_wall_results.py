@@ -36,6 +36,7 @@ class ToyRun:
     def __init__(self, folder: Path | None = None, published: tuple[str, ...] = (), **cells: Any):
         self.cells = cells
         self.folder = folder
+        self.path = Path("run.h5") if folder is None else folder / "run.h5"
         self.record = SimpleNamespace(
             run_id="r1", published=[SimpleNamespace(path=path) for path in published]
         )
@@ -48,6 +49,19 @@ class ToyRun:
     def upstream(self, address: str) -> list[Any]:
         names = list(self.cells)
         return [self.cells[name] for name in names[: names.index(address) + 1]]
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"n_found": 6.0}, " of 6 check points"),
+        ({"n_found": 1.0, "n_pairs": 9.0}, " of 1 check point"),
+        ({"n_pairs": 9.0}, " of 9 pairs"),
+        ({}, ""),
+    ],
+)
+def test_accuracy_says_of_how_many_it_is(values: dict[str, float], said: str) -> None:
+    assert module._of_how_many(values, ("n_found", "n_pairs")) == said
 
 
 def inspection(*findings: tuple[str, float, int], walls: tuple[int, ...] = ()) -> Inspection:

@@ -99,8 +99,9 @@ def test_a_method_is_summed_up_over_datasets() -> None:
             "z": combination(None),
         },
     }
+    partners = {"plane=a": "", "plane=b": "plane=a"}
     first, second = module._methods(
-        found, ("x", "y", "z", "w"), "plane=a", ("check", "rms_mm", Sense.LESS)
+        found, ("x", "y", "z", "w"), partners, ("check", "rms_mm", Sense.LESS)
     )
     assert (first.name, first.is_reference, first.n, first.failed, first.n_absent) == (
         "plane=a", True, 3, (), 1,
@@ -109,13 +110,14 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     assert first.median == 3.0
     assert first.spread == pytest.approx(1.4826 * 1.0)
     assert first.paired is None
+    assert (first.against, second.against) == ("", "plane=a")
     assert (second.is_reference, second.n, second.failed, second.n_absent) == (
         False, 1, ("y",), 2,
     )  # fmt: skip
     assert second.paired is not None
     assert (second.paired.n, second.paired.wins) == (1, 1)
     first, second = module._methods(
-        found, ("x", "y", "z"), "plane=a", ("check", "rms_mm", Sense.NEITHER)
+        found, ("x", "y", "z"), partners, ("check", "rms_mm", Sense.NEITHER)
     )
     assert first.median == 3.0
     assert second.paired is None
