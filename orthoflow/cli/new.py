@@ -11,6 +11,7 @@ from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import echo, echo_folded, echo_json
+from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
     from orthoflow.workflow.drafting import Draft, Recipe
@@ -45,7 +46,6 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     them; it is yours to change.
     """
     from orthoflow.cli.progress import working_on
-    from orthoflow.errors import ArgumentError
 
     if output.exists():
         raise ArgumentError(f"{output} is there already: choose another name with -o")
@@ -71,8 +71,6 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
 
 def _write(output: Path, text: str) -> None:
     """Write the file, unless one came into being meanwhile."""
-    from orthoflow.errors import ArgumentError
-
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with output.open("x", encoding="utf-8") as stream:

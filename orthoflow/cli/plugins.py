@@ -25,6 +25,7 @@ from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISS
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
+from orthoflow.system import usable_cores
 
 if TYPE_CHECKING:
     from orthoflow.sdk import Method, MethodParams, Ports
@@ -503,8 +504,6 @@ def _sharing_kernels(method_id: str) -> Iterator[None]:
     from orthoflow.engine.executors import COMPILED_CODE, compiled_code_in
     from orthoflow.engine.keys import compiled_digest, method_facts
     from orthoflow.engine.store import Store
-    from orthoflow.errors import PluginError
-    from orthoflow.system import usable_cores
 
     if COMPILED_CODE in os.environ:
         yield

@@ -29,6 +29,7 @@ from orthoflow.cli.tables import (
     echo_table,
     echo_warnings,
 )
+from orthoflow.errors import DamageError, DiskSpaceError, StoreError
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
@@ -121,7 +122,6 @@ class Call:
     def go(self) -> int:
         """Execute, record, report and say what came out."""
         from orthoflow.engine.run_folder import LOGS
-        from orthoflow.errors import DiskSpaceError
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.workflow.doubts import doubts_about
 
@@ -142,7 +142,6 @@ class Call:
         """Execute, record and report."""
         from orthoflow.cli.progress import working_on
         from orthoflow.engine.run_folder import new_run_folder, new_run_id
-        from orthoflow.errors import DamageError, StoreError
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.writing import executed_and_written, write_run
         from orthoflow.report import write_page

@@ -18,6 +18,7 @@ from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, number
+from orthoflow.foreign_text import csv_text
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary
@@ -256,8 +257,6 @@ def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, objec
 
 
 def _print_csv(kept: Sequence[RunSummary]) -> None:
-    from orthoflow.foreign_text import csv_text
-
     metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
     facts = list(dict.fromkeys(name for run in kept for name in run.facts))
     header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]

@@ -15,6 +15,7 @@ from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, duration, echo, echo_json, size
+from orthoflow.errors import StoreError
 
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
@@ -105,7 +106,6 @@ def _warm(workflow: str | None) -> Warmed:
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.compiled_code import VARIABLE, warm_folder
     from orthoflow.engine.durability import size_of, writing_to
-    from orthoflow.errors import StoreError
 
     started, folder, catalog = time.monotonic(), warm_folder(), discover_catalog()
     wanted = _calls_of(workflow, catalog) if workflow is not None else None

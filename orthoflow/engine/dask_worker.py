@@ -12,7 +12,7 @@ import uuid
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from distributed import Worker, get_worker
 from distributed.worker import WORKER_ANY_RUNNING
@@ -26,9 +26,7 @@ from orthoflow.engine.results import CellResult, result_to_json
 from orthoflow.engine.running import failed_result
 from orthoflow.engine.tasks import Task, read_task
 from orthoflow.errors import PluginError, StepFailedError
-
-if TYPE_CHECKING:
-    from orthoflow.sdk.context import StepEvent
+from orthoflow.sdk.context import StepEvent
 
 # In the folder of a task: who finds it stops.
 CANCEL_FILE: Final = "cancel"

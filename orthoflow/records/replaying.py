@@ -7,14 +7,15 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from orthoflow_provenance.model import RecordedCell
 from pydantic import ValidationError
 
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
-from orthoflow.engine.plan import RunPlan, plan_run
+from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
+from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
@@ -22,11 +23,6 @@ from orthoflow.records.verification import verify_run
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.format import StepVariant, Workflow
 from orthoflow.workflow.resolved import workflow_from_resolved
-
-if TYPE_CHECKING:
-    from orthoflow.catalog.catalog import Catalog
-    from orthoflow.engine.plan import RunOptions
-    from orthoflow.engine.store import Store
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 

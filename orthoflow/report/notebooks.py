@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError
+from orthoflow.files.images import cells_webp
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
@@ -282,8 +283,6 @@ class WallImage:
         )
 
     def _repr_html_(self) -> str:
-        from orthoflow.files.images import cells_webp  # noqa: PLC0415 - only pictures need it
-
         picture = cells_webp(
             self.image.mask.shape,
             lambda part: (eight_bits(self.rgb[part]), np.isin(self.image.mask[part], _SHOWN)),

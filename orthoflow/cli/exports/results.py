@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthoflow.cli.exports.products import make_empty, output_of, product_of
 from orthoflow.cli.tables import counted
+from orthoflow.foreign_text import csv_text
 
 if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices
@@ -30,7 +31,6 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
-    from orthoflow.foreign_text import csv_text
     from orthoflow.records.spreadsheets import write_csv_tables
     from orthoflow.report.tidy_tables import combination_rows
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.files.drawings.papers import Part, nice_step
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.levels import eight_bits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.levels import Colours, eight_bits
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4

@@ -29,6 +29,7 @@ from orthoflow_plugins.match.paper import (
 from orthoflow_plugins.match.pictures import require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 from orthoflow_plugins.match.traced_photos import TracedPhoto, TracedPhotos
+from orthoflow_plugins.match.warping import Before
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.channels import WallTarget
@@ -312,7 +313,6 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
     """What stands free before the walls, where the cloud is wired."""
     from orthoflow.geometry.occluders import occluders_before
-    from orthoflow_plugins.match.warping import Before
 
     cloud, walls = inputs.cloud, inputs.walls
     if cloud is None or not walls.walls:
