@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,6 @@ from orthoflow.workflow.format import (
     MOST_REPEATS,
     Comparison,
     Dataset,
-    Design,
     StepVariant,
     Workflow,
     WorkflowInputSpec,
@@ -31,10 +29,6 @@ from orthoflow.workflow.shapes import Reference, seconds_in
 from orthoflow.workflow.wiring import is_acyclic, step_graph
 
 _PLACE: Final = "the resolved workflow"
-# What every record says of a method call; a key that came later may be missing in older ones.
-_EVER_RECORDED: Final = frozenset(
-    {"name", "use", "params", "params_set", "repeat", "cores", "timeout_s"}
-)
 
 
 def resolved_json(workflow: Workflow) -> str:
@@ -49,7 +43,7 @@ def resolved_json(workflow: Workflow) -> str:
         "seed": workflow.seed,
         "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
         "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
-        "compare": _compare_json(workflow.compare),
+        "compare": asdict(workflow.compare) if workflow.compare else None,
         "overrides": list(workflow.overrides),
     }
     if workflow.datasets:
@@ -85,7 +79,8 @@ def workflow_from_resolved(resolved: str, source: str) -> Workflow:
         WorkflowError: the text is no resolved workflow, or one of a newer format.
     """
     try:
-        document = parse_json(resolved)
+        _check_format(parse_json(resolved))
+        document = _Document.model_validate_json(resolved, strict=True)
         workflow = _workflow(document, source)
         _check(workflow)
     except WorkflowError:
@@ -99,38 +94,25 @@ def workflow_from_resolved(resolved: str, source: str) -> Workflow:
     return workflow
 
 
-# Any: JSON whose form `_check` and the caller's `except` look at.
-def _workflow(document: Any, source: str) -> Workflow:
-    _check_format(document["orthoflow"])
-    _check_types(document)
+def _workflow(document: _Document, source: str) -> Workflow:
     return Workflow(
-        name=document["name"],
-        path=Path(f"{document['name']}.yaml"),
+        name=document.name,
+        path=Path(f"{document.name}.yaml"),
         source=source,
-        seed=document["seed"],
-        inputs={
-            name: WorkflowInputSpec(
-                name=name, files=tuple(entry["files"]), optional=entry["optional"]
-            )
-            for name, entry in document["inputs"].items()
-        },
-        steps={name: _step(name, entry) for name, entry in document["steps"].items()},
-        compare=_comparison(document["compare"]),
-        overrides=tuple(document["overrides"]),
+        seed=document.seed,
+        inputs={name: given.spec(name) for name, given in document.inputs.items()},
+        steps={name: _step(name, given) for name, given in document.steps.items()},
+        compare=document.compare,
+        overrides=document.overrides,
         datasets={
-            name: _dataset(name, entry) for name, entry in document.get("datasets", {}).items()
+            data: Dataset(
+                name=data,
+                inputs={name: item.spec(f"{name}@{data}") for name, item in given.inputs.items()},
+                sets=given.sets,
+            )
+            for data, given in document.datasets.items()
         },
     )
-
-
-def _dataset(data: str, entry: Mapping[str, Any]) -> Dataset:
-    inputs = {
-        name: WorkflowInputSpec(
-            name=f"{name}@{data}", files=tuple(given["files"]), optional=given["optional"]
-        )
-        for name, given in entry["inputs"].items()
-    }
-    return Dataset(name=data, inputs=inputs, sets=entry["set"])
 
 
 def _step_json(step: WorkflowStep) -> dict[str, object]:
@@ -148,29 +130,20 @@ def _variant_json(variant: StepVariant) -> dict[str, object]:
     return {"use": document.pop("method"), **document}
 
 
-def _compare_json(comparison: Comparison | None) -> JsonValue:
-    if comparison is None:
-        return None
-    return {
-        "design": comparison.design,
-        "baseline": dict(comparison.baseline),
-        "exclude": [dict(combination) for combination in comparison.exclude],
-        "metrics": list(comparison.metrics),
-    }
-
-
-def _check_format(version: object) -> None:
+# Any: JSON whose form the caller's `except` looks at.
+def _check_format(document: Any) -> None:
+    version = document["orthoflow"]
     if version != FORMAT:
         raise WorkflowError(f"{_PLACE} has format {version}, this orthoflow reads {FORMAT}")
 
 
-class _VariantDocument(BaseModel):
-    """What a run takes from a recorded method call; the rest is only handed on."""
+class _VariantDocument(BaseModel, extra="forbid"):
+    """A recorded method call."""
 
     name: str
-    use: str
-    params: dict[str, object]
-    params_set: dict[str, object]
+    method: str = Field(alias="use")
+    params: dict[str, Any]
+    params_set: dict[str, Any]
     repeat: int = Field(ge=1)
     cores: int | None = Field(ge=1)
     timeout_s: float | None = Field(gt=0, allow_inf_nan=False)
@@ -185,20 +158,16 @@ class _StepDocument(BaseModel):
 
 
 class _InputDocument(BaseModel):
-    files: list[str]
+    files: tuple[str, ...]
     optional: bool
+
+    def spec(self, name: str) -> WorkflowInputSpec:
+        return WorkflowInputSpec(name=name, files=self.files, optional=self.optional)
 
 
 class _DatasetDocument(BaseModel):
     inputs: dict[str, _InputDocument]
-    sets: dict[str, object] = Field(alias="set")
-
-
-class _ComparisonDocument(BaseModel):
-    design: Design
-    baseline: dict[str, str]
-    exclude: list[dict[str, str]]
-    metrics: list[str]
+    sets: dict[str, Any] = Field(alias="set")
 
 
 class _Document(BaseModel):
@@ -208,50 +177,27 @@ class _Document(BaseModel):
     seed: int
     inputs: dict[str, _InputDocument]
     steps: dict[str, _StepDocument]
-    compare: _ComparisonDocument | None
-    overrides: list[str]
+    compare: Comparison | None
+    overrides: tuple[str, ...]
     datasets: dict[str, _DatasetDocument] = {}
 
 
-def _check_types(document: object) -> None:
-    _Document.model_validate(document, strict=True)
-
-
-# Any: JSON whose form `_check_types` and the caller's `except` look at.
-def _step(name: str, entry: Mapping[str, Any]) -> WorkflowStep:
+def _step(name: str, given: _StepDocument) -> WorkflowStep:
     return WorkflowStep(
         name=name,
-        variants=tuple(_variant(variant) for variant in entry["variants"]),
+        variants=tuple(StepVariant(**dict(variant)) for variant in given.variants),
         inputs={
-            port: tuple(_reference(text) for text in texts) for port, texts in entry["in"].items()
+            port: tuple(_reference(text) for text in texts) for port, texts in given.inputs.items()
         },
-        only_if=entry.get("if", ""),
-        unless=entry["unless"],
-        is_varied=entry["is_varied"],
+        only_if=given.only_if,
+        unless=given.unless,
+        is_varied=given.is_varied,
     )
-
-
-def _variant(entry: Mapping[str, Any]) -> StepVariant:
-    if missing := sorted(_EVER_RECORDED - entry.keys()):
-        raise KeyError(missing[0])
-    fields = dict(entry)
-    return StepVariant(method=fields.pop("use"), **fields)
 
 
 def _reference(text: str) -> Reference:
     source, _, name = text.partition(".")
     return Reference(source=source, name=name)
-
-
-def _comparison(entry: Mapping[str, Any] | None) -> Comparison | None:
-    if entry is None:
-        return None
-    return Comparison(
-        design=entry["design"],
-        baseline=entry["baseline"],
-        exclude=tuple(entry["exclude"]),
-        metrics=tuple(entry["metrics"]),
-    )
 
 
 def _check(workflow: Workflow) -> None:

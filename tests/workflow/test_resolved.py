@@ -73,7 +73,7 @@ def changed(change: Callable[[dict[str, object]], object]) -> str:
         ),
         (
             changed(lambda document: document.update(steps=[])),
-            r"the resolved workflow cannot be read: steps: Input should be a valid dictionary",
+            r"the resolved workflow cannot be read: steps: Input should be an object",
         ),
         (
             changed(
