@@ -163,6 +163,9 @@ def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[st
     for run in kept:
         if run.reason:
             echo_folded(f"{run.folder} {run.state}: {run.reason[:_LONGEST_REASON]}")
+    for run in kept:
+        if run.n_datasets > 1:
+            echo_folded(f"{run.folder}: medians of {run.n_datasets} datasets that have a value")
     n_left_out = n_found - len(kept)
     echo(counted(len(kept), "run") + (f", {n_left_out} others left out" if n_left_out else ""))
 

@@ -185,7 +185,9 @@ class RunComparison:
             )
         ]
         n_products = sum(item.verdict == "different" for item in self.products)
-        differing.append(f"{n_products} of {len(self.products)} products")
+        n_unknown = sum(item.verdict == "not measured" for item in self.products)
+        unknown = f" ({n_unknown} more not measured)" if n_unknown else ""
+        differing.append(f"{n_products}{unknown} of {len(self.products)} products")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
         n_alone = sum(not row.is_shared for row in self.cells)
         alone = f"; {n_alone} cells in one of them only" if n_alone else ""

@@ -21,6 +21,7 @@ from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import words_of
+from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.format import DATA
 
@@ -47,6 +48,7 @@ class RunSummary:
         started: ISO 8601 UTC; empty where nothing says it.
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
             has it; of several datasets the median.
+        n_datasets: that it ran on; 0 for a run on none.
         labels: what each of these is, in words.
         facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
             baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
@@ -60,6 +62,7 @@ class RunSummary:
     run_id: str = ""
     started: str = ""
     metrics: Mapping[str, float] = field(default_factory=dict)
+    n_datasets: int = 0
     labels: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
 
@@ -184,19 +187,26 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         run_id=record.run_id,
         started=record.started,
         metrics=_metrics(run),
+        n_datasets=len(parts_of(run)),
         labels=_labels(run),
         facts=facts,
     )
 
 
 def _metrics(run: Run) -> dict[str, float]:
-    """Numbers of the baseline; of several datasets the median of those that have one."""
+    """Numbers of the baseline; of several datasets the median of those that have one.
+
+    Of errors with signs it is that of their sizes, as in the report.
+    """
     values: dict[str, list[float]] = {}
-    for part in parts_of(run).values() or (run,):
+    parts = parts_of(run)
+    for part in parts.values() or (run,):
         own: dict[str, float] = {}
         for cell in baseline_cells(part):
             for row in cell_metrics(cell):
-                own |= {f"{row.step}.{row.metric}": row.value, row.metric: row.value}
+                is_size = len(parts) > 1 and sense_of(row.metric, row) is Sense.LESS
+                value = abs(row.value) if is_size else row.value
+                own |= {f"{row.step}.{row.metric}": value, row.metric: value}
         for name, value in own.items():
             values.setdefault(name, []).append(value)
     return {name: statistics.median(found) for name, found in values.items()}

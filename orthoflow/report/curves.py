@@ -177,18 +177,24 @@ def _lines(
         at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
         at.append(_Value(measured.value, measured.spread, one.is_baseline))
     return {
-        name: [_point(x, found, is_over=is_over) for x, found in sorted(line.items())]
+        name: [
+            _point(x, found, is_over=is_over, is_error=column.sense is Sense.LESS)
+            for x, found in sorted(line.items())
+        ]
         for name, line in values.items()
     }
 
 
-def _point(x: float, found: Sequence[_Value], *, is_over: bool) -> _Point:
+def _point(x: float, found: Sequence[_Value], *, is_over: bool, is_error: bool) -> _Point:
     is_baseline = any(one.is_baseline for one in found)
     if len(found) == 1:
         # A bar over datasets is how far they lie apart, not how far the repeats of one do.
         y, spread = found[0].value, math.nan if is_over else found[0].spread
     else:
         numbers = np.array([one.value for one in found])
+        if is_error:
+            # Errors of both signs would make each other small.
+            numbers = np.abs(numbers)
         y, spread = float(np.median(numbers)), median_deviation(numbers)
     return _Point(x=x, y=y, spread=spread, n=len(found), is_baseline=is_baseline)
 
@@ -215,13 +221,10 @@ def _curve(
     n_datasets: int,
 ) -> Curve:
     title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
-    has_spread = any(
-        math.isfinite(point.spread) and point.spread > 0
-        for points in lines.values()
-        for point in points
-    )
+    has_spread = any(math.isfinite(point.spread) for points in lines.values() for point in points)
     if n_datasets > 1:
         said = _behind([point for points in lines.values() for point in points], n_datasets)
+        said += ", of signed errors of their sizes" if column.sense is Sense.LESS else ""
     elif has_spread:
         said = "means of the repeats, bars their standard deviation"
     else:

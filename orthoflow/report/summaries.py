@@ -71,7 +71,11 @@ def answers(run: Run) -> tuple[Answer, ...]:
     """How good the products are: the quality metrics of the baseline's inspections and planes."""
     rows = [row for cell in baseline_cells(run) for row in cell_metrics(cell)]
     values = {(row.cell, row.metric): row.value for row in rows}
-    found: list[Answer] = []
+    found: list[Answer] = [
+        Answer(what="main wall of the scene", value="not found", cell=row.cell)
+        for row in rows
+        if row.metric == "main_found" and row.method.startswith("inspect.") and row.value == 0
+    ]
     for wanted in QUALITY:
         stated = [row for row in rows if row.metric == wanted and is_quality(row)]
         # Own orthoimages stand behind those of others, whatever the order of the steps.

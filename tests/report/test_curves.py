@@ -118,6 +118,26 @@ def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
     assert "baseline" not in plain.caption
 
 
+def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path) -> None:
+    cells = [
+        cell(
+            f"plane@data={name},plane=tolerance_m-{value:g}",
+            params={"tolerance_m": value},
+            metrics=metrics(plane_offset_mm=sign * value),
+        )
+        for name, sign in (("hall", 1.0), ("tower", -1.0))
+        for value in (0.02, 0.05, 0.1)
+    ]
+    parts = {
+        name: held(tmp_path, [one for one in cells if one.assignment["data"] == name])
+        for name in ("hall", "tower")
+    }
+    (curve,) = curves_over(parts)
+    told = re.findall(r"<title>[0-9.]+: ([0-9.-]+)</title>", curve.svg)
+    assert [float(value) for value in told] == [0.02, 0.05, 0.1]
+    assert "of signed errors of their sizes" in curve.caption
+
+
 def test_over_datasets_the_points_are_medians(tmp_path: Path) -> None:
     parts = {name: held(tmp_path, swept(0.02, 0.05, 0.1)) for name in ("hall", "stairs")}
     (curve,) = curves_over(parts)

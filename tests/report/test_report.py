@@ -192,6 +192,14 @@ def test_check_points_of_the_own_orthoimage_are_told_before_those_of_others() ->
     assert answer.cell == "points_theirs"
 
 
+def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
+    plane = cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6))
+    for value, first in ((0.0, ("main wall of the scene", "not found")), (1.0, None)):
+        check = cell("check", method="inspect.truth", metrics=metrics(main_found=value))
+        told = [(one.what, one.value) for one in answers(run(plane, check))]
+        assert told == [*([first] if first else []), ("points to their plane, RMS", "1.6 mm")]
+
+
 def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
     folder = tmp_path / "products" / "shade"
     folder.mkdir(parents=True)

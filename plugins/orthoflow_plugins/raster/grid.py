@@ -55,6 +55,8 @@ ExtentOf = Callable[[int], Extent]
 
 # A point that somebody took for one on a wall is farther from it than any relief.
 _FAR_M: Final = 1.0
+# So much of a wall is missed on a drawing.
+_LARGE_CUT_M: Final = 0.05
 
 
 class RasterGrid(Method):
@@ -311,7 +313,8 @@ def _log_cuts(
     for index, frame in frames.items():
         for side, cut_m in extent_of(index).cut_m.items():
             if cut_m > frame.gsd_m:
-                ctx.log(
+                tell = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
+                tell(
                     f"{planes.names[index]}: what adjoins it at its {side} runs askew, and its "
                     f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of the wall "
                     "are left out there; margin_m adds them"

@@ -137,14 +137,13 @@ def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said
     _, corners = level(0.0, (0.0, 3.0), towards=1.0)
     corners[:, 2] += rise * corners[:, 0]
     normal = np.array([-rise, 0.0, 1.0]) / np.hypot(rise, 1.0)
-    said: list[str] = []
-    ctx = replace(scenes.context(tmp_path), listen=lambda event: said.append(event.text))
+    ctx = scenes.context(tmp_path)
     planes = planes_of((0.0, WIDTH_M), (0.3, HEIGHT_M), (normal, corners))
     inputs = RasterGrid.In(cloud=scanned(surface, floor), planes=planes)
     chosen = RasterGrid.Params(gsd_m=GSD_M, ranks=(0,))
     walls = RasterGrid().run(inputs, chosen, ctx).walls
     assert edges_m(walls)[2] == pytest.approx(rise * WIDTH_M, abs=CORNER_M)
-    (told,) = [text for text in said if "askew" in text]
+    (told,) = [text for text in ctx.warnings if "askew" in text]
     assert told == (
         "plane 0: what adjoins it at its bottom runs askew, and its raster ends where that comes "
         "nearest: up to 80 mm of the wall are left out there; margin_m adds them"
