@@ -66,59 +66,47 @@ class BrokenPlugin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KindEntry:
-    """A kind as announced.
+class Announced:
+    """What an entry says of who announced it, and of what is wrong with that.
 
     Attributes:
-        spec: ports of the kind.
-        distribution: who announced it.
-        state: `clash` when two distributions announce it with different ports, `broken` when a
-            port carries a product type that nobody announces.
-        problem: one sentence, empty when fine.
-    """
-
-    spec: KindSpec
-    distribution: DistributionInfo
-    state: EntryState = "fine"
-    problem: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProductEntry:
-    """A product type as announced.
-
-    Attributes:
-        spec: where class and publisher are.
-        distribution: who announced it.
-        state: `clash` when two distributions announce different classes for it.
-        problem: one sentence, empty when fine.
-    """
-
-    spec: ProductSpec
-    distribution: DistributionInfo
-    state: EntryState = "fine"
-    problem: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodEntry:
-    """A method as announced; its class loads on first use.
-
-    Attributes:
-        spec: id, import string, summary.
-        distribution: who brought it; of a clash, the first claimant.
-        kind: ports that the method must keep; None when nobody announces its kind.
-        product_types: all product types that ports may carry.
-        state: `clash` when several claim the id, `broken` when its kind cannot be used.
+        distribution: who announced it; of a clash, the first.
+        state: `clash` when several announce it, and not alike; `broken` when it cannot be used.
         problem: one sentence that names the distributions, empty when fine.
     """
 
-    spec: MethodSpec
     distribution: DistributionInfo
-    kind: KindSpec | None
-    product_types: frozenset[str] = frozenset()
     state: EntryState = "fine"
     problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KindEntry(Announced):
+    """A kind as announced; broken when a port carries a product type that nobody announces."""
+
+    spec: KindSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductEntry(Announced):
+    """A product type as announced: where class and publisher are."""
+
+    spec: ProductSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodEntry(Announced):
+    """A method as announced; its class loads on first use. Broken when its kind cannot be used.
+
+    Attributes:
+        spec: id, import string, summary.
+        kind: ports that the method must keep; None when nobody announces its kind.
+        product_types: all product types that ports may carry.
+    """
+
+    spec: MethodSpec
+    kind: KindSpec | None
+    product_types: frozenset[str] = frozenset()
 
     def load(self) -> type[Method]:
         """Import the class and check what the framework relies on.

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.catalog.catalog import Catalog, MethodEntry
+from orthoflow.catalog.catalog import Announced, Catalog, MethodEntry
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
@@ -115,10 +115,7 @@ def _catalog_json(catalog: Catalog) -> dict[str, object]:
             {
                 "id": entry.spec.id,
                 "kind": entry.spec.kind,
-                "state": entry.state,
-                "problem": entry.problem,
-                "distribution": entry.distribution.name,
-                "version": entry.distribution.version,
+                **_announced_json(entry),
                 "summary": entry.spec.summary,
             }
             for entry in catalog.methods.values()
@@ -126,10 +123,7 @@ def _catalog_json(catalog: Catalog) -> dict[str, object]:
         "kinds": [
             {
                 "name": name,
-                "state": kind.state,
-                "problem": kind.problem,
-                "distribution": kind.distribution.name,
-                "version": kind.distribution.version,
+                **_announced_json(kind),
                 "in": dict(kind.spec.inputs),
                 "out": dict(kind.spec.outputs),
                 "is_source": kind.spec.is_source,
@@ -140,10 +134,7 @@ def _catalog_json(catalog: Catalog) -> dict[str, object]:
         "products": [
             {
                 "name": name,
-                "state": product.state,
-                "problem": product.problem,
-                "distribution": product.distribution.name,
-                "version": product.distribution.version,
+                **_announced_json(product),
                 "summary": product.spec.summary,
             }
             for name, product in catalog.products.items()
@@ -159,6 +150,15 @@ def _catalog_json(catalog: Catalog) -> dict[str, object]:
             }
             for broken in catalog.broken
         ],
+    }
+
+
+def _announced_json(entry: Announced) -> dict[str, object]:
+    return {
+        "state": entry.state,
+        "problem": entry.problem,
+        "distribution": entry.distribution.name,
+        "version": entry.distribution.version,
     }
 
 
