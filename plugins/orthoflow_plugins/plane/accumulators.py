@@ -46,14 +46,12 @@ class Accumulator:
     Attributes:
         angles_rad: (a,) direction of the lines' normals in the (e1, e2) frame, 0 to pi.
         low_m: lower edge of the first bin, as a distance from `centre_m`.
-        bin_m: width of a bin.
         centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
         votes: (a, bins) points that speak for each line.
     """
 
     angles_rad: NDArray[np.float64]
     low_m: float
-    bin_m: float
     centre_m: NDArray[np.float64]
     votes: NDArray[np.int64]
 
@@ -186,7 +184,6 @@ class PlanProposer:
             self.first = Accumulator(
                 angles_rad=self._angles_rad,
                 low_m=-self._reach_bins * self._grid.cell_m,
-                bin_m=self._grid.cell_m,
                 centre_m=plan_centre_m(self._grid),
                 votes=np.rint(self._votes / VOTE_SHARES * self._points_per_vote).astype(np.int64),
             )

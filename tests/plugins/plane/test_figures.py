@@ -342,7 +342,6 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     accumulator = Accumulator(
         angles_rad=np.arange(12) * math.pi / 12,
         low_m=-6.0,
-        bin_m=0.5,
         centre_m=np.array([0.0, 0.5]),
         votes=votes,
     )
@@ -375,7 +374,7 @@ def test_large_plans_are_summed_until_they_are_small_enough_to_draw(
     plan = np.random.default_rng(0).integers(0, 5, (2_001, 901))
     grid = PlanGrid(basis=np.eye(3), low_m=np.zeros(3), cell_m=0.01, shape=(2_001, 901, 3))
     accumulator = Accumulator(
-        angles_rad=np.zeros(4), low_m=-1.0, bin_m=0.01, centre_m=np.zeros(2), votes=plan[:4, :900]
+        angles_rad=np.zeros(4), low_m=-1.0, centre_m=np.zeros(2), votes=plan[:4, :900]
     )
     planes = planes_of()
     floor = replace(
