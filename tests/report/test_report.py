@@ -226,6 +226,13 @@ def test_a_busy_machine_ranks_no_times() -> None:
     assert busy is not None
     assert [one.time.mark for one in calm.rows] == [Mark.BEST, Mark.WORST]
     assert [one.time.mark for one in busy.rows] == [Mark.NONE, Mark.NONE]
+    # Of a tenth of a second nobody knows which is shorter.
+    short = comparison_table([run(row("hough", 0.08, 0.08), row("ransac", 0.11, 0.11))])
+    assert short is not None
+    assert [(one.time.text, one.time.mark) for one in short.rows] == [
+        ("0.08", Mark.NONE),
+        ("0.11", Mark.NONE),
+    ]
     assert [one.remark for one in busy.rows] == [
         "",
         "1.6 s of processor in 22.0 s: the machine was busy, so that no time is ranked",
