@@ -139,6 +139,13 @@ def test_whether_a_step_is_needed_may_hang_on_the_data(catalog: Catalog) -> None
     assert found["cloud@data=made"].skip_reason
     source = found["plane@data=made,plane=hough2d"].inputs["cloud"]
     assert str(source) == "room@data=made.cloud"
+    asked = cells(
+        ROOMS.replace("unless: inputs.scan", "if: inputs.scan")
+        + "datasets: {hall: {scan: hall.e57}, made: {}}\n",
+        catalog,
+    )
+    assert not asked["room@data=hall"].skip_reason
+    assert asked["room@data=made"].skip_reason == "only with the input scan"
 
 
 @pytest.mark.usefixtures("folder")
