@@ -135,3 +135,59 @@ def test_a_block_is_told_of_with_its_ties_between_photos(
     expected = {"sigma0": 1.25, "redundancy": 77.0, "n_photo_points": 40 if has_ties else 0}
     assert told(ctx) == (expected | {"photo_tie_rmse_px": 0.3} if has_ties else expected)
     assert ctx.warnings == ["hardly told apart"]
+
+
+@pytest.mark.parametrize("wants_ties", [True, False])
+def test_key_points_are_sought_in_photos_that_overlap_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wants_ties: bool
+) -> None:
+    block: list[Any] = [
+        SimpleNamespace(
+            tied=SimpleNamespace(
+                photo=SimpleNamespace(name=name),
+                seen=SimpleNamespace(points_world=np.arange(12.0).reshape(4, 3)),
+                is_check=np.array([True, False, False, False]),
+            ),
+            estimate=SimpleNamespace(
+                agreeing=np.array([True, True, False, True]),
+                resection=SimpleNamespace(camera=f"camera {name}"),
+            ),
+        )
+        for name in "abcd"
+    ]
+    given: list[Any] = []
+
+    def pairs(cameras: Any, shown: Any, share: float) -> list[tuple[int, int]]:
+        assert cameras == ["camera a", "camera b", "camera c", "camera d"]
+        # Neither withheld ties nor those that do not agree.
+        assert [points[:, 0].tolist() for points in shown] == [[3.0, 9.0]] * 4
+        assert share == 0.35
+        return [(0, 3), (1, 3)]
+
+    monkeypatch.setattr(bundle, "overlapping_pairs", pairs)
+    monkeypatch.setattr(bundle, "photo_features", lambda photo, n: (photo.name, n))
+    monkeypatch.setattr(bundle, "no_features", lambda: "none")
+    monkeypatch.setattr(bundle, "no_photo_ties", lambda: "no ties")
+    monkeypatch.setattr(bundle, "tie_photos", lambda *args: given.append(args) or "ties")
+    params = bundle.OrientColmapBundle.Params(
+        photo_ties=wants_ties, overlap_min_share=0.35, n_features_max=500, n_photo_points_max=77
+    )
+    told_shares: list[float] = []
+    ctx = StepContext(
+        rng=np.random.default_rng(1),
+        cores=1,
+        scratch=tmp_path,
+        listen=lambda event: (
+            told_shares.append(event.fraction) if event.kind == "progress" else None
+        ),
+    )
+    found = bundle._photo_ties(block, params, ctx)
+    if not wants_ties:
+        assert (found, given) == ("no ties", [])
+        return
+    assert found == "ties"
+    ((_, features, asked, n_most),) = given
+    assert features == [("a", 500), ("b", 500), "none", ("d", 500)]
+    assert (asked, n_most) == ([(0, 3), (1, 3)], 77)
+    # From what orienting one by one took to where the adjustment begins.
+    assert told_shares == pytest.approx([0.4, 0.475, 0.55, 0.625])

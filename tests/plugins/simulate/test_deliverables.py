@@ -10,8 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.simulate import deliverables
+from orthoflow_plugins.simulate.building import Paint, SceneDraft, wall_side
+from orthoflow_plugins.simulate.room_model import Room
+from orthoflow_plugins.simulate.scanning import SPOILT, Scan, Scanned
 
 from orthoflow.files.images import decode_image, encode_png
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import Photo, Photos, PointCloud
 from orthoflow.sdk import StepContext
 from tests import samples
@@ -150,3 +154,107 @@ def test_distances_from_a_plane_are_summed_by_its_points() -> None:
     moved = PointCloud(origin=np.array([5.0, 0.0, -2.0]), x=cloud.x, y=y, z=cloud.z, up=UP)
     rms = deliverables._rms_m(moved, truth.planes, truth.labels)
     assert rms[0] == pytest.approx(math.sqrt((9e-6 + 1e-6) / 2), rel=1e-4)
+
+
+# --- the cloud and the truth in the world ---
+
+# Turned by a quarter about the vertical, and z up or y up.
+WORLDS = {
+    "turned": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "y up": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+SHIFT_M = np.array([500.0, -300.0, 20.0])
+
+
+def delivered(world: str) -> deliverables.Delivery:
+    """Two walls of 2 m x 1 m, a panel on the first that is no plane, and nine scanned points."""
+    draft = SceneDraft()
+    paint = Paint(kind=TextureKind.PLAIN, rgb=(90.0, 90.0, 90.0), reflectance=0.5)
+    extent = (-1.0, 1.0, -0.5, 0.5)
+    for name, omega_deg in (("north", 90.0), ("east", 0.0)):
+        side = wall_side(draft, omega_deg=omega_deg, phi_deg=0.0, distance_m=2.0)
+        plane = side.true_plane(name, extent)
+        side.place(extent, 0.0, paint, SurfaceRole.WALL, plane=plane)
+        if name == "north":
+            side.place((-0.1, 0.1, -0.1, 0.1), 0.05, paint, SurfaceRole.RELIEF)
+    room = Room(scene=draft.finished(spectral_gap=0.0), planes=tuple(draft.planes))
+    # On the north wall, its panel, the east wall, and one that was spoilt; 3 mm off in turns.
+    rectangle = np.array([0, 0, 1, 2, 2, 2, 2, SPOILT, 1], dtype=np.int32)
+    off = np.where(np.arange(9) % 2, 0.003, -0.003)
+    points = np.zeros((9, 3))
+    points[rectangle != 2] = [0.3, 2.0, 0.1]
+    points[rectangle == 2] = [2.0, 0.4, -0.2]
+    points[:, 1] += np.where(rectangle == 2, 0.0, off)
+    points[:, 0] += np.where(rectangle == 2, off, 0.0)
+    x, y, z = points.T.astype(np.float32)
+    at = np.arange(9)
+    scan = Scan(
+        points=Scanned(
+            x=x,
+            y=y,
+            z=z,
+            intensity=np.linspace(0.0, 1.0, 9, dtype=np.float32),
+            rgb=np.tile(at[:, None].astype(np.uint8), 3),
+            rectangle=rectangle,
+        ),
+        scan=(at % 2).astype(np.uint16),
+        row=at.astype(np.uint32),
+        column=(at + 5).astype(np.uint32),
+        stations=np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 0.2]]),
+    )
+    return deliverables.Delivery(
+        room=room, scan=scan, world_from_room=WORLDS[world], shift_world_m=SHIFT_M
+    )
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_cloud_is_turned_and_its_origin_shifted(world: str) -> None:
+    delivery = delivered(world)
+    cloud = deliverables.cloud_of(delivery)
+    in_room = np.column_stack([getattr(delivery.scan.points, axis) for axis in "xyz"])
+    turn = WORLDS[world]
+    np.testing.assert_array_equal(np.column_stack([cloud.x, cloud.y, cloud.z]), in_room @ turn.T)
+    np.testing.assert_array_equal(cloud.origin, SHIFT_M)
+    np.testing.assert_allclose(cloud.stations, delivery.scan.stations @ turn.T + SHIFT_M)
+    np.testing.assert_array_equal(cloud.up, turn @ UP)
+    assert cloud.stations_source == "file"
+    for name in ("scan", "row", "column"):
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(delivery.scan, name))
+    np.testing.assert_array_equal(cloud.intensity, delivery.scan.points.intensity)
+    np.testing.assert_array_equal(cloud.rgb, delivery.scan.points.rgb)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_true_planes_come_by_their_points_with_rectangles_along_their_walls(world: str) -> None:
+    delivery = delivered(world)
+    cloud = deliverables.cloud_of(delivery)
+    truth = deliverables.truth_of(delivery, cloud, (), {"seed": 3})
+    # The east wall has four points, the north wall two; panel and spoilt points are of no plane.
+    assert truth.planes.names == ("east", "north")
+    assert truth.planes.n_points.tolist() == [4, 2]
+    assert truth.labels.tolist() == [1, 1, -1, 0, 0, 0, 0, -1, -1]
+    assert truth.scene.plane_index.tolist() == [1, -1, 0]
+    assert truth.n_spoilt == 1
+    np.testing.assert_allclose(truth.planes.rms_m, 0.003, rtol=1e-3)
+    turn = WORLDS[world]
+    for k, (normal, across) in enumerate(
+        (((-1.0, 0, 0), (0, -1.0, 0)), ((0, -1.0, 0), (1.0, 0, 0)))
+    ):
+        np.testing.assert_allclose(truth.planes.normal[k], turn @ normal, atol=1e-12)
+        foot = 2.0 * -np.array(normal)
+        # From the top left for who looks at it, counter-clockwise.
+        corners = [
+            foot + a * np.array(across) + b * UP
+            for a, b in ((-1.0, 0.5), (-1.0, -0.5), (1.0, -0.5), (1.0, 0.5))
+        ]
+        np.testing.assert_allclose(
+            truth.planes.corners[k], np.array(corners) @ turn.T + SHIFT_M, atol=1e-9
+        )
+        on_plane = truth.planes.corners[k] @ truth.planes.normal[k]
+        np.testing.assert_allclose(on_plane, truth.planes.offset[k], atol=1e-9)
+    assert truth.planes.covariance.shape == (2, 4, 4)
+    assert (truth.cameras, truth.photos) == (None, ())
+    assert truth.details == {"parameters": {"seed": 3}, "n_points": 9}
+    np.testing.assert_array_equal(truth.scene.origin, SHIFT_M)
+    np.testing.assert_allclose(truth.stations, cloud.stations)
+    assert (truth.lowest_elevation_deg, truth.highest_elevation_deg) == (-62.0, 62.0)
