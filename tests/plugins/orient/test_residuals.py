@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.residuals import residual_rows
+from orthoflow_plugins.orient.residuals import (
+    numbers_json,
+    photo_numbers,
+    residual_rows,
+    residual_table,
+)
+
+from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.resection import Resection
+from orthoflow.testing import photographed as ms
 
 UNITS = {"px": 1.0, "mm": 2.5, "cell": 0.5}
 
@@ -73,3 +84,116 @@ def test_without_a_cell_there_is_no_share_beyond_cells() -> None:
 def test_one_residual_and_none() -> None:
     assert rows(np.array([[0.5, -0.5]]))["u", "px"]["shift_p"] is None
     assert residual_rows("a", "check", np.empty((0, 2)), UNITS) == []
+
+
+# --- a whole photo ---
+
+CAMERA = replace(
+    ms.camera_before(ms.textured_wall(0)), distortion=np.array([-0.09, 0.0, 0.0, 0.0, 0.0])
+)
+CONTROL = np.array([True, True, True, False, False, False])
+CHECKED = np.array([False, False, False, True, True, False])
+
+
+def candidate(**changes: Any) -> Any:
+    """Six ties 2 m before a camera: three control, two withheld, one rejected."""
+    lens = LensFreedom(focal_sigma=0.05, k1_sigma=0.1)
+    resection = Resection(
+        camera=CAMERA,
+        covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 4e-6, 9e-6]),
+        sigma0=1.25,
+        variance_factor=1.5,
+        lens=changes.pop("lens", lens),
+    )
+    residuals = np.array(
+        [[1.0, -1.0], [1.0, 1.0], [-2.0, 2.0], [3.0, 1.0], [1.0, 3.0], [90.0, 9.0]]
+    )
+    estimate = SimpleNamespace(
+        fit=SimpleNamespace(residuals_px=residuals),
+        resection=resection,
+        agreeing=CONTROL | CHECKED,
+        limit=4.5,
+        source="exif",
+        numbers={"skew_px": 0.3},
+    )
+    points = CAMERA.centre_world + 2.0 * np.tile(CAMERA.rotation[2], (6, 1))
+    # What does not determine the pose lies far away, where pixels are larger.
+    points[~CONTROL] += 50.0 * CAMERA.rotation[2]
+    usual: dict[str, Any] = {
+        "photo": SimpleNamespace(name="a.jpg"),
+        "seen": SimpleNamespace(points_world=points),
+        "control": CONTROL,
+        "checked": CHECKED,
+        "estimate": estimate,
+        "hull_ratio": 0.7,
+        "gsd_m": 0.002,
+        "error": SimpleNamespace(
+            rms_m=0.001, worst_m=0.003, corners_m=np.array([0.004, np.nan, 0.002, 0.001])
+        ),
+    }
+    return SimpleNamespace(**{**usual, **changes})
+
+
+PIXEL_MM = 2000.0 / np.sqrt(CAMERA.fx * CAMERA.fy)
+
+
+def test_an_orientation_is_summed_up_in_pixels_and_on_the_wall() -> None:
+    found = photo_numbers(candidate())
+    assert (found.n_control, found.n_check, found.n_rejected) == (3, 2, 1)
+    assert found.control_rmse_px == pytest.approx(np.sqrt((4 * 1.0 + 2 * 4.0) / 6))
+    assert found.check_rmse_px == pytest.approx(np.sqrt((2 * 9.0 + 2 * 1.0) / 4))
+    assert found.pixel_mm == pytest.approx(PIXEL_MM, rel=1e-6)
+    assert found.check_rmse_mm == pytest.approx(PIXEL_MM * found.check_rmse_px)
+    assert found.hull_ratio == 0.7
+    nothing = photo_numbers(candidate(checked=np.zeros(6, dtype=np.bool_)))
+    assert np.isnan(nothing.check_rmse_px)
+    assert np.isnan(nothing.check_rmse_mm)
+
+
+def test_an_orientation_is_recorded_with_its_lens_and_errors() -> None:
+    of = candidate()
+    entry = numbers_json(of, photo_numbers(of))
+    assert entry == {
+        "n_control": 3,
+        "n_check": 2,
+        "n_rejected": 1,
+        "pixel_mm": pytest.approx(PIXEL_MM),
+        "hull_ratio": 0.7,
+        "limit_sigma": 4.5,
+        "sigma0": 1.25,
+        "variance_factor": 1.5,
+        "lens": "exif",
+        "focal_px": CAMERA.fx,
+        "k1": -0.09,
+        "skew_px": 0.3,
+        "sigma_wall_mm": 1.0,
+        "sigma_wall_worst_mm": 3.0,
+        "sigma_image_corners_mm": [4.0, None, 2.0, 1.0],
+        # Of the logarithm of the focal length: two thousandths.
+        "focal_sigma_px": pytest.approx(0.002 * CAMERA.fx),
+    }
+    fixed = candidate(lens=LensFreedom(), error=None)
+    left = numbers_json(fixed, photo_numbers(fixed))
+    assert set(entry) - set(left) == {
+        "sigma_wall_mm",
+        "sigma_wall_worst_mm",
+        "sigma_image_corners_mm",
+        "focal_sigma_px",
+    }
+
+
+@pytest.mark.parametrize("gsd_m", [0.002, None])
+def test_the_table_has_control_and_check_in_units_of_the_wall(gsd_m: float | None) -> None:
+    of = candidate(gsd_m=gsd_m)
+    table = residual_table(of, photo_numbers(of))
+    units = ["px", "mm", *(["cell"] if gsd_m else [])]
+    assert [(row.role, row.axis, row.unit) for row in table] == [
+        (role, axis, unit) for role in ("control", "check") for axis in "uv" for unit in units
+    ]
+    assert {row.photo for row in table} == {"a.jpg"}
+    by = {(row.role, row.axis, row.unit): row for row in table}
+    assert (by["control", "u", "px"].n, by["check", "u", "px"].n) == (3, 2)
+    assert by["control", "u", "px"].max == 2.0
+    assert by["check", "v", "mm"].max == pytest.approx(3.0 * PIXEL_MM)
+    if gsd_m:
+        assert by["check", "v", "cell"].max == pytest.approx(3.0 * PIXEL_MM / 2.0)
