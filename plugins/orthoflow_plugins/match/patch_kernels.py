@@ -211,8 +211,8 @@ def match_patches(
     """
     weight, lines, moved = patch
     least = 0.0
-    for y in range(window.shape[0]):
-        for x in range(window.shape[0]):
+    for y in range(len(window)):
+        for x in range(len(window)):
             least += _KNOWN_SHARE_LEAST * window[y, x]
     for i in range(places.shape[0]):
         place = (places[i, 1], places[i, 0])
@@ -246,7 +246,7 @@ def _sample(
     """Resample the second picture around a shifted place; give the sum of the weights."""
     window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
-    side = window.shape[0]
+    side = len(window)
     half = side // 2
     low_y, low_x = math.floor(place[0] + shift[0]), math.floor(place[1] + shift[1])
     reach = half + 3
@@ -309,7 +309,7 @@ def _improvement(
     total: float,
 ) -> tuple[float, float, float, float]:
     """One Gauss-Newton step (down, across), its standard deviation, and the correlation."""
-    side, n_channels = weight.shape[0], values.shape[2]
+    side, n_channels = len(weight), values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
     # Sums of products of: a, reference; b, moved; x and y, slopes across and down.
     saa, sab, sbb, nxx, nxy, nyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -133,8 +133,6 @@ def recovered_pose(
         lens: its interior orientation, roughly; the pose is ignored.
     """
     pairs = pair_photo(grey, [each.features for each in painted], USUAL_RULE)
-    if pairs.n_verified < _AGREEING_LEAST:
-        return None
     pixels, points = _agreeing(pairs, painted)
     if len(pixels) < _AGREEING_LEAST:
         return None

@@ -310,3 +310,59 @@ def test_the_heaviest_group_wins_and_whoever_contradicts_it_loses_all() -> None:
     twice = [on(0, "a"), on(0, "g"), on(1, "b"), on(0, "c")]
     assert confirming._chosen(twice, [(0, 2), (1, 2), (3, 2)]) == {0: places["g"], 1: places["b"]}
     assert confirming._chosen(some, []) == {}
+
+
+def test_shared_key_points_are_given_in_pixels_of_both_photos(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scales = {2: 0.5, 5: 0.25, 7: 1.0}
+    places = np.array([[4.0, 8.0], [10.0, 20.0], [30.0, 30.0]])
+    asked: list[int] = []
+
+    def small(photos: Any, index: int) -> Any:
+        asked.append(index)
+        return SimpleNamespace(
+            grey=index, features=SimpleNamespace(pixels=places + index), scale=scales[index]
+        )
+
+    def pair_photo(grey: Any, walls: list[Any], rule: Any) -> Any:
+        def pair(first: list[int], second: list[int], agreeing: list[bool], is_shown: bool) -> Any:
+            matches = SimpleNamespace(first=np.array(first), second=np.array(second))
+            return SimpleNamespace(matches=matches, agreeing=np.array(agreeing), is_shown=is_shown)
+
+        assert rule is confirming._RULE
+        return SimpleNamespace(
+            features=SimpleNamespace(pixels=places - 1.0),
+            pairs=[
+                pair([0, 1, 2], [2, 0, 1], [True, False, True], is_shown=grey == 2),
+                pair([1], [1], [True], is_shown=False),
+            ],
+        )
+
+    monkeypatch.setattr(confirming, "_small", small)
+    monkeypatch.setattr(confirming, "pair_photo", pair_photo)
+    found = confirming._shared(PHOTOS, [(2, 5), (5, 7)], 1)
+    # Each photo is looked at once.
+    assert sorted(asked) == [2, 5, 7]
+    np.testing.assert_allclose(
+        found[2, 5],
+        [
+            [(places[0] - 1.0) / 0.5, (places[2] + 5.0) / 0.25],
+            [(places[2] - 1.0) / 0.5, (places[1] + 5.0) / 0.25],
+        ],
+    )
+    assert found[5, 7].shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize(("width", "scale"), [(1600, 1.0), (3200, 0.5), (800, 1.0)])
+def test_photos_are_compared_at_sixteen_hundred_pixels(
+    monkeypatch: pytest.MonkeyPatch, width: int, scale: float
+) -> None:
+    grey = np.random.default_rng(1).integers(0, 255, (width // 8, width), dtype=np.uint8)
+    monkeypatch.setattr(confirming, "photo_grey", lambda _: grey)
+    found = confirming._small(PHOTOS, 0)
+    assert found.scale == scale
+    assert found.grey.shape == (round(width // 8 * scale), round(width * scale))
+    # Key points lie in the shrunk picture.
+    assert found.features.pixels[:, 0].max() <= width * scale
+    assert len(found.features) > 20

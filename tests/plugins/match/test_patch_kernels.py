@@ -252,3 +252,32 @@ def test_what_three_gains_fit_of_chance_is_no_score() -> None:
         search_mixtures(wall, colours, np.array([[32, 32]]), (10, 0), row[None])
     # A plain least-squares fit of 121 cells would correlate by 0.16 on average.
     assert np.median(scores[:, 2]) < 0.1
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("half", [4, 10])
+def test_gains_are_ridge_regression_and_the_score_is_corrected_for_what_they_fit_of_chance(
+    half: int, noise: float
+) -> None:
+    rng = np.random.default_rng(14)
+    colours = rng.normal(3.0, 1.0, (SIDE, SIDE, 3))
+    # Channels that follow each other.
+    colours[..., 2] = 0.7 * colours[..., 0] + 0.5 * colours[..., 2]
+    wall = colours @ [0.8, -0.5, 0.3] + noise * rng.normal(size=(SIDE, SIDE)) + 7.0
+    first, second = wall[..., None].astype(np.float32), colours.astype(np.float32)
+    found = np.zeros((1, 7))
+    search_mixtures(first, second, np.array([[21, 23]]), (half, 0), found)
+    # Every second cell of the patch.
+    cells = np.ix_(23 + np.arange(-half, half + 1, 2), 21 + np.arange(-half, half + 1, 2))
+    a = first[cells].reshape(-1).astype(np.float64)
+    x = second[cells].reshape(-1, 3).astype(np.float64)
+    a, x = a - a.mean(), x - x.mean(axis=0)
+    products = x.T @ x
+    gains = np.linalg.solve(products + 1e-3 * np.trace(products) * np.eye(3), x.T @ a)
+    # Products are of single precision.
+    np.testing.assert_allclose(found[0, 4:], gains, atol=2e-4)
+    # Of the cells, two in three are independent; three gains and a mean fit four of these.
+    free = len(a) / 1.5
+    left = (1.0 - gains @ x.T @ a / (a @ a)) * (free - 1.0) / (free - 4.0)
+    assert found[0, 2] == pytest.approx(np.sqrt(max(0.0, 1.0 - left)), abs=1e-4)
+    assert (found[0, 0], found[0, 1], found[0, 3]) == (0.0, 0.0, -1.0)

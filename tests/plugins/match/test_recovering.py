@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.recovering import _pose, lens_of, painted_walls
+from orthoflow_plugins.match import recovering
+from orthoflow_plugins.match.descriptors import Matches
+from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.recovering import (
+    PaintedWall,
+    _pose,
+    lens_of,
+    painted_walls,
+    recovered_pose,
+)
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Camera, Intrinsics, Photo
@@ -128,3 +137,53 @@ def test_two_dozen_points_must_agree_with_a_pose(n_right: int, is_found: bool) -
     pixels, points = ties(40)
     pixels[n_right:] = np.random.default_rng(6).uniform([0, 0], [900, 640], (40 - n_right, 2))
     assert (_pose(pixels, points, lens(), 0.5) is not None) == is_found
+
+
+def key_points(pixels: NDArray[np.float64]) -> Features:
+    n = len(pixels)
+    return Features(
+        pixels=pixels,
+        sizes_px=np.full(n, 4.0),
+        angles_deg=np.zeros(n),
+        descriptors=np.zeros((n, 128), dtype=np.float32),
+    )
+
+
+def test_matches_that_agree_are_pixels_and_points_of_the_walls_shown() -> None:
+    frame = samples.facing_south(0.01, 40, 30)
+    cells = np.random.default_rng(2).uniform(5.0, 25.0, (6, 2))
+    wall = PaintedWall(wall=samples.wall(frame), features=key_points(cells))
+    blind = PaintedWall(wall=samples.wall(frame), features=None)
+    in_photo = key_points(np.arange(12.0).reshape(6, 2))
+    at = np.arange(5)
+    matches = Matches(first=at, second=at[::-1] + 1, ratio=np.ones(5))
+
+    def pair(index: int, *, is_shown: bool) -> Any:
+        return SimpleNamespace(wall=index, matches=matches, agreeing=at % 2 == 0, is_shown=is_shown)
+
+    pairs: Any = SimpleNamespace(
+        features=in_photo,
+        scale=1.0,
+        pairs=[pair(0, is_shown=False), pair(0, is_shown=True), pair(1, is_shown=True)],
+    )
+    pixels, points = recovering._agreeing(pairs, [wall, blind])
+    np.testing.assert_array_equal(pixels, in_photo.pixels[[0, 2, 4]])
+    np.testing.assert_allclose(points, frame.world_from_wall(cells[[5, 3, 1]], np.zeros(3)))
+    pairs.pairs.clear()
+    pixels, points = recovering._agreeing(pairs, [wall, blind])
+    assert (pixels.shape, points.shape) == ((0, 2), (0, 3))
+
+
+@pytest.mark.parametrize(("n", "is_found"), [(23, False), (24, True)])
+def test_a_pose_is_asked_of_two_dozen_matches_that_agree(
+    monkeypatch: pytest.MonkeyPatch, n: int, is_found: bool
+) -> None:
+    pixels, points = ties(n)
+    monkeypatch.setattr(recovering, "pair_photo", lambda *_: None)
+    monkeypatch.setattr(recovering, "_agreeing", lambda *_: (pixels, points))
+    limits: list[float] = []
+    monkeypatch.setattr(recovering, "_pose", lambda *args: limits.append(args[-1]) or VIEW)
+    grey = np.zeros((640, 900), dtype=np.uint8)
+    assert (recovered_pose(grey, [], lens()) is not None) == is_found
+    # Two thousandths of the photo's longer side.
+    assert limits == [pytest.approx(1.8)] * is_found

@@ -270,3 +270,36 @@ def test_photos_that_key_points_hardly_recognise_are_looked_for_by_structure(
     asked.clear()
     sift._placed(photos, WALLS, mirrored, params, context(tmp_path))
     assert asked == []
+
+
+def test_what_stands_free_is_told_from_the_cloud_between_all_photos_and_walls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+
+    def occluders(cloud: Any, slabs: Any, cameras: Any, **more: Any) -> str:
+        asked.append((cloud, slabs, cameras, more))
+        return "found"
+
+    monkeypatch.setattr("orthoflow.geometry.occluders.occluders_before", occluders)
+    slabs = [SimpleNamespace(front_m=0.1), SimpleNamespace(front_m=0.3)]
+    walls = SimpleNamespace(
+        walls=["west", "east"], slab=lambda index: slabs[index], spacing_m=lambda: 0.004
+    )
+    cloud = SimpleNamespace(stations="stations")
+    cameras: Any = [SimpleNamespace(viewing=lambda: "viewer")] * 3
+    inputs: Any = SimpleNamespace(cloud=cloud, walls=walls)
+    before = guided._before(inputs, cameras)
+    assert before is not None
+    assert before.occluders == "found"
+    assert before.front_m == (0.1, 0.3)
+    ((given, of, viewers, more),) = asked
+    assert given is cloud
+    assert (of, viewers) == (slabs, ["viewer"] * 3)
+    # A point with fewer than six about it, itself included, is an outlier.
+    assert more == {"spacing_m": 0.004, "stations_world": "stations", "n_least": 6, "threads": 1}
+    for nothing in (
+        SimpleNamespace(cloud=None, walls=walls),
+        SimpleNamespace(cloud=cloud, walls=SimpleNamespace(walls=[])),
+    ):
+        assert guided._before(nothing, cameras) is None  # type: ignore[arg-type]

@@ -19,6 +19,11 @@ from orthoflow.geometry.cameras import looking_at
 from tests.raster_scenes import context
 
 UP = np.array([0.0, 0.0, 1.0])
+# Where photos of the main wall aim: metres to the right of its foot, and above it.
+LATTICES = {
+    "quick": ((-1.75, 0.0, 1.75), (-0.65, 0.75)),
+    "variant2": ((-1.8, -1.08, -0.36, 0.36, 1.08, 1.8), (-0.8, 0.1, 1.0)),
+}
 PLAIN = Film(noise_grey=0.0, vignetting=0.0, supersample=1, exposures=0.0)
 
 
@@ -121,8 +126,10 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
     sides = wall_sides(SceneDraft())
     plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=8.0)
     rolls, tilts = [], []
+    columns, rows = LATTICES[layout]
+    targets = [(a, b) for b in rows for a in columns]
     for seed in range(20):
-        for shot in planned_shots(plan, rng(seed)):
+        for target, shot in zip(targets, planned_shots(plan, rng(seed)), strict=True):
             camera, taken = shot.camera, shot.taken
             tilt = np.degrees(np.arccos(-camera.rotation[2] @ sides[0].normal))
             assert taken.wall == "main wall"
@@ -131,6 +138,9 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
             along = (sides[0].foot - camera.centre_world) @ sides[0].normal
             reach = along / (camera.rotation[2] @ sides[0].normal)
             assert taken.gsd_m == pytest.approx(reach / camera.fx)
+            aimed = camera.centre_world + reach * camera.rotation[2] - sides[0].foot
+            off = np.array([aimed @ sides[0].axis_a, aimed @ sides[0].axis_b]) - target
+            assert (np.abs(off) <= np.array([0.02 * 2.4, 0.02 * 1.8]) + 1e-9).all()
             level = np.cross(camera.rotation[2], UP)
             level /= np.linalg.norm(level)
             roll = np.degrees(np.arcsin(np.cross(camera.rotation[0], level) @ camera.rotation[2]))
