@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan
+from orthoflow.files.points import open_scan, pcd, tables
 from orthoflow.files.points.lzf_kernels import decompress_lzf
 from tests import scan_files
 from tests.scan_files import read_all
@@ -39,6 +39,45 @@ def test_pcd_gives_its_points(tmp_path: Path, points: NDArray[np.float64], data:
     np.testing.assert_array_equal(block.intensity, fields["intensity"])
     np.testing.assert_array_equal(block.row, index // 8)
     np.testing.assert_array_equal(block.column, index % 8)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
+def test_the_grid_of_a_pcd_goes_on_from_block_to_block(
+    tmp_path: Path, points: NDArray[np.float64], data: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points), data=data, width=8)
+    for module in (pcd, tables):
+        monkeypatch.setattr(module, "BLOCK_POINTS", 15)
+    blocks = read_all(path)
+    assert [block.n_read for block in blocks] == [15, 15, 10]
+    index = np.arange(40)
+    rows, columns, greys = (
+        np.concatenate([getattr(block, name) for block in blocks])
+        for name in ("row", "column", "intensity")
+    )
+    np.testing.assert_array_equal(rows, index // 8)
+    np.testing.assert_array_equal(columns, index % 8)
+    np.testing.assert_array_equal(greys, index // 4)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_values_of_several_numbers_stand_between_those_of_one(tmp_path: Path, count: int) -> None:
+    """Descriptors of points, as PCL writes them among the coordinates."""
+    path = tmp_path / "a.pcd"
+    head = (
+        f"FIELDS x y histogram z\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 {count} 1\n"
+        "WIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+    )
+    rows = np.arange(2 * (3 + count), dtype="<f4").reshape(2, -1)
+    expected = rows[:, [0, 1, -1]]
+    for data, content in (
+        ("ascii", "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode() + b"\n"),
+        ("binary", rows.tobytes()),
+    ):
+        path.write_bytes(f"{head}DATA {data}\n".encode() + content)
+        (block,) = read_all(path)
+        np.testing.assert_array_equal(block.points, expected)
+        assert block.row is None
 
 
 def test_pcd_colours_may_be_integers_and_the_sensor_may_stand_somewhere(

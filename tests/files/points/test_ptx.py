@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan
+from orthoflow.files.points import open_scan, tables
 from tests import scan_files
 from tests.scan_files import read_all
 
@@ -60,3 +60,40 @@ def test_a_ptx_line_with_an_odd_number_of_columns_is_refused(tmp_path: Path) -> 
     path = scan_files.write_ptx(tmp_path / "a.ptx", [(table, 2, np.eye(4))])
     with pytest.raises(InputError, match=r"a\.ptx, line 11: expected x y z, with intensity"):
         open_scan(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "message"),
+    [
+        (51, "8 5", r"a\.ptx, line 51: expected the ten header lines of a PTX scan"),
+        (61, "1 2 x", r"a\.ptx, line 61"),
+        (70, "1 2 x", r"a\.ptx, line 70"),
+        (101, "8 5", r"a\.ptx, line 101: expected the ten header lines"),
+    ],
+    ids=["second-header", "its-first-point", "its-tenth", "third-header"],
+)
+def test_what_is_wrong_with_a_later_scan_is_told_with_its_line(
+    tmp_path: Path, points: NDArray[np.float64], line: int, text: str, message: str
+) -> None:
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))] * 3)
+    lines = path.read_text().splitlines()
+    assert len(lines) == 150
+    lines[line - 1] = text
+    path.write_text("\n".join([*lines, ""]))
+    with pytest.raises(InputError, match=message):
+        read_all(path)
+
+
+def test_the_grid_of_a_ptx_goes_on_from_block_to_block(
+    tmp_path: Path, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "BLOCK_POINTS", 15)
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))] * 2)
+    blocks = read_all(path)
+    assert [(block.scan, block.n_read) for block in blocks] == [
+        (scan, n) for scan in (0, 1) for n in (15, 15, 10)
+    ]
+    rows = np.concatenate([block.row for block in blocks if block.row is not None])
+    columns = np.concatenate([block.column for block in blocks if block.column is not None])
+    np.testing.assert_array_equal(rows, np.tile(np.arange(40) % 8, 2))
+    np.testing.assert_array_equal(columns, np.tile(np.arange(40) // 8, 2))
