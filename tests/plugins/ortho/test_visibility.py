@@ -13,6 +13,7 @@ from orthoflow_plugins.ortho.relief_kernels import make_occluding
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, transparent_relief_of, view_of
 from orthoflow_plugins.ortho.views import (
     FINE_CELLS,
+    NO_SURFACE,
     NOTHING,
     NOTHING_M,
     OCCLUDED,
@@ -163,7 +164,9 @@ def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(
     camera = scenes.camera(where, aside_m=aside_m)
     depths = noisy_depths()
     surface = surface_of(depths, is_transparent=True)
-    free = seen_of(surface, camera, is_exact=is_exact).mask == PAINTED
+    before = seen_of(surface, camera, is_exact=is_exact).mask
+    free = before == PAINTED
+    np.testing.assert_array_equal(before == NO_SURFACE, np.isnan(depths))
     rows, columns = np.nonzero(free)
     heights = depths[free].astype(np.float64)
     points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, heights)
