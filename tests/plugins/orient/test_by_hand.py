@@ -421,3 +421,61 @@ def test_poses_fit_whose_residuals_are_no_larger_than_chance_makes_them(
         squares = 12.0 * fit.resection.sigma0**2
         assert fit.chance == pytest.approx(stats.chi2.sf(squares, 12), abs=1e-9)
         assert fit.prior is CAMERA
+
+
+@pytest.mark.parametrize(("chance", "fits"), [(0.0012, True), (0.0008, False)])
+def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
+    chance: float, fits: bool
+) -> None:
+    from scipy import stats
+
+    rng = np.random.default_rng(2)
+    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (9, 3))
+    seen = replace(by(points), sigma_m=np.zeros(9))
+    seen.pixels_photo[:] += rng.normal(size=(9, 2))
+    prior: Any = SimpleNamespace(
+        guesses=[SimpleNamespace(posed=lambda: CAMERA)], freedom=LensFreedom()
+    )
+    fit = next(iter(by_hand._fits(seen, prior)))
+    # With such deviations the same residuals are as large as by chance one time in so many.
+    times = fit.resection.sigma0 * np.sqrt(12.0 / stats.chi2.isf(chance, 12))
+    found = list(by_hand._fits(replace(seen, sigma_px=times * seen.sigma_px), prior))
+    assert bool(found) == fits
+    if fits:
+        assert found[0].chance == pytest.approx(chance, rel=0.01)
+
+
+def test_a_pose_by_hand_knows_what_it_was_found_from() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (14, 3))
+    seen = by(points)
+    seen.pixels_photo[:] += 0.3 * rng.normal(size=(14, 2))
+    # Every second one was measured by hand, and the third of these is wrong.
+    measured = np.arange(14) % 2 == 0
+    hand = np.flatnonzero(measured)
+    more = np.concatenate([hand, [1, 3]])
+    measured[[1, 3]] = True
+    seen.pixels_photo[hand[2]] += [70.0, -50.0]
+    photo = calibrated().photos[0]
+    found = by_hand.pose_by_hand(photo, seen, measured)
+    assert not isinstance(found, str)
+    estimate = found.estimate
+    agreeing = np.zeros(14, dtype=np.bool_)
+    agreeing[np.setdiff1d(more, hand[2])] = True
+    np.testing.assert_array_equal(estimate.agreeing, agreeing)
+    np.testing.assert_array_equal(found.start.agreeing, agreeing)
+    assert (estimate.limit, estimate.source) == (3.5, "calibration")
+    assert estimate.notes[0] == "oriented by ties measured by hand alone"
+    u, v = seen.pixels_photo[hand[2]] - 0.5
+    assert estimate.notes[1].endswith(f"contradict the others: (u {u:.0f}, v {v:.0f})")
+    # Without each of them in turn less is known than with all.
+    assert len(estimate.without_one) == agreeing.sum()
+    sure = np.trace(estimate.resection.covariance)
+    worth = [np.trace(each.covariance) for each in estimate.without_one]
+    assert min(worth) > sure
+    assert len({round(value / sure, 6) for value in worth}) == len(worth)
+    assert estimate.fit.normalised.shape == (14,)
+    assert found.start.camera is estimate.resection.camera
+    nothing_lost = by_hand.pose_by_hand(photo, seen, measured & (np.arange(14) != hand[2]))
+    assert not isinstance(nothing_lost, str)
+    assert len(nothing_lost.estimate.notes) == 1

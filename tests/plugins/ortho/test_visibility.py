@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.ortho.block_kernels import room_for_blocks
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
 from orthoflow_plugins.ortho.relief_kernels import make_occluding
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, transparent_relief_of, view_of
 from orthoflow_plugins.ortho.views import (
+    BLOCK_CELLS,
     FINE_CELLS,
     NO_SURFACE,
     NOTHING,
@@ -22,7 +24,7 @@ from orthoflow_plugins.ortho.views import (
     TileVisibility,
     WallView,
 )
-from orthoflow_plugins.ortho.visibility_kernels import look_at_cells
+from orthoflow_plugins.ortho.visibility_kernels import look_at_blocks, look_at_cells
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
@@ -244,3 +246,88 @@ def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:
     assert (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).sum() > 1000
     assert not (layer.mask == LayerMask.OCCLUDED).any()
     assert any("visibility none" in warning for warning in ctx.warnings)
+
+
+NOTHING_SEEN = np.array([np.inf, -np.inf, np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0])
+# Rows and columns of the third block of the fourth row, which a tile begins with.
+BLOCK = (3, 2)
+
+
+def block_looked_at(
+    depths: NDArray[np.float32],
+    *,
+    aside_m: float = 0.4,
+    nearest_m: NDArray[np.float32] | float = np.inf,
+    is_exact: bool = False,
+) -> tuple[bool, TileVisibility]:
+    """Whether a block goes fast, and what is found in it."""
+    surface = surface_of(depths, is_transparent=False)
+    camera = scenes.camera(scenes.frame(), aside_m=aside_m)
+    shape = (BLOCK_CELLS, BLOCK_CELLS)
+    visible = TileVisibility(
+        u=np.full(shape, 7.0, dtype=np.float32),
+        v=np.full(shape, 7.0, dtype=np.float32),
+        mask=np.full(shape, 99, dtype=np.uint8),
+        quality=np.full(shape, 7.0, dtype=np.float32),
+        summary=NOTHING_SEEN.copy(),
+    )
+    row, column = BLOCK[0] * BLOCK_CELLS, BLOCK[1] * BLOCK_CELLS
+    tile = (row, column, row + BLOCK_CELLS, column + BLOCK_CELLS)
+    buffer = nothing_in_the_way(camera)
+    if np.ndim(nearest_m) or np.isfinite(nearest_m):
+        filled = np.broadcast_to(np.float32(nearest_m), (camera.height, camera.width))
+        buffer = DepthBuffer(nearest=np.ascontiguousarray(filled), reduction=1.0)
+    done = look_at_blocks(
+        view_of(camera, surface, PARAMS, is_exact=is_exact),
+        surface.relief,
+        buffer,
+        visible,
+        room_for_blocks(surface.relief, visible),
+        tile,
+        (BLOCK[0], BLOCK[1], BLOCK[1] + 1),
+    )
+    return bool(done), visible
+
+
+def test_a_block_that_a_photo_sees_as_a_whole_goes_fast() -> None:
+    flat = np.zeros(scenes.SHAPE, dtype=np.float32)
+    flat[BLOCK[0] * BLOCK_CELLS + 3, BLOCK[1] * BLOCK_CELLS + 4] = np.nan
+    done, visible = block_looked_at(flat)
+    assert done
+    assert (visible.mask == PAINTED).sum() == BLOCK_CELLS**2 - 1
+    assert visible.mask[3, 4] == NO_SURFACE
+    # Bounds of its places, how many, and those of its middle so many times.
+    known = visible.mask == PAINTED
+    u, v, n = visible.u[known], visible.v[known], BLOCK_CELLS**2 - 1
+    assert visible.summary[0] < u.min() < u.max() < visible.summary[1]
+    assert visible.summary[2] < v.min() < v.max() < visible.summary[3]
+    middle = 0.5 * (BLOCK_CELLS - 1)
+    column, row = BLOCK[1] * BLOCK_CELLS + middle, BLOCK[0] * BLOCK_CELLS + middle
+    np.testing.assert_allclose(visible.summary[4:], [n, n * column, n * row, 0.0], atol=1e-6)
+    assert not block_looked_at(flat, is_exact=True)[0]
+
+
+def test_a_block_behind_the_cloud_goes_fast_and_one_in_doubt_does_not() -> None:
+    flat = np.zeros(scenes.SHAPE, dtype=np.float32)
+    done, visible = block_looked_at(flat, nearest_m=0.5)
+    assert done
+    assert (visible.mask == OCCLUDED).all()
+    np.testing.assert_array_equal(visible.summary, NOTHING_SEEN)
+    # Something hides a part of it.
+    half = np.full((800, 1000), np.inf, dtype=np.float32)
+    done, visible = block_looked_at(flat)
+    half[:, : int(np.median(visible.u))] = 0.5
+    assert not block_looked_at(flat, nearest_m=half)[0]
+    void = flat.copy()
+    void[BLOCK[0] * BLOCK_CELLS :][:BLOCK_CELLS] = np.nan
+    assert not block_looked_at(void)[0]
+
+
+def test_of_a_block_in_the_shadow_of_the_relief_nothing_is_seen() -> None:
+    depths = np.zeros(scenes.SHAPE, dtype=np.float32)
+    end = (BLOCK[1] + 1) * BLOCK_CELLS
+    depths[:, end + 4 : end + 12] = 0.25
+    done, visible = block_looked_at(depths, aside_m=1.4)
+    assert done
+    assert (visible.mask == OCCLUDED).all()
+    np.testing.assert_array_equal(visible.summary, NOTHING_SEEN)
