@@ -257,7 +257,7 @@ def _methods(
             # Errors of both signs would make each other small.
             numbers = np.abs(numbers)
         against = partners[method]
-        compared = against and sense is not Sense.NEITHER
+        is_compared = against != "" and sense is not Sense.NEITHER
         rows.append(
             MethodOverDatasets(
                 name=method,
@@ -268,7 +268,7 @@ def _methods(
                 n_absent=len(names) - len(values) - len(failed),
                 median=float(np.median(numbers)) if numbers.size else math.nan,
                 spread=median_deviation(numbers) if numbers.size else math.nan,
-                paired=_paired(values, measured[against], sense) if compared else None,
+                paired=_paired(values, measured[against], sense) if is_compared else None,
             )
         )
     return tuple(rows)

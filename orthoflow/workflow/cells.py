@@ -350,7 +350,7 @@ class _Expansion:
         own |= always
         if is_excluded(self.workflow, own):
             raise _ExcludedError
-        if cause := self._is_unwanted(step, full):
+        if cause := self._stopped_by(step, full):
             cell = self._cell(step, variant, own, {}, _reason(cause))
             return _Node(cell=cell, dependence=always, causes=(cause,))
         choices = {
@@ -375,7 +375,7 @@ class _Expansion:
         cell = self._cell(step, variant, assignment, inputs, _reason(*choice.causes))
         return _Node(cell=cell, dependence=dependence, causes=choice.causes)
 
-    def _is_unwanted(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
+    def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
         """Why a step is skipped, whatever it takes; empty where it is not."""
         if step.unless and self._input_name(step.unless, full) in self.present:
             return f"without the input {step.unless}"
