@@ -10,12 +10,13 @@ from typing import Final
 
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import baseline_cells, is_missing
+from orthoflow.report.combinations import baseline_cells, combinations_of, is_missing
+from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
-from orthoflow.report.summaries import QUALITY, is_quality, limits
+from orthoflow.report.summaries import limits
 from orthoflow.workflow.format import DATA
 
 _ORIENTED: Final = "n_oriented"
@@ -84,13 +85,10 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     }
     measured = {name: _measured(part, own[name]) for name, part in parts.items()}
     units = {key: row for values in measured.values() for key, row in values.items()}
-    wanted = [
-        key
-        for metric in QUALITY
-        for key, row in units.items()
-        if key[1] == metric and is_quality(row)
-    ]
-    chosen = [key for key in wanted if key[1] != _ORIENTED][:_MOST_COLUMNS]
+    # Those of the comparison, which the workflow may have asked for.
+    columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
+    wanted = [(column.step, column.metric) for column in columns]
+    chosen = [key for key in wanted if key in units and key[1] != _ORIENTED][:_MOST_COLUMNS]
     return DatasetTable(
         columns=tuple((row.step, label_in_words(row)) for row in (units[key] for key in chosen)),
         rows=tuple(

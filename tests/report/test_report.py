@@ -200,6 +200,20 @@ def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
         assert told == [*([first] if first else []), ("points to their plane, RMS", "1.6 mm")]
 
 
+def test_whether_a_detector_found_what_there_is_has_columns_without_being_asked() -> None:
+    found = metrics(label_iou_mean=0.8, label_f1=0.9, true_planes_found=9.0, plane_angle_deg=0.1)
+    cells = [
+        cell(f"check@plane={name}", method="inspect.truth", metrics=found) for name in ("a", "b")
+    ]
+    table = comparison_table([run(*cells)])
+    assert table is not None
+    assert [column.metric for column in table.columns] == [
+        "plane_angle_deg",
+        "true_planes_found",
+        "label_iou_mean",
+    ]
+
+
 def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
     folder = tmp_path / "products" / "shade"
     folder.mkdir(parents=True)
