@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.mosaic import seams
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
@@ -321,6 +324,8 @@ def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
     (figure,) = ctx.figures
     assert figure.caption.startswith("west, by source: blue left, orange right; seams in white.")
     picture = decode_image(figure.path.read_bytes()).astype(float)
+    # A small wall is drawn cell by cell.
+    assert picture.shape[:2] == two_halves()[0].mask.shape
     third = picture.shape[1] // 3
     left, right = (picture[:, part].mean(axis=(0, 1)) for part in np.s_[:third, -third:])
     assert left[2] > 2 * left[0]  # blue
@@ -356,3 +361,28 @@ def test_layers_are_published_when_asked_for(tmp_path: Path) -> None:
         said = json.loads((tmp_path / f"{stem}.json").read_text())
         assert (said["source"], said["name"]) == (layer.source, "west wall")
         assert sum(said["mask_counts"].values()) == layer.mask.size
+
+
+def test_gains_and_what_a_lens_loses_in_its_corners_are_told(tmp_path: Path) -> None:
+    def joined_with(exposures: list[list[float]], lenses: list[list[float]]) -> Any:
+        of = SimpleNamespace(exposures=np.log(exposures), lenses=np.array(lenses).reshape(-1, 2))
+        return SimpleNamespace(balance=SimpleNamespace(exposures=of))
+
+    untouched: Any = SimpleNamespace(balance=None)
+    # In the corners r is 1: both terms add up in the logarithm of what has to be made good.
+    verdicts = [
+        joined_with([[0.8, 1.0, 1.1], [1.2, 0.9, 1.0]], [[0.1, 0.2], [0.0, 0.05]]),
+        untouched,
+        joined_with([[1.0, 1.4, 1.0]], []),
+    ]
+    ctx = scenes.context(tmp_path)
+    seams._report_gains(ctx, verdicts)
+    assert {metric.name: metric.value for metric in ctx.metrics} == {
+        "gain_min": pytest.approx(0.8),
+        "gain_max": pytest.approx(1.4),
+        "lens_loss_share": pytest.approx(1.0 - np.exp(-0.3)),
+    }
+    for few, names in (([untouched], set()), (verdicts[2:], {"gain_min", "gain_max"})):
+        ctx = scenes.context(tmp_path)
+        seams._report_gains(ctx, few)
+        assert {metric.name for metric in ctx.metrics} == names
