@@ -316,3 +316,7 @@ def test_what_a_step_says_is_heard_line_by_line(tmp_path: Path) -> None:
     assert [event.text for event in heard[:2]] == ["one two", "None"]
     assert heard[2].fraction == 0.0
     assert heard[2].text.endswith("p... (1048576 characters)")
+
+
+def test_nobody_ends_a_step_that_runs_alone(tmp_path: Path) -> None:
+    assert context(tmp_path).is_cancelled() is False

@@ -280,3 +280,11 @@ def test_sides_that_hardly_turn_keep_the_corner_between_them(degrees: float, mee
     if met is not None:
         expected = [30.0 - 5.0 / np.tan(np.radians(degrees)), 2.0]
         np.testing.assert_allclose(met, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("length", [0.25, 0.75, 1.0])
+def test_a_side_shorter_than_a_cell_is_seen_too(length: float) -> None:
+    """A side that has no length at all has nothing beside it, and its neighbours keep theirs."""
+    corners = np.array([[30.5, 20.5], [30.5, 20.5 + length], [30.5, 20.5 + length]])
+    shares = module._seen_shares(corners, np.ones(SHAPE, dtype=np.bool_))
+    np.testing.assert_array_equal(shares, [1.0, 0.0, 1.0])
