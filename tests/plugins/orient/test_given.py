@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.orient import given as given_poses
 from orthoflow_plugins.orient.given import OrientGiven
 from orthoflow_plugins.read.cameras import ReadCameras
 
@@ -157,3 +159,16 @@ def first_of(ties: Ties, count: int) -> Ties:
     names = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
     arrays = {name: getattr(ties, name)[:count] for name in (*names, "residual_px", "by_hand")}
     return replace(ties, **arrays)
+
+
+def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() -> None:
+    seen: Any = [None] * 4
+    residuals = np.array([[0.3, 0.4], [6.0, 8.0], [30.0, 40.0], [np.nan, np.nan]])
+    near = np.array([0.5, 3.4, 3.4, np.nan])
+    assert given_poses._disagreement(seen, near, residuals) == ()
+    (note,) = given_poses._disagreement(seen, np.array([0.5, 3.6, 3.4, np.nan]), residuals)
+    assert note.startswith("1 of its 4 ties measured by hand disagree with the given pose")
+    assert "by up to 10.0 px" in note
+    (note,) = given_poses._disagreement(seen, np.array([0.5, 3.6, 9.0, np.nan]), residuals)
+    assert note.startswith("2 of its 4 ties")
+    assert "by up to 50.0 px: measure at least 6" in note

@@ -164,9 +164,10 @@ def test_materials_have_gains_and_powers_of_their_own(many: Scene) -> None:
     spans(falls, 0.6, 0.85)
     rises = dry(many, 0.5, 1.0) - dry(many, 0.5, 0.0)
     spans(rises, 0.4, 0.65)
-    spans(np.log2(rises / (dry(many, 0.5, 0.5) - dry(many, 0.5, 0.0))), 1.2, 1.8)
+    bend = np.log2(rises / (dry(many, 0.5, 0.5) - dry(many, 0.5, 0.0)))
+    spans(bend, 1.2, 1.8)
     # What is drawn of one says nothing of another.
-    draws = [black, falls, rises]
+    draws = [black, falls, power, rises, bend]
     for k, one in enumerate(draws):
         for other in draws[k + 1 :]:
             assert abs(np.corrcoef(one, other)[0, 1]) < 0.2

@@ -350,3 +350,37 @@ def test_true_planes_reach_as_far_as_they_are_seen() -> None:
         np.testing.assert_allclose(off, depth_m, atol=1e-9)
     assert planes["door"].outline[:, 2].min() == pytest.approx(FLOOR_M, abs=0.01)
     assert planes["niche"].outline[:, 2].min() > FLOOR_M + 0.3
+
+
+@pytest.mark.parametrize(
+    ("name", "corners"),
+    # How far the walls beside it stand from the room's middle, to the left and to the right.
+    [
+        ("main wall", (-2.7, 2.7)),
+        ("opposite wall", (-2.7, 2.7)),
+        ("right wall", (-2.4, 2.0)),
+        ("left wall", (-2.0, 2.4)),
+    ],
+)
+def test_what_is_drawn_on_a_wall_lies_between_the_corners_of_the_room(
+    name: str, corners: tuple[float, float]
+) -> None:
+    sides = wall_sides(SceneDraft())
+    own = sides[WALLS.index(name)]
+    beside = sorted(
+        float(side.foot @ own.axis_a) for side in sides if abs(side.normal @ own.normal) < 0.5
+    )
+    assert beside == pytest.approx(corners, abs=0.02)
+    plan = RoomPlan(relief=1.0, obstacle=False, spectral_gap=0.0)
+    least, most = 9.0, -9.0
+    for seed in range(6):
+        found = along(build_room(plan, np.random.default_rng(seed)), name)
+        narrow = found.extent[:, 1] - found.extent[:, 0] < 3.0
+        ends = found.extent[narrow][:, :2]
+        # Pilasters in the corners reach a little behind the next wall.
+        assert ends.min() >= corners[0] - 0.1 - 1e-9
+        assert ends.max() <= corners[1] + 0.1 + 1e-9
+        least, most = min(least, ends.min()), max(most, ends.max())
+    # And it is drawn on all of the wall.
+    assert least < corners[0] + 0.9
+    assert most > corners[1] - 0.9
