@@ -234,7 +234,10 @@ def _curve(
         good += "; the filled point is the baseline"
     return Curve(
         title=title,
-        svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
+        svg=_Axes.of(
+            [point for points in lines.values() for point in points],
+            is_error=column.sense is Sense.LESS,
+        ).drawn(
             lines,
             label=title,
             below=f"{sweep.step}.{sweep.parameter}",
@@ -255,23 +258,32 @@ class _Axes:
         x: least and largest.
         y: least and largest.
         is_logarithmic: along x.
+        floor: no bar reaches below it: sizes of errors are none.
     """
 
     x: tuple[float, float]
     y: tuple[float, float]
     is_logarithmic: bool
+    floor: float
 
     @classmethod
-    def of(cls, points: Sequence[_Point]) -> _Axes:
+    def of(cls, points: Sequence[_Point], *, is_error: bool) -> _Axes:
         xs = [point.x for point in points]
         spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
+        floor = 0.0 if is_error and all(point.y >= 0.0 for point in points) else -math.inf
         low = min(point.y - spread for point, spread in zip(points, spreads, strict=True))
+        low = max(low, floor)
         high = max(point.y + spread for point, spread in zip(points, spreads, strict=True))
         margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
         # An axis that begins near 0 begins there: half of it would show a difference too large.
         begin = 0.0 if 0.0 <= low < 0.6 * high else low - margin
         is_logarithmic = min(xs) > 0 and max(xs) / min(xs) >= _LOGARITHMIC_RATIO
-        return cls(x=(min(xs), max(xs)), y=(begin, high + margin), is_logarithmic=is_logarithmic)
+        return cls(
+            x=(min(xs), max(xs)),
+            y=(begin, high + margin),
+            is_logarithmic=is_logarithmic,
+            floor=floor,
+        )
 
     def across(self, x: float) -> float:
         low, high = self.x
@@ -290,7 +302,6 @@ class _Axes:
         floor = _HEIGHT - _BOTTOM
         parts = [
             f'<path class="axis" d="M{_LEFT} {_TOP}V{floor}H{_WIDTH - _RIGHT}"/>',
-            f'<text class="beside" x="6" y="{_TOP - 14}">{escape(shown(beside))}</text>',
             (
                 f'<text x="{0.5 * (_LEFT + _WIDTH):.0f}" y="{_HEIGHT - 6}" text-anchor="middle">'
                 f"{escape(shown(below))}{' (logarithmic)' if self.is_logarithmic else ''}</text>"
@@ -311,24 +322,28 @@ class _Axes:
                     f'<text x="{x:.1f}" y="{floor + 17}" text-anchor="middle">{text}</text>'
                 )
                 taken = x + 0.5 * _LETTER * len(text) + 6.0
-        for index, (name, points) in enumerate(lines.items()):
-            parts.append(self._line(index, points))
-            if name:
-                y = _TOP + 12 + 15 * index
-                parts.append(
-                    f'<path class="line line-{index}" d="M{_WIDTH - 172} {y - 4}h22"/>'
-                    f'<text x="{_WIDTH - 146}" y="{y}">{escape(shown(name))}</text>'
-                )
+        parts += [self._line(index, points) for index, points in enumerate(lines.values())]
+        # The names stand above the lines, which could be anywhere below.
+        named = [(index, name) for index, name in enumerate(lines) if name]
+        above = [f'<text class="beside" x="6" y="{_TOP - 14}">{escape(shown(beside))}</text>']
+        for row, (index, name) in enumerate(named):
+            y = _TOP + 4 + 15 * row
+            above.append(
+                f'<path class="line line-{index}" d="M{_LEFT} {y - 4}h22"/>'
+                f'<text x="{_LEFT + 26}" y="{y}">{escape(shown(name))}</text>'
+            )
+        down = 15 * len(named)
         return (
-            f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
-            f'aria-label="{escape(shown(label))}">{"".join(parts)}</svg>'
+            f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT + down:.0f}" role="img" '
+            f'aria-label="{escape(shown(label))}">{"".join(above)}'
+            f'<g transform="translate(0 {down})">{"".join(parts)}</g></svg>'
         )
 
     def _line(self, index: int, points: Sequence[_Point]) -> str:
         at = [(self.across(point.x), self.down(point.y)) for point in points]
         way = "L".join(f"{x:.1f} {y:.1f}" for x, y in at)
         bars = "".join(
-            f"M{x:.1f} {self.down(point.y - point.spread):.1f}"
+            f"M{x:.1f} {self.down(max(point.y - point.spread, self.floor)):.1f}"
             f"V{self.down(point.y + point.spread):.1f}"
             for (x, _), point in zip(at, points, strict=True)
             if math.isfinite(point.spread)

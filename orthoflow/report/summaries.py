@@ -37,6 +37,7 @@ QUALITY: Final[Mapping[str, str]] = {
     )
 }
 
+_DECLARED_MOST: Final = 3
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
@@ -76,6 +77,12 @@ def answers(run: Run) -> tuple[Answer, ...]:
         for row in rows
         if row.metric == "main_found" and row.method.startswith("inspect.") and row.value == 0
     ]
+    # What a stranger's method says to be good or bad is what its workflow is about.
+    found += [
+        Answer(what=row.words, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
+        for row in rows
+        if row.words and row.good
+    ][:_DECLARED_MOST]
     for wanted in QUALITY:
         stated = [row for row in rows if row.metric == wanted and is_quality(row)]
         # Own orthoimages stand behind those of others, whatever the order of the steps.

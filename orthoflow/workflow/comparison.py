@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
-from orthoflow.files.yaml_positions import Position, Table, Value, join
+from orthoflow.files.yaml_positions import Entry, Position, Table, Text, Value, join
 from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
 from orthoflow.workflow.format import (
     BASELINE,
@@ -64,8 +65,16 @@ def read_compare(
     # A variant that was swept is still known by its own name.
     names = {name: [*known, *families[name]] for name, known in names.items()}
     with_data = {DATA: list(datasets), **names} if datasets else names
-    combinations = [_read_assignment(item, here, with_data, log) for here, item in excluded]
-    chosen = _read_assignment(baseline, join(path, BASELINE.name), names, log) if baseline else {}
+    unswept = _unswept(steps)
+    combinations = [
+        _read_assignment(item, here, with_data, log)
+        for here, item in excluded
+        if not _names_unswept(item, unswept)
+    ]
+    chosen: Assignment = {}
+    if baseline:
+        here = join(path, BASELINE.name)
+        chosen = _read_assignment(_without_values(baseline, unswept), here, names, log)
     return Comparison(
         design=design,
         baseline=_complete(next(_spelt_out(chosen, families)), steps),
@@ -86,6 +95,40 @@ def _families(step: DraftStep) -> dict[str, tuple[str, ...]]:
         if variant.family:
             found[variant.family] = (*found.get(variant.family, ()), variant.call.name)
     return found
+
+
+def _unswept(steps: Sequence[DraftStep]) -> dict[str, tuple[str, ...]]:
+    """Names of the calls to which the command line gives one value of what the file sweeps."""
+    found = {
+        step.name: tuple(variant.call.name for variant in step.variants if variant.is_unswept)
+        for step in steps
+    }
+    return {step: names for step, names in found.items() if names}
+
+
+def _call_of(entry: Entry, unswept: Mapping[str, Sequence[str]]) -> str | None:
+    """The call whose swept value an entry names, though it is not swept now; None for others."""
+    text = entry.value.value if isinstance(entry.value, Text) else ""
+    names = unswept.get(entry.key, ())
+    fitting = [name for name in names if not name or str(text).startswith(f"{name}-")]
+    return max(fitting, key=len, default=None)
+
+
+def _names_unswept(table: Table, unswept: Mapping[str, Sequence[str]]) -> bool:
+    return any(_call_of(entry, unswept) is not None for entry in table)
+
+
+def _without_values(table: Table, unswept: Mapping[str, Sequence[str]]) -> Table:
+    """A baseline with calls in the place of values of theirs that are not swept now."""
+    entries = []
+    for entry in table:
+        call = _call_of(entry, unswept)
+        if call is None:
+            entries.append(entry)
+        elif call and isinstance(entry.value, Text):
+            entries.append(replace(entry, value=replace(entry.value, value=call)))
+        # A step that is its only call has no variants to choose from.
+    return replace(table, entries=tuple(entries))
 
 
 def _spelt_out(

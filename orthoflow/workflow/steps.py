@@ -43,6 +43,7 @@ class DraftVariant:
         params: as written.
         swept: names of the parameters whose values its name says.
         family: of a swept one, the name of the variant that it came from; empty without.
+        is_unswept: the file sweeps it, and the command line gives it one value.
     """
 
     position: Position
@@ -53,6 +54,7 @@ class DraftVariant:
     params: Table | None
     swept: tuple[str, ...] = ()
     family: str = ""
+    is_unswept: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

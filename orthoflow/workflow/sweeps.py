@@ -64,7 +64,7 @@ def expand_sweeps(
                     call = CallName(step=step.name, variant=one.call.name)
                     kept[call] = (*values, *others)
             else:
-                variants.append(variant)
+                variants.append(replace(variant, is_unswept=variant != written))
                 kept[name] = others
         has_sweeps |= is_swept
         expanded.append(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance.model import PublishedFile
+from orthoflow_provenance.model import Metric, PublishedFile
 
 from orthoflow.errors import StoreError
 from orthoflow.records.runs import Run
@@ -211,6 +211,19 @@ def test_whether_a_detector_found_what_there_is_has_columns_without_being_asked(
         "plane_angle_deg",
         "true_planes_found",
         "label_iou_mean",
+    ]
+
+
+def test_what_a_stranger_calls_good_is_told_first() -> None:
+    dent = Metric(name="dent_share", value=0.25, unit="1", words="share of dents", good="less")
+    other = Metric(name="n_dents", value=7.0, unit="1", words="dents")
+    cells = [
+        cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6)),
+        cell("dent", method="dent.simple", metrics=(dent, other)),
+    ]
+    assert [(one.what, one.value, one.cell) for one in answers(run(*cells))] == [
+        ("share of dents", "0.25", "dent"),
+        ("points to their plane, RMS", "1.6 mm", "plane"),
     ]
 
 

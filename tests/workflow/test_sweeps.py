@@ -70,6 +70,35 @@ def test_a_sweep_is_a_comparison_of_all_its_values(catalog: Catalog) -> None:
     assert named.baseline == {"plane": "tolerance_m-0_05"}
 
 
+TWO = (
+    ROOM[: ROOM.index("    use: plane.hough2d")]
+    + """\
+    in: {cloud: room.cloud}
+    variants:
+      hough2d: {use: plane.hough2d, params: {tolerance_m: {sweep: [0.02, 0.05]}}}
+      ransac: {use: plane.ransac, params: {tolerance_m: {sweep: [0.02, 0.05]}}}
+compare: {baseline: {plane: hough2d-tolerance_m-0_05},
+          exclude: [{plane: ransac-tolerance_m-0_02}]}
+"""
+)
+
+
+def test_a_value_that_is_not_swept_any_more_stands_for_its_variant(catalog: Catalog) -> None:
+    one = load(catalog, TWO, sets=["plane.hough2d.tolerance_m=0.03"])
+    assert one.baseline == {"plane": "hough2d"}
+    assert one.compare is not None
+    assert one.compare.exclude == ({"plane": "ransac-tolerance_m-0_02"},)
+    # What was to be left out of a sweep is no reason to leave out its only value.
+    other = load(catalog, TWO, sets=["plane.ransac.tolerance_m=0.03"])
+    assert other.compare is not None
+    assert other.compare.exclude == ()
+    assert other.baseline == {"plane": "hough2d-tolerance_m-0_05"}
+    alone = f"{ROOM}compare: {{baseline: {{plane: tolerance_m-0_05}}}}\n"
+    assert load(catalog, alone, sets=["plane.tolerance_m=0.03"]).baseline == {}
+    with pytest.raises(InvalidWorkflowError, match="has no variant ransac-tolerance_m-0_07"):
+        load(catalog, TWO.replace("hough2d-tolerance_m-0_05}", "ransac-tolerance_m-0_07}"))
+
+
 def test_several_sweeps_make_all_combinations_and_a_variant_stands_in_front(
     catalog: Catalog,
 ) -> None:
