@@ -122,7 +122,9 @@ def _scan(path: Path) -> Recognised:
     fields = frozenset(str(name) for name in scan.fields)
     n_photos = count_e57_images(path) if path.suffix.lower() == E57_SUFFIX else 0
     words = [scan.format_name, f"{scan.n_most:,} points"]
-    words += [word for name, word in _FIELDS.items() if name in fields]
+    if has := [word for name, word in _FIELDS.items() if name in fields]:
+        # Files may have room for them and nothing in it.
+        words.append(f"fields for {' and '.join(has)}")
     words += [f"{n_photos} photos" if n_photos > 1 else "a photo"] if n_photos else []
     return Recognised(
         kind="scan", path=path, said=", ".join(words), n_photos=n_photos, fields=fields

@@ -76,7 +76,7 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     }
     text = Path("jobs/hall 1.yaml").read_text()
     assert 'photos: {files: "../the [old] hall/photos"}  # 3 photos' in text
-    assert "scan: hall.las, LAS/LAZ, 500 points, intensity, colours" in out
+    assert "scan: hall.las, LAS/LAZ, 500 points, fields for intensity and colours" in out
     assert "calibration: calibration.yaml, a calibration of *" in out
     assert "checkpoints: checks.csv, 2 surveyed points" in out
     assert "ties: ties.csv, 1 tie" in out

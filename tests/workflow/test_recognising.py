@@ -63,7 +63,7 @@ def test_a_scan_says_how_many_points_it_has_and_what_of_each(tmp_path: Path) -> 
     cloud.write(str(tmp_path / "hall.las"))
     (found,) = recognised([tmp_path / "hall.las"])
     assert (found.kind, found.n_photos) == ("scan", 0)
-    assert found.said == "LAS/LAZ, 1,500 points, intensity, colours"
+    assert found.said == "LAS/LAZ, 1,500 points, fields for intensity and colours"
     assert found.fields == {"intensity", "rgb"}
 
 
