@@ -198,16 +198,19 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
     middle = seen.points_world.mean(axis=0)
     pixels = np.ascontiguousarray(to_opencv(straight[inside]))
     points = np.ascontiguousarray(seen.points_world[inside] - middle)
-    methods = [cv2.SOLVEPNP_SQPNP]
-    across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    posed = [(cv2.SOLVEPNP_SQPNP, points)]
+    centroid = points.mean(axis=0)
+    _, across, axes = np.linalg.svd(points - centroid, full_matrices=False)
     if across[2] < 1e-2 * across[1]:
-        methods.append(cv2.SOLVEPNP_IPPE)
+        # IPPE takes nothing but points of one plane: onto it, then.
+        flat = points - np.outer((points - centroid) @ axes[2], axes[2])
+        posed.append((cv2.SOLVEPNP_IPPE, flat))
     call: Any = cv2.solvePnPGeneric
     starts: list[ViewingCamera] = []
-    for method in methods:
+    for method, of_method in posed:
         try:
             n_found, turns, shifts, _ = call(
-                points, pixels, opencv_matrix(lens), None, flags=method
+                of_method, pixels, opencv_matrix(lens), None, flags=method
             )
         except cv2.error:  # the points have no such solution
             continue
