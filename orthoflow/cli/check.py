@@ -64,9 +64,12 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
     without_data = f", {skipped} of them skipped for lack of optional data" if skipped else ""
     n_data = len(loaded.chosen_data)
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
+    # Where nothing varies, a step is its only cell.
+    is_plain = all(cell.address == cell.step for cell in cells)
+    n_cells = "" if is_plain else f", {datasets}{counted(len(cells), 'cell')}"
     summary = (
-        f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}, {datasets}"
-        f"{counted(len(cells), 'cell')}{without_data}{_baseline_text(loaded)}"
+        f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"
+        f"{n_cells}{without_data}{_baseline_text(loaded)}"
     )
     return _Verdict(summary=summary, warnings=doubts_about(loaded))
 

@@ -391,7 +391,7 @@ def test_report_writes_one_page_for_several_runs(finished: tuple[Path, str, str]
 def test_plan_says_what_is_cached_and_what_changed(finished: tuple[Path, str, str]) -> None:
     folder = finished[0]
     same = orthoflow(folder, "plan", "studio.yaml", "--set", "survey.offset_m=-3")
-    assert same.stdout.splitlines()[-1] == "2 cells: 2 cached"
+    assert same.stdout.splitlines()[-1] == "2 steps: 2 cached"
     other = json.loads(
         orthoflow(
             folder,
@@ -431,7 +431,7 @@ def test_the_store_may_lie_elsewhere(tmp_path: Path) -> None:
 def test_check_is_content_with_a_good_workflow(tmp_path: Path) -> None:
     write_studio(tmp_path)
     done = orthoflow(tmp_path, "check", "studio.yaml")
-    assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps, 2 cells\n")
+    assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps\n")
 
 
 def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -> None:
@@ -472,7 +472,7 @@ def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None
     said = "no step takes the input more: wire it as inputs.more, or remove it"
     done = orthoflow(tmp_path, "check", "studio.yaml")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"studio is fine: 2 steps, 2 cells\nwarning: {said}\n"
+    assert done.stdout == f"studio is fine: 2 steps\nwarning: {said}\n"
     answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
     assert (answer["ok"], answer["warnings"]) == (True, [said])
     # Whoever has not checked reads it where the run ends.

@@ -149,13 +149,13 @@ def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     assert asked == [(tmp_path, None, False), (tmp_path, 2.5, True), (tmp_path, None, False)]
 
 
-def planned(status: str, *, key: object = None) -> Any:
+def planned(status: str, *, key: object = None, took_s: float | None = 1.0) -> Any:
     cell = SimpleNamespace(address=f"a@b={status}", step="a", method="a.b", params={"n": 1})
-    return SimpleNamespace(status=status, reason="so", cell=cell, key=key)
+    return SimpleNamespace(status=status, reason="so", cell=cell, key=key, took_s=took_s)
 
 
 def test_a_plan_is_summed_up_by_status() -> None:
-    assert _summary([]) == "0 cells: "
+    assert _summary([]) == "0 steps: "
     statuses = ("skipped", "cached", "will run", "cached", "unknown yet")
     assert _summary([planned(status) for status in statuses]) == (
         "5 cells: 2 cached, 1 will run, 1 unknown yet, 1 skipped"
@@ -170,3 +170,12 @@ def test_a_plan_is_summed_up_by_status() -> None:
         "params": {"n": 1},
     }
     assert _as_json(planned("will run"))["key"] is None
+    # What never ran before is in no store, whatever it will be given.
+    new = planned("unknown yet", took_s=None)
+    assert _summary([new]) == "1 cell: 1 will run"
+    assert (_as_json(new)["status"], _as_json(new)["reason"]) == (
+        "will run",
+        "no result of its method is stored",
+    )
+    new.cell.address = new.cell.step
+    assert _summary([new]) == "1 step: 1 will run"
