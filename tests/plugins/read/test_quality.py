@@ -125,8 +125,9 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
     }
     thick, apart = ctx.warnings
     assert thick.startswith(
-        "the cloud is thicker than its scan step: about pieces of 10 cm of a surface its points "
-        "scatter by 3.1 mm (95 % within 12.5 mm), and they lie 2.0 mm apart: planes and depths"
+        "the cloud is thicker than its scan step: across surfaces, pieces of 10 cm each, its "
+        "points scatter by 3.1 mm (95 % within 12.5 mm), and along them the nearest other point is "
+        "2.0 mm away: planes and depths"
     )
     assert apart == (
         "the scans disagree: where two show one surface they lie 9.4 mm apart across it (median), "
