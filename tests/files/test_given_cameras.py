@@ -419,6 +419,8 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "cameras.txt:1: a camera's parameters must be numbers"),
         ({"cameras.txt": "1 PINHOLE 640 480 500 320 240\n", "images.txt": ""},
          "a camera PINHOLE has 4 parameters, got 3"),
+        ({"cameras.txt": "1 SIMPLE_RADIAL 640 480 500\n", "images.txt": ""},
+         "a camera SIMPLE_RADIAL has 4 parameters, got 1"),
         ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
         ({"cameras.txt": "1 PINHOLE 640 480\n", "images.txt": ""}, "txt:1: expected CAMERA_ID"),
         ({"cameras.txt": "# c\n\n" + CAMERA, "images.txt": "\n1 1 0 0 0 0 x 0 1 a.jpg\n"},

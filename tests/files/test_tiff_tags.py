@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import struct
 
 import pytest
 
+from orthoflow.files import tiff_tags
 from orthoflow.files.tiff_tags import Directory, read_directory
 
 TAG = 0x9000
@@ -134,3 +136,13 @@ def test_values_outside_the_block_are_missed_and_the_rest_is_read() -> None:
     found = read_directory(cut, most_bytes=MOST)
     assert found.is_damaged
     assert found.number(TAG) is None
+
+
+def test_a_block_gives_what_it_has_and_zeros_where_that_is_not_enough() -> None:
+    source = tiff_tags._Source(b"abc", 10)
+    assert (source.read(0), source.tell()) == (b"", 0)
+    assert (source.read(2), source.read(1), source.is_short) == (b"ab", b"c", False)
+    # A reader that asks where the end is learns of that of the file.
+    assert source.seek(0, io.SEEK_END) == 10
+    assert source.seek(1) == 1
+    assert (source.read(3), source.is_short) == (bytes(3), True)

@@ -210,7 +210,7 @@ def _read_header(path: Path) -> PcdHeader:
     for line in start.splitlines(keepends=True):
         n_bytes += len(line)
         words = line.decode("ascii", "replace").split()
-        if words and not words[0].startswith("#"):
+        if words:
             entries[words[0].upper()] = words[1:]
         if "DATA" in entries:
             break
@@ -258,7 +258,7 @@ def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
         fields=tuple(names),
         dtype=np.dtype(members),
         n_points=n_points,
-        width=max(width, 1),
+        width=width,
         height=height,
         data=data,
         # The default, 0 0 0 and no rotation, says nothing.

@@ -60,6 +60,27 @@ def test_the_grid_of_a_pcd_goes_on_from_block_to_block(
     np.testing.assert_array_equal(greys, index // 4)
 
 
+def test_a_grid_of_one_column_has_as_many_rows_as_points(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    (block,) = read_all(scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points), width=1))
+    np.testing.assert_array_equal(block.row, np.arange(40))
+    np.testing.assert_array_equal(block.column, np.zeros(40))
+
+
+def test_comments_and_empty_lines_are_no_entries(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points))
+    plain = path.read_bytes()
+    (expected,) = read_all(path)
+    between = b"\n#\n# WIDTH 7\n#HEIGHT 7\n \nWIDTH"
+    path.write_bytes(plain.replace(b"WIDTH", between, 1))
+    (block,) = read_all(path)
+    np.testing.assert_array_equal(block.points, expected.points)
+    assert block.row is None
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_values_of_several_numbers_stand_between_those_of_one(tmp_path: Path, count: int) -> None:
     """Descriptors of points, as PCL writes them among the coordinates."""
