@@ -22,21 +22,24 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
+_ROWS_MOST: Final = 20
 
 
 @click.command(cls=RecordCommand)
 @click.argument("first", metavar="A", type=click.Path(path_type=Path))
 @click.argument("second", metavar="B", type=click.Path(path_type=Path))
 @store_option
+@click.option("--all", "is_whole", is_flag=True, help="Print every row that differs.")
 @json_option
-def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
+def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: bool) -> int:
     """Lay the runs A and B, run folders or their run.h5, side by side.
 
     Says in what their inputs, workflows, parameters, versions and environments differ, and how
     far their metrics and products lie apart. A parameter with * was set, others are defaults.
     Cells are the same when their addresses are, or else when each step that varies on their way
-    has one method with the same parameters; what only one run has is counted apart. --json has
-    also what is equal. Ends with 3 where the seal of a record does not hold.
+    has one method with the same parameters; what only one run has is counted apart. Of long tables
+    the first rows are printed, of metrics those that say how good results are. --json has also
+    what is equal. Ends with 3 where the seal of a record does not hold.
     """
     from orthoflow.engine.store import Store
     from orthoflow.records.comparison import compare_runs
@@ -49,7 +52,7 @@ def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
     if as_json:
         echo_json(comparison_json(comparison))
     else:
-        _print(comparison)
+        _print(comparison, most=None if is_whole else _ROWS_MOST)
     doubts = [doubt for run in runs if (doubt := broken_seal(run))]
     say_error(*(f"error: {doubt}; rely on nothing that is said of it here" for doubt in doubts))
     return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD
@@ -86,37 +89,42 @@ def _row_json(row: Pair[Any]) -> dict[str, object]:
     return {**dataclasses.asdict(row), "same": row.is_same}
 
 
-def _print(comparison: RunComparison) -> None:
+def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
         echo(
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
             f"seed {record.seed}, {counted(len(record.cells), 'cell')}"
         )
-    _print_pairs("inputs", comparison.inputs, _files_text)
+    _print_pairs("inputs", comparison.inputs, _files_text, most)
     if comparison.workflow:
         echo("", "workflow, A (-) against B (+)")
         for line in comparison.workflow[2:]:
             echo(line)
     else:
         echo("", "workflow: same text")
-    _print_pairs("options", [comparison.overrides], " ".join)
-    _print_pairs("cells", comparison.cells, str)
+    _print_pairs("options", [comparison.overrides], " ".join, most)
+    _print_pairs("cells", comparison.cells, str, most)
     for theirs, ours in comparison.readdressed.items():
         echo(f"the same, though called otherwise: {ours} (A), {theirs} (B)")
     _print_pairs(
         "parameters (* set, others are defaults)",
         comparison.shared(comparison.parameters),
         _parameter_text,
+        most,
     )
-    _print_pairs("environment", comparison.environment, str)
-    _print_metrics(comparison.shared(comparison.metrics))
+    _print_pairs("environment", comparison.environment, str, most)
+    _print_metrics(comparison.shared(comparison.metrics), most)
     echo("", "products")
-    echo_distances(comparison.products)
+    echo_distances(comparison.products, most)
 
 
-def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value], str]) -> None:
-    """Print the rows that differ under a title, or that none does."""
+def _print_pairs(
+    title: str, rows: Sequence[Pair[Value]], text: Callable[[Value], str], most: int | None
+) -> None:
+    """Print the rows that differ under a title, what both have first, or that none does."""
     different = [row for row in rows if not row.is_same]
+    if most is not None and len(different) > most:
+        different.sort(key=lambda row: not row.is_shared)
     if not different:
         echo("", f"{title}: same")
         return
@@ -136,9 +144,15 @@ def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value]
                 ".".join(part for part in (row.cell, row.name) if part),
                 *(_NOTHING if side is None else text(side) for side in (row.left, row.right)),
             )
-            for row in different
+            for row in different[:most]
         ],
     )
+    _say_more(len(different), most)
+
+
+def _say_more(n_rows: int, most: int | None) -> None:
+    if most is not None and n_rows > most:
+        echo(f"and {n_rows - most} more, which --all prints")
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:
@@ -151,14 +165,26 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text}*" if parameter.is_set else text
 
 
-def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
+def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> None:
     """Print every metric that differs; times and memory, which always do, apart and last."""
     for title, is_cost in (("metrics", False), ("times and memory", True)):
         chosen = [row for row in rows if row.either.is_cost == is_cost]
         different = [row for row in chosen if _value(row.left) != _value(row.right)]
         echo("", f"{title}: {len(different)} of {len(chosen)} differ")
+        if most is not None and len(different) > most:
+            different.sort(key=lambda row: _place(row.name))
         if different:
-            _print_numbers(different)
+            _print_numbers(different[:most])
+        _say_more(len(different), most)
+
+
+def _place(metric: str) -> int:
+    """Where a number stands among those that say how good results are; the others last."""
+    from orthoflow.report.comparisons import FOUND
+    from orthoflow.report.summaries import QUALITY
+
+    order = [*QUALITY, *FOUND]
+    return order.index(metric) if metric in order else len(order)
 
 
 def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:

@@ -23,6 +23,7 @@ from orthoflow.engine.events import (
 )
 from orthoflow.foreign_text import shown
 from orthoflow.geometry.threads import start_beside
+from orthoflow.records.warnings import SettingNames
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -60,6 +61,8 @@ class RunState:
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
         self._senses: set[str] = set()
+        self._calls = {item.cell.address: item.cell for item in cells}
+        self._names = SettingNames.of(self._calls.values())
 
     def take(self, event: RunEvent) -> None:
         """Hear of an event."""
@@ -88,6 +91,12 @@ class RunState:
             n_before = len(self._senses)
             self._senses.add(sense(warning.text))
             return len(self._senses) > n_before
+
+    def told(self, warning: CellWarned) -> str:
+        """A warning in a line, with parameters as they are set."""
+        call = self._calls.get(warning.address)
+        text = warning.text if call is None else self._names.in_words(warning.text, call)
+        return f"{warning.address}: warning: {text}"
 
     def cells(self) -> dict[str, CellState]:
         """Give all cells, as they are now."""
@@ -135,7 +144,7 @@ class PlainProgress:
             case CellStarted():
                 self._say(f"{event.address}: started")
             case CellWarned() if self._state.is_new(event):
-                self._say(f"{event.address}: warning: {event.text}")
+                self._say(self._state.told(event))
             case CellFinished():
                 self._say(f"{end_text(event)} ({self._state.n_ended} of {self._n_cells})")
             case _:
@@ -206,7 +215,7 @@ class LiveProgress:
             case RunStarted():
                 self._print(start_text(event))
             case CellWarned() if self._state.is_new(event):
-                self._print(f"{event.address}: warning: {event.text}", style="yellow")
+                self._print(self._state.told(event), style="yellow")
             case _:
                 return
 

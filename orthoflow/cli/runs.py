@@ -167,7 +167,8 @@ def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[st
         if run.n_datasets > 1:
             echo_folded(f"{run.folder}: medians of {run.n_datasets} datasets that have a value")
     n_left_out = n_found - len(kept)
-    echo(counted(len(kept), "run") + (f", {n_left_out} others left out" if n_left_out else ""))
+    others = f", {counted(n_left_out, 'other')} left out" if n_left_out else ""
+    echo(f"{counted(len(kept), 'run')}{others}")
 
 
 @dataclass(frozen=True, kw_only=True)

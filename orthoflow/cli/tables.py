@@ -85,8 +85,16 @@ def echo_json(value: object) -> None:
     click.echo(text)  # noqa: TID251 - what could be obeyed is written as JSON has it
 
 
-def echo_distances(distances: Sequence[ProductDistance]) -> None:
-    """Print a row per product, the reasons of what differs, and how many there are of each."""
+def echo_distances(distances: Sequence[ProductDistance], most: int | None = None) -> None:
+    """Print a row per product, the reasons of what differs, and how many there are of each.
+
+    Args:
+        distances: of products.
+        most: rows that are printed, those that differ first; all without it.
+    """
+    told = list(distances)
+    if most is not None and len(told) > most:
+        told = sorted(told, key=lambda item: item.verdict == "identical")[:most]
     echo_table(
         ("product", "type", "verdict", "largest differences"),
         [
@@ -96,12 +104,14 @@ def echo_distances(distances: Sequence[ProductDistance]) -> None:
                 item.verdict,
                 ", ".join(_distance_text(distance) for distance in item.distances),
             )
-            for item in distances
+            for item in told
         ],
     )
-    for item in distances:
+    for item in told:
         if item.reason:
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
+    if len(told) < len(distances):
+        echo(f"and {len(distances) - len(told)} more, which --all prints")
     echo(verdict_counts(distances))
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Protocol
 
 from orthoflow_provenance.model import RecordedCell
 
@@ -14,6 +15,58 @@ _LATER: Final = re.compile(r"\bunless [a-z ]+ later \(([a-z0-9_.-]+)\)")
 _OF_METHOD: Final = re.compile(r"(`?)(\w+)(`?) of ([a-z0-9_]+\.[a-z0-9_-]+)")
 # Names of parameters; those of one word are words of sentences, too.
 _PARAMETER: Final = re.compile(r"(?<![\w.])[a-z]+(?:_[a-z0-9]+)+(?![\w.])")
+
+
+class Call(Protocol):
+    """A cell, planned or recorded."""
+
+    @property
+    def step(self) -> str:
+        """Name of its step."""
+        raise AssertionError("a protocol is never called")
+
+    @property
+    def method(self) -> str:
+        """Id of its method."""
+        raise AssertionError("a protocol is never called")
+
+    @property
+    def params(self) -> Mapping[str, object]:
+        """Resolved parameters."""
+        raise AssertionError("a protocol is never called")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingNames:
+    """How parameters are called where they are set: `wall.margin_m`.
+
+    Attributes:
+        steps: method and parameter -> the only step that has them.
+    """
+
+    steps: Mapping[tuple[str, str], str]
+
+    @classmethod
+    def of(cls, calls: Iterable[Call]) -> SettingNames:
+        """Look through the cells of a run."""
+        found: dict[tuple[str, str], set[str]] = {}
+        for call in calls:
+            for name in call.params:
+                found.setdefault((call.method, name), set()).add(call.step)
+        return cls(steps={key: min(steps) for key, steps in found.items() if len(steps) == 1})
+
+    def in_words(self, text: str, call: Call) -> str:
+        """Name the parameters in what a cell says, its own and those of methods that it names."""
+
+        def of_method(found: re.Match[str]) -> str:
+            before, name, behind, method = found.groups()
+            step = self.steps.get((method, name))
+            return found[0] if step is None else f"{before}{step}.{name}{behind}"
+
+        def own(found: re.Match[str]) -> str:
+            return f"{call.step}.{found[0]}" if found[0] in call.params else found[0]
+
+        return _PARAMETER.sub(own, _OF_METHOD.sub(of_method, text))
 
 
 def standing_warnings(cells: Iterable[RecordedCell]) -> tuple[tuple[str, str], ...]:
@@ -30,9 +83,9 @@ def standing_warnings(cells: Iterable[RecordedCell]) -> tuple[tuple[str, str], .
         if cell.status == "ok"
         for given in cell.inputs.values()
     }
-    steps = _steps(cells)
+    names = SettingNames.of(cells)
     return tuple(
-        (cell.address, _as_set(text, cell, steps))
+        (cell.address, names.in_words(text, cell))
         for cell in cells
         for text in cell.warnings
         if not any(
@@ -41,26 +94,3 @@ def standing_warnings(cells: Iterable[RecordedCell]) -> tuple[tuple[str, str], .
             for made in cell.outputs.values()
         )
     )
-
-
-def _steps(cells: Iterable[RecordedCell]) -> dict[tuple[str, str], str]:
-    """Method and parameter -> the only step that has them."""
-    found: dict[tuple[str, str], set[str]] = {}
-    for cell in cells:
-        for name in cell.params:
-            found.setdefault((cell.method, name), set()).add(cell.step)
-    return {key: next(iter(steps)) for key, steps in found.items() if len(steps) == 1}
-
-
-def _as_set(text: str, cell: RecordedCell, steps: Mapping[tuple[str, str], str]) -> str:
-    """Name parameters as `--set` takes them: those of the cell, and those of methods named."""
-
-    def of_method(found: re.Match[str]) -> str:
-        before, name, behind, method = found.groups()
-        step = steps.get((method, name))
-        return found[0] if step is None else f"{before}{step}.{name}{behind}"
-
-    def own(found: re.Match[str]) -> str:
-        return f"{cell.step}.{found[0]}" if found[0] in cell.params else found[0]
-
-    return _PARAMETER.sub(own, _OF_METHOD.sub(of_method, text))

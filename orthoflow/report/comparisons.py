@@ -23,7 +23,7 @@ _NOTHING: Final = "-"
 _CUT: Final = frozenset(("rms_mm", "fit_rms_mm"))
 _CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
 # Of detectors: whether they found what there is, before how well.
-_FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean")
+FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean")
 # Seconds of the clock beyond those of the processor, and how many times these, that a machine with
 # other work is known by.
 _BUSY_S: Final = 5.0
@@ -242,7 +242,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         ]
         wanted += [
             key
-            for name in _FOUND
+            for name in FOUND
             for key in last
             if key[1] == name and first[key].method.startswith("inspect.")
         ]

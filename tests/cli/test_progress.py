@@ -168,6 +168,19 @@ def test_how_far_a_step_says_it_is_counts_where_nothing_is_known() -> None:
     assert CellState(state="running", started=0.0, fraction=0.5, took_s=10.0).left_s(20.0) == 20.0
 
 
+def test_a_warning_names_parameters_as_they_are_set(capsys: pytest.CaptureFixture[str]) -> None:
+    (item,) = planned("wall")
+    told = dataclasses.replace(item, cell=dataclasses.replace(item.cell, params={"gsd_m": 0.01}))
+    with PlainProgress((told,)) as progress:
+        progress.tell(CellWarned(address="wall", text="raise gsd_m"))
+        # Of what is no cell of the plan nobody knows the parameters.
+        progress.tell(CellWarned(address="other", text="lower gsd_m"))
+    assert capsys.readouterr().err.splitlines() == [
+        "wall: warning: raise wall.gsd_m",
+        "other: warning: lower gsd_m",
+    ]
+
+
 def test_a_run_takes_as_long_as_what_is_left_of_it() -> None:
     running = CellState(state="running", started=0.0, took_s=30.0)
     waiting, unknown = CellState(took_s=50.0), CellState()

@@ -219,6 +219,23 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
     ]
 
 
+def test_of_a_long_comparison_what_says_how_good_results_are_is_printed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    few = different_runs()
+    numbers = [
+        Pair(cell="a", name=name, left=metric(1.0), right=metric(2.0))
+        for name in (*(f"odd_{index}" for index in range(30)), "rms_mm", "rmse_u_mm")
+    ]
+    _print(dataclasses.replace(few, metrics=tuple(numbers)), most=20)
+    lines = printed(capsys)
+    start = lines.index("metrics: 32 of 32 differ")
+    assert [line.split()[0] for line in lines[start + 2 : start + 5]] == [
+        *("a.rmse_u_mm", "a.rms_mm", "a.odd_0"),
+    ]
+    assert lines[start + 22] == "and 12 more, which --all prints"
+
+
 def test_a_comparison_in_json_says_of_each_row_whether_it_is_the_same() -> None:
     found = json.loads(json.dumps(comparison_json(different_runs())))
     assert [run["run_id"] for run in found["runs"]] == ["r1", "r2"]
