@@ -108,3 +108,24 @@ def test_every_state_of_a_cell_occurs() -> None:
             shown = image.source == place
             np.testing.assert_array_equal(image.rgb[shown], layer.rgb[shown])
             assert (layer.mask[shown] == LayerMask.PAINTED).all()
+
+
+def test_walls_are_stained_smoothly_from_dark_to_light() -> None:
+    walls = example("walls")
+    assert isinstance(walls, Walls)
+    for wall in walls.walls:
+        assert wall.intensity is not None
+        grey = 256.0 * wall.intensity.astype(np.float64)
+        known = np.isfinite(grey)
+        assert np.nanmin(grey) >= 40.0
+        assert np.nanmax(grey) <= 215.0
+        assert np.nanstd(grey) > 20.0
+        # Straight between places eight cells apart: nowhere steeper than that and bent only there.
+        for axis in (0, 1):
+            assert np.nanmax(abs(np.diff(grey, axis=axis))) <= 175.0 / 8.0 + 1e-3
+            bend = abs(np.diff(grey, n=2, axis=axis))
+            lines = np.moveaxis(bend, axis, 0)
+            at_places = (np.arange(len(lines)) + 1) % 8 == 0
+            assert np.nanmax(lines[~at_places]) < 1e-3
+            assert np.nanmax(lines[at_places]) > 1.0
+        assert known.any()
