@@ -36,9 +36,12 @@ def missed_points(
         if point.how != "outside":
             found[surveyed.names[index]] = f"nothing like it was recognised on {names[point.wall]}"
             continue
-        found[surveyed.names[index]] = min(
-            _beside(surveyed, index, picture, walls) for picture in pictures
-        )[1]
+        number = int(surveyed.wall[index])
+        found[surveyed.names[index]] = (
+            f"there is no orthoimage of wall {number}"
+            if number >= 0
+            else min(_beside(surveyed, index, picture, walls) for picture in pictures)[1]
+        )
     return found
 
 

@@ -127,6 +127,9 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
     points = points_at(surveyed, pixels=pixels)
     points = replace(points, wall=np.array([0, -1, -1, -1], dtype=np.int32))
     image = inspect_scenes.displaced(0, 0)
+    elsewhere = replace(points, wall=np.array([0, 0, 7, 0], dtype=np.int32))
+    _, _, ctx = inspect(tmp_path, elsewhere, walls, image)
+    assert "P2 (there is no orthoimage of wall 7)" in ctx.warnings[0]
     metrics, _, ctx = inspect(tmp_path, points, walls, image)
     assert (metrics["n_points"], metrics["n_found"]) == (4, 1)
     (said,) = ctx.warnings
