@@ -56,6 +56,11 @@ os.environ.setdefault(
 # What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
 
+# There is a process of tests for each core. With as many threads each, products of small matrices
+# take several times longer: threads wait for each other on cores that others have. What methods
+# give with two is compared by the conformance suite; steps have as many threads as cores, as ever.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Containers set it to keep images small. Each command that a test starts would compile the sources
 # anew: 0.7 s instead of 0.5 to import what it needs.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):

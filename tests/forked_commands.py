@@ -16,7 +16,6 @@ from __future__ import annotations
 import atexit
 import ctypes
 import gc
-import importlib
 import json
 import os
 import select
@@ -155,8 +154,10 @@ class _StepServers:
 
     def load(self) -> None:
         """Load what commands have loaded, for those that follow."""
+        from orthoflow.engine.fork_server import load_library
+
         for name in self.wanted:
-            importlib.import_module(name)
+            load_library(name)
         self.wanted.clear()
 
     def _answer(self) -> None:

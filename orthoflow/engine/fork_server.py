@@ -44,6 +44,7 @@ _LIBRARIES: Final = (
     "matplotlib.figure",
     "networkx",
     "numba",
+    "orthoflow_provenance.payloads",
     "pandas",
     "PIL.Image",
     "pye57",
@@ -115,7 +116,7 @@ class _Server:
         while True:
             ready = self.selector.select(0 if self.wanted else _IDLE_S)
             if not ready and self.wanted:
-                _load(self.wanted.pop(0))
+                load_library(self.wanted.pop(0))
             elif not ready and not self.keepers:
                 return
             for key, _ in ready:
@@ -138,7 +139,7 @@ class _Server:
         if request.is_compared:
             self._learn()
             while self.wanted:
-                _load(self.wanted.pop(0))
+                load_library(self.wanted.pop(0))
         try:
             keeper = os.fork()
         except OSError:
@@ -224,14 +225,35 @@ def _move_to(request: StepRequest) -> None:
     os.chdir(request.folder)
 
 
-def _load(name: str) -> None:
-    """Load a library as well as it can be; steps say what is wrong with it."""
+def load_library(name: str) -> None:
+    """Load a library for the processes that are forked from this one, as well as it can be.
+
+    Steps say what is wrong with it.
+    """
     if address_space() is not None:
         # Some crash where they get too little, and all steps with this process.
         return
     with suppress(Exception):
         importlib.import_module(name)
+        if name == "numba":
+            _ready_numba()
     gc.freeze()
+
+
+def _ready_numba() -> None:
+    """Let numba register what it can compile, as it does for the first kernel of a process.
+
+    That takes longer than loading numba. Its extensions are code of strangers: they are left to
+    each step, which looks for them again.
+    """
+    from numba.core import entrypoints  # noqa: PLC0415 - only where numba is loaded anyway
+    from numba.core.registry import cpu_target  # noqa: PLC0415
+
+    entrypoints._already_initialized = True  # noqa: SLF001 - numba has no other door for it
+    try:
+        cpu_target.target_context.refresh()
+    finally:
+        entrypoints._already_initialized = False  # noqa: SLF001
 
 
 def main(arguments: list[str]) -> None:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.engine.fork_server import load_library
 from orthoflow.engine.store import Store
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial
@@ -36,6 +37,8 @@ INSTRUCTION_SWITCHES: Final = (
     "OPENBLAS_CORETYPE",
     "OPENCV_CPU_DISABLE",
 )
+# Two where the session has one, else one.
+_ALGEBRA_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _LIMIT_S: Final = 600
 # Slow to import, harmless to fork after; the server imports them once the session has.
 _SHARED_LIBRARIES: Final = ("numba", "scipy.ndimage", "scipy.spatial", "cv2", "matplotlib.figure")
@@ -55,7 +58,7 @@ class ElsewhereRun:
 
 
 def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
-    """Run a trial in a new process: other working directory, home, hash seed and one BLAS thread.
+    """Run a trial in a new process: other working directory, home, hash seed, BLAS threads.
 
     Raises:
         AssertionError: the process failed; the sentence ends with what it said last.
@@ -134,10 +137,10 @@ def _environment(folder: Path) -> dict[str, str]:
     # Bytecode is read where this process has it, or the server would make its own, for seconds.
     names = ("PATH", "LD_LIBRARY_PATH", "PYTHONPYCACHEPREFIX", *INSTRUCTION_SWITCHES)
     kept = {name: os.environ[name] for name in names if name in os.environ}
-    one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    threads = {name: "2" if os.environ.get(name) == "1" else "1" for name in _ALGEBRA_THREADS}
     return {
         **kept,
-        **one_thread,
+        **threads,
         "HOME": str(folder),
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         "PYTHONHASHSEED": "12345",
@@ -174,8 +177,8 @@ def serve() -> None:
         task_file = Path(line.rstrip("\n"))
         task = json.loads(task_file.read_text())
         for library in task["libraries"]:
-            with suppress(ImportError):
-                importlib.import_module(library)
+            if library not in sys.modules:
+                load_library(library)
         process = os.fork()
         if process == 0:
             _run_forked(task_file.parent, task)

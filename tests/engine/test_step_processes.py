@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.engine.fork_server import load_library
 from tests.engine_world import World, has_ended, start_coordinator
 
 STEPS = "steps:\n  first: {use: make.range}\n"
@@ -94,6 +95,24 @@ def test_what_compared_steps_loaded_is_loaded_before_the_next_one_not_beside_it(
     outcome = world.run(COMPARED)
     loaded = [world.values(outcome, f"second@second={name}")[3] for name in ("one", "two")]
     assert loaded == [0.0, 1.0]
+
+
+def test_numba_is_ready_where_steps_are_forked_from_and_its_extensions_are_left_to_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from numba.core import entrypoints
+    from numba.core.registry import cpu_target
+
+    asked, entry_points = [], entrypoints.importlib_metadata.entry_points
+    monkeypatch.setattr(
+        entrypoints.importlib_metadata, "entry_points", lambda: asked.append(1) or entry_points()
+    )
+    load_library("numba")
+    assert "numba.np.arraymath" in sys.modules
+    assert not asked
+    # As the first kernel of a step does.
+    cpu_target.target_context.refresh()
+    assert asked == [1]
 
 
 @pytest.mark.parametrize("turns", ["20", "26"], ids=["by default", "as somebody wants it"])
