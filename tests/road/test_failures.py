@@ -44,7 +44,7 @@ steps:
       crash: {use: mischief.crash}
       exit: {use: mischief.exit}
       raise: {use: mischief.raise}
-      hang: {use: mischief.hang, timeout: 5s}
+      hang: {use: mischief.hang, timeout: 2s}
       fill: {use: mischief.fill}
       meddle: {use: mischief.meddle}
       wrong: {use: mischief.wrong}
@@ -127,7 +127,8 @@ def test_a_scan_that_is_not_there_is_named(shell: Shell) -> None:
 
 def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -> None:
     write("mischief.yaml", MISCHIEF)
-    ended = with_stranger("run", "mischief.yaml", "-o", "run")
+    # The others go on while one hangs, for as long as it may and is then waited for.
+    ended = with_stranger("run", "mischief.yaml", "-o", "run", "--jobs", "2")
     assert ended.code == 1
     assert no_traceback(ended.said)
     shown = json.loads(with_stranger("show", "run", "--json").out)
@@ -136,7 +137,7 @@ def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -
         "crash": "segmentation fault",
         "exit": "17",
         "raise": "KeyError",
-        "hang": "5 s",
+        "hang": "2 s",
         "fill": "No space left",
         "meddle": "writes to an array that is read-only, as all its inputs are",
         "wrong": "must give a planes on its port planes, got PointCloud",

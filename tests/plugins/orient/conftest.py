@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from orthoflow_plugins.orient import figures
+from orthoflow_plugins.orient import figures, reporting
+
+from tests.undrawn_charts import build_charts_once
 
 
 @pytest.fixture(autouse=True)
@@ -14,3 +16,8 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     """
     if request.path.stem != "test_figures":
         monkeypatch.setattr(figures, "_SIDE_PX", 90)
+
+
+@pytest.fixture(autouse=True)
+def _charts_built_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    build_charts_once(request, monkeypatch, reporting, "draw_positions", "draw_residuals")

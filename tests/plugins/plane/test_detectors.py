@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane import detecting, final_fit, search_figures
+from orthoflow_plugins.plane import final_fit
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
@@ -42,13 +42,6 @@ TO_THE_END = {"stop_unclassified_share": 0.0}
 
 every_detector = pytest.mark.parametrize("detector", DETECTORS)
 
-# What builds charts. Where planes are those of `rooms` once more, or some of them, so are they; to
-# set them up takes longer than to find the planes.
-CHARTS = {
-    detecting: ("draw_deviations", "draw_planes", "draw_thickness"),
-    search_figures: ("draw_accumulator", "draw_space", "draw_sections", "draw_normals"),
-}
-
 
 def detect(
     detector: str,
@@ -56,18 +49,13 @@ def detect(
     folder: Path,
     *,
     seed: int = 0,
-    draws: bool = True,
     **params: Any,
 ) -> tuple[Any, StepContext]:
     method, options = DETECTORS[detector]
     folder.mkdir(parents=True, exist_ok=True)
     ctx = StepContext(rng=np.random.default_rng(seed), cores=2, scratch=folder)
     inputs = method.In(cloud=cloud)
-    with pytest.MonkeyPatch.context() as patch:
-        for module, names in CHARTS.items():
-            for name in () if draws else names:
-                patch.setattr(module, name, lambda *_, **__: None)
-        return method().run(inputs, method.Params(**{**options, **params}), ctx), ctx
+    return method().run(inputs, method.Params(**{**options, **params}), ctx), ctx
 
 
 def nearest(planes: Planes, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> int:
@@ -150,7 +138,7 @@ def test_shuffled_points_give_the_same_planes(
 ) -> None:
     order = np.random.default_rng(7).permutation(len(sampled()))
     cloud = cloud_of(sampled()[order], stations=STATION)
-    out, _ = detect(detector, cloud, tmp_path, draws=False, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, np.eye(3))
 
 
@@ -159,7 +147,7 @@ def test_survey_coordinates_of_a_million_metres_lose_nothing(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
     cloud = cloud_of(sampled(), stations=STATION, origin=SURVEY)
-    out, _ = detect(detector, cloud, tmp_path, draws=False, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     expected = rooms[detector].planes
     np.testing.assert_array_equal(out.planes.normal, expected.normal)
     np.testing.assert_allclose(
@@ -174,7 +162,7 @@ def test_a_turned_room_gives_the_turned_planes(
 ) -> None:
     turn = turned(angle_deg)
     cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
-    out, _ = detect(detector, cloud, tmp_path, draws=False, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -187,7 +175,7 @@ def test_ten_other_turns_give_the_turned_planes(
     for angle_deg in (7.0, 18.5, 41.0, 57.3, 77.0, 103.0, 131.7, 168.0, 212.4, 299.9):
         turn = turned(angle_deg)
         cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
-        out, _ = detect(detector, cloud, tmp_path / str(angle_deg), draws=False, **TO_THE_END)
+        out, _ = detect(detector, cloud, tmp_path / str(angle_deg), **TO_THE_END)
         same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -199,7 +187,7 @@ def test_a_room_turned_any_way_gives_the_turned_planes(
     cross = np.cross(np.eye(3), axis)
     turn = np.eye(3) + np.sin(1.0) * cross + (1.0 - np.cos(1.0)) * cross @ cross
     cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
-    out, _ = detect(detector, cloud, tmp_path, draws=False, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -209,7 +197,7 @@ def test_half_of_the_points_give_the_same_planes_within_three_sigma(
 ) -> None:
     expected = rooms[detector].planes
     cloud = cloud_of(sampled()[::2], stations=STATION)
-    out, _ = detect(detector, cloud, tmp_path, draws=False, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     for truth in ROOM:
         k = nearest(expected, truth.normal, np.array(truth.centre))
         j = nearest(out.planes, truth.normal, np.array(truth.centre))
@@ -296,7 +284,7 @@ def test_a_constraint_leaves_only_its_planes(
 ) -> None:
     cloud = cloud_of(sampled(), stations=STATION)
     few = {"constraint": constraint, **TO_THE_END}
-    planes = detect(detector, cloud, tmp_path, draws=False, **few)[0].planes
+    planes = detect(detector, cloud, tmp_path, **few)[0].planes
     rises = np.abs(planes.normal @ planes.up)
     assert len(planes) == count
     assert (rises < 0.1 if constraint == "vertical" else rises > 0.99).all()
@@ -360,7 +348,7 @@ def test_thinning_finds_the_same_planes_and_labels_every_point(
 def test_stop_rules_end_the_search(detector: str, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(), stations=STATION)
     number = detect(detector, cloud, tmp_path, n_planes_max=2)[0].planes
-    few = partial(detect, detector, cloud, tmp_path, draws=False)
+    few = partial(detect, detector, cloud, tmp_path)
     support = few(min_share=0.15, **TO_THE_END)[0].planes
     rest = few(stop_rest_share=0.25, **TO_THE_END)[0]
     unclassified = few(stop_unclassified_share=0.6)[0]

@@ -58,14 +58,19 @@ def whole(wall: tuple[PointCloud, Slab, Vertices]) -> Net:
     return lay_net(*wall)
 
 
-def in_tiles(
-    wall: tuple[PointCloud, Slab, Vertices], monkeypatch: pytest.MonkeyPatch, tile_cells: int
-) -> Net:
-    monkeypatch.setattr(nets, "VERTICES_MOST", 1000)
-    monkeypatch.setattr(nets, "_TILE_CELLS", tile_cells)
-    monkeypatch.setattr(nets, "_SPAN_CELLS", 40)
-    monkeypatch.setattr(nets, "SPAN_MOST_CELLS", SPAN_MOST)
-    return lay_net(*wall)
+def in_tiles(wall: tuple[PointCloud, Slab, Vertices], tile_cells: int) -> Net:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nets, "VERTICES_MOST", 1000)
+        patch.setattr(nets, "_TILE_CELLS", tile_cells)
+        patch.setattr(nets, "_SPAN_CELLS", 40)
+        patch.setattr(nets, "SPAN_MOST_CELLS", SPAN_MOST)
+        return lay_net(*wall)
+
+
+@pytest.fixture(scope="module")
+def tiled(wall: tuple[PointCloud, Slab, Vertices]) -> dict[int, Net]:
+    """The net of each size of tiles, in cells; the last size takes the wall whole."""
+    return {tile_cells: in_tiles(wall, tile_cells) for tile_cells in (90, 140, 300)}
 
 
 def diameters(wall: tuple[PointCloud, Slab, Vertices], net: Net) -> NDArray[np.float64]:
@@ -89,32 +94,31 @@ def diameters(wall: tuple[PointCloud, Slab, Vertices], net: Net) -> NDArray[np.f
 def test_tiles_give_the_triangles_of_the_whole(
     wall: tuple[PointCloud, Slab, Vertices],
     whole: Net,
-    monkeypatch: pytest.MonkeyPatch,
+    tiled: dict[int, Net],
     tile_cells: int,
 ) -> None:
-    tiled = in_tiles(wall, monkeypatch, tile_cells)
-    told = np.isfinite(tiled.depth_m)
+    net = tiled[tile_cells]
+    told = np.isfinite(net.depth_m)
     assert told.reshape(SHAPE)[WINDOW].all()
     assert not told.reshape(SHAPE)[170:180, 170:180].any()
     across = diameters(wall, whole)
     assert told[across <= SPAN_MOST].all()
     # Of wider circles only those that lie beside the wall for the most part.
     assert np.count_nonzero(told & ~(across <= SPAN_MOST)) < 0.01 * told.size
-    np.testing.assert_allclose(tiled.depth_m[told], whole.depth_m[told], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(net.depth_m[told], whole.depth_m[told], rtol=0, atol=1e-7)
     assert whole.intensity is not None
-    assert tiled.intensity is not None
-    np.testing.assert_allclose(tiled.intensity[told], whole.intensity[told], rtol=0, atol=1e-6)
+    assert net.intensity is not None
+    np.testing.assert_allclose(net.intensity[told], whole.intensity[told], rtol=0, atol=1e-6)
     assert whole.rgb is not None
-    assert tiled.rgb is not None
-    assert (tiled.rgb[told] != whole.rgb[told]).mean() < 1e-4
-    assert not tiled.rgb[~told].any()
+    assert net.rgb is not None
+    assert (net.rgb[told] != whole.rgb[told]).mean() < 1e-4
+    assert not net.rgb[~told].any()
 
 
-def test_what_is_left_out_does_not_hang_on_the_tiles(
-    wall: tuple[PointCloud, Slab, Vertices], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    masks = [np.isfinite(in_tiles(wall, monkeypatch, cells).depth_m) for cells in (110, 300)]
-    np.testing.assert_array_equal(*masks)
+def test_what_is_left_out_does_not_hang_on_the_tiles(tiled: dict[int, Net]) -> None:
+    first, *others = (np.isfinite(net.depth_m) for net in tiled.values())
+    for other in others:
+        np.testing.assert_array_equal(other, first)
 
 
 def test_a_large_wall_whose_points_lie_on_a_line_has_no_net(
