@@ -20,9 +20,10 @@ read, messages and whatever else an exception is raised with, log and progress l
 assertions of what cannot happen, version numbers of results, what changes speed or looks alone
 (threads, sizes of parts, bands and caches, the room of arrays that kernels make for themselves and
 that tables which grow begin with, from how many on, a hundred thousand or more, a part is
-looked at in place of all, arguments, margins and sizes of drawings, colours and paints, floats
-below a millionth that guard a division), which seed samples begin with, how long another process is
-waited for at most, and how often a search goes on at most: one that has converged moves no more.
+looked at in place of all, the priority of processes, arguments, margins and sizes of drawings,
+colours and paints, floats of a millionth or less that guard a division), which seed samples begin
+with, how long another process is waited for at most, how often a search goes on at most, and from
+which step on it has converged: it moves no more than that.
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
 kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests,

@@ -73,7 +73,7 @@ _UNSEEN_NAMES: Final = re.compile(
     r"|BAND_(CELLS|PX)|_BLOCK(_ROWS|_ENTRIES)?$|_(LONGEST|SMALLEST|MAP)_PX$|PIXELS_MOST$"
     r"|_RGB$|_BGR$|_SEED$|^_?(INK|PAPER)$"
     r"|(TIMEOUT|PATIENCE|CONNECT|STOPPING|CLOSE|GRACE|LOOK|LOOK_EVERY|SILENT|PAUSE|RETRY)_S$"
-    r"|(ROWS|VOXELS)_FIRST$|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|THREADS$|^(result_version|citations|cores|threads)$"
+    r"|(ROWS|VOXELS)_FIRST$|ITERATIONS|ROUNDS|CONVERGED|NICENESS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|THREADS$|^(result_version|citations|cores|threads)$"
 )
 # What lays out a drawing, and how a made-up surface looks.
 _LOOKS: Final = re.compile(r"^(Margins|Paint)$")
@@ -269,7 +269,7 @@ class _Finder(ast.NodeVisitor):
             other: object = not value
         elif isinstance(value, int):
             other = 2 * value if value >= _LARGE else value + 1
-        elif isinstance(value, float) and not 0.0 < abs(value) < _GUARD:
+        elif isinstance(value, float) and not 0.0 < abs(value) <= _GUARD:
             other = 2.0 * value if value else 1.0
         else:
             return

@@ -32,7 +32,7 @@ from orthoflow.engine.executors import COMPILED_CODE
 from orthoflow.engine.keys import MethodFacts
 
 FORETOLD: Final = "kernels.json"
-_LOWEST: Final = 19
+_NICENESS: Final = 19
 
 # Module, name and types of the arguments of a kernel, as `geometry.kernel_types` writes them.
 _Kernel = list[Any]
@@ -174,7 +174,7 @@ def _listen(left: set[str]) -> None:
 
 def main(arguments: list[str]) -> None:
     """Compile what the coordinator orders."""
-    os.nice(_LOWEST)
+    os.nice(_NICENESS)
     left: set[str] = set()
     threading.Thread(target=_listen, args=(left,), daemon=True).start()
     with os.fdopen(int(arguments[0]), "rb") as stream:

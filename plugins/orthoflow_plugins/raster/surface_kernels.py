@@ -191,7 +191,7 @@ def _sort(values: NDArray[np.float32]) -> None:
 
 @compiled
 def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
-    best_size, best_first, first = 0, 0, 0
+    best_size, best_first, first = 1, 0, 0
     for k in range(1, depths.size + 1):
         if k == depths.size or depths[k] - depths[k - 1] > layer_m:
             # At least as large: depths ascend, the later layer is nearer to the viewer.
