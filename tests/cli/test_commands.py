@@ -6,10 +6,14 @@ import shlex
 from pathlib import Path
 
 import click
+import h5py
+import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli.commands import command_again
+from orthoflow.cli.commands import RecordCommand, command_again
 from orthoflow.cli.tables import echo
+from orthoflow.errors import ArgumentError, GeometryError, ProductError, RecordError
+from tests.provenance_records import write_sample
 
 
 @click.command()
@@ -29,3 +33,67 @@ def test_a_command_is_repeated_with_what_was_given_and_another_folder() -> None:
     assert sorted(words[1:-2]) == sorted(given[:-2])
     assert words[words.index("a=[1, 2]") - 1] == words[words.index("b=3") - 1] == "--set"
     assert words[-2:] == ["-o", "new one"]
+
+
+# --- what fails on a record ---
+
+
+def failing(error: Exception, *runs: Path) -> BaseException:
+    """Give runs to a command that ends with an error, and take what becomes of it."""
+
+    @click.command(cls=RecordCommand)
+    @click.argument("first", type=click.Path(path_type=Path))
+    @click.argument("others", nargs=-1, type=click.Path(path_type=Path))
+    @click.option("--at", default="nowhere")
+    def fail(**_given: object) -> None:
+        raise error
+
+    with pytest.raises(BaseException) as caught:  # noqa: PT011 - which one is what is asked
+        fail.main([str(run) for run in runs], standalone_mode=False)
+    return caught.value
+
+
+@pytest.fixture
+def intact(tmp_path: Path) -> Path:
+    path, _, _ = write_sample(tmp_path)
+    return path
+
+
+@pytest.fixture
+def changed(intact: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "changed.h5"
+    path.write_bytes(intact.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["seed"] = type(file.attrs["seed"])(b"8")
+    return path
+
+
+def test_what_fails_on_an_intact_record_is_our_own_fault(intact: Path) -> None:
+    error = KeyError("wall")
+    assert failing(error, intact) is error
+    assert failing(error, intact, intact) is error
+
+
+def test_what_fails_on_a_changed_record_is_that_ones(intact: Path, changed: Path) -> None:
+    for runs in ((changed,), (intact, changed), (changed, intact), (intact, intact, changed)):
+        error = KeyError("wall")
+        told = failing(error, *runs)
+        assert isinstance(told, RecordError)
+        assert str(told).startswith(f"{changed} is not as it was written: ")
+        assert told.__cause__ is error
+
+
+@pytest.mark.parametrize("kind", [GeometryError, ProductError])
+def test_a_product_that_breaks_its_rules_is_the_records(
+    intact: Path, kind: type[Exception]
+) -> None:
+    told = failing(kind("no plane"), intact)
+    assert isinstance(told, RecordError)
+    assert str(told) == "a product of this run breaks its own rules: no plane"
+
+
+@pytest.mark.parametrize(
+    "error", [ArgumentError("not so"), OSError(28, "full"), click.UsageError("no"), click.Abort()]
+)
+def test_what_a_user_did_is_told_as_it_is(changed: Path, error: Exception) -> None:
+    assert failing(error, changed) is error

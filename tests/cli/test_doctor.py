@@ -8,6 +8,7 @@ import platform
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -162,6 +163,34 @@ def test_little_memory_is_told(
 
 
 @pytest.mark.parametrize(
+    ("n_bytes", "verdict", "found"),
+    [
+        (5 * GIB, "ok", "5.0 GiB free"),
+        (5 * GIB - 1, "limited", "5.0 GiB free"),
+        (GIB // 4, "limited", "0.2 GiB free"),
+    ],
+)
+def test_little_room_on_the_disk_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int, verdict: str, found: str
+) -> None:
+    asked = []
+
+    def disk_usage(folder: Path) -> SimpleNamespace:
+        asked.append(folder)
+        return SimpleNamespace(free=n_bytes)
+
+    monkeypatch.setattr(diagnosis.shutil, "disk_usage", disk_usage)
+    disk, store = diagnosis._diagnose_store(tmp_path / "new" / "er")
+    # Of what is not there yet the folder that it will lie in counts.
+    assert asked == [tmp_path]
+    assert (disk.name, disk.is_core) == ("disk of the store", False)
+    assert (disk.verdict, disk.found, bool(disk.cost)) == (verdict, found, verdict != "ok")
+    assert (store.verdict, store.cost, store.is_core) == ("ok", "", True)
+    assert store.found == f"{tmp_path / 'new' / 'er'} is writable"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
     ("system", "machine", "verdict"),
     [
         ("Linux", "x86_64", "ok"),
@@ -212,6 +241,28 @@ def test_every_library_of_the_core_is_one() -> None:
         *("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich"),
         "ruamel.yaml",
     }
+
+
+def test_plugins_are_counted_and_broken_ones_cost_their_methods(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    broken = SimpleNamespace(entry_point="odd", distribution="odd-methods", error="no such name")
+    catalog = SimpleNamespace(methods={"a.b": 1, "a.c": 2}, broken=(broken,))
+    monkeypatch.setattr("orthoflow.catalog.discovery.discover_catalog", lambda: catalog)
+    fine, odd = doctor._diagnose_plugins()
+    assert (fine.name, fine.verdict, fine.found, fine.cost) == ("plugins", "ok", "2 methods", "")
+    assert (odd.name, odd.verdict, odd.is_core) == ("plugin odd", "missing", False)
+    assert (odd.found, odd.cost) == (
+        *("odd-methods fails to load", "its methods are missing: no such name"),
+    )
+
+    def fail() -> None:
+        raise ImportError("no pluggy")
+
+    monkeypatch.setattr("orthoflow.catalog.discovery.discover_catalog", fail)
+    (none,) = doctor._diagnose_plugins()
+    assert (none.name, none.verdict, none.found) == ("plugins", "missing", "no pluggy")
+    assert none.cost == "no method can be found; install what is missing"
 
 
 @pytest.mark.parametrize(

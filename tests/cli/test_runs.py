@@ -14,6 +14,8 @@ import pytest
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 from orthoflow_provenance.writer import write_record
 
+from orthoflow.cli import runs as module
+from orthoflow.report.browsing import RunSummary
 from tests.hostile_records import reseal, set_attribute
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
@@ -259,3 +261,82 @@ def test_mistakes_get_a_sentence(runs: Path, arguments: tuple[str, ...], sentenc
 
 def test_without_runs_it_says_so(tmp_path: Path) -> None:
     assert said("runs", tmp_path) == "0 runs\n"
+
+
+# --- parts of a row ---
+
+
+def test_in_what_a_run_differs_is_said_as_far_as_a_line_bears_it() -> None:
+    assert module._facts_text({}) == ""
+    facts = {
+        "plane.use": "plane.toy",
+        "wall.near": [[1, 2.5]],
+        "input scan": ["a.laz", "b.laz"],
+        "input photos": [],
+    }
+    said = "plane.use=plane.toy, wall.near=[[1, 2.5]], input scan=a.laz, b.laz, "
+    assert module._facts_text(facts) == f"{said}input photos=not given"
+    assert module._facts_text({**facts, "seed": 8, "a": None}) == (
+        f"{said}input photos=not given and 2 more"
+    )
+    for length, told in ((40, "x" * 40), (41, "x" * 40 + "...")):
+        assert module._facts_text({"name": "x" * length}) == f"name={told}"
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "limit", "holding"),
+    [
+        ("rms_mm<2", "rms_mm", 2.0, [1]),
+        (" rms_mm <= 2 ", "rms_mm", 2.0, [1, 2]),
+        ("check.rms_mm > 2e0", "check.rms_mm", 2.0, [3]),
+        ("plane.a >= 2.", "plane.a", 2.0, [2, 3]),
+        ("seed = +2", "seed", 2.0, [2]),
+        ("seed != .2e1", "seed", 2.0, [1, 3]),
+        ("input scan = -2.5", "input scan", -2.5, []),
+    ],
+)
+def test_a_condition_is_a_name_a_sign_and_a_number(
+    text: str, name: str, limit: float, holding: list[int]
+) -> None:
+    condition = module._Condition.of(text)
+    assert (condition.name, condition.limit) == (name, limit)
+    for facts in (False, True):
+        runs = {
+            value: RunSummary(
+                folder=Path("a"),
+                state="ok",
+                metrics={} if facts else {name: value},
+                facts={name: value} if facts else {},
+            )
+            for value in (1, 2, 3)
+        }
+        assert [value for value, run in runs.items() if condition.is_met_by(run)] == holding
+
+
+@pytest.mark.parametrize("value", [True, "2", None, [2]])
+def test_what_is_no_number_meets_no_condition(value: object) -> None:
+    run = RunSummary(folder=Path("a"), state="ok", facts={"seed": value})  # type: ignore[dict-item]
+    assert not any(module._Condition.of(f"seed {sign} 2").is_met_by(run) for sign in module._SIGNS)
+    assert not module._Condition.of("other = 2").is_met_by(run)
+
+
+def test_long_names_and_reasons_are_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunSummary(
+        folder=Path("a"),
+        state="damaged",
+        workflow="w" * 61,
+        reason="r" * 1001,
+        started="2026-01-02T03:04:05Z",
+    )
+    fine = RunSummary(folder=Path("b"), state="ok", workflow="v" * 60, n_datasets=2)
+    one = RunSummary(folder=Path("c"), state="ok", n_datasets=1)
+    module.print_runs([run, fine, one], n_found=4)
+    said = capsys.readouterr().out
+    lines = said.splitlines()
+    assert lines[1].split() == ["a", "2026-01-02", "03:04", "w" * 60, "damaged"]
+    assert lines[2].split() == ["b", "v" * 60, "ok"]
+    assert said.count("r" * 1000) == 1
+    assert "r" * 1001 not in said
+    assert "b: medians of 2 datasets that have a value" in said
+    assert "c: medians" not in said
+    assert lines[-1] == "3 runs, 1 others left out"

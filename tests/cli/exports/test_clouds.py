@@ -16,7 +16,16 @@ from orthoflow.cli.exports import clouds as module
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.errors import ArgumentError
 from orthoflow.files.clouds.dressing import DressedCloud
-from orthoflow.products import Planes, PointCloud, PointLabels, Product
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Photo,
+    Photos,
+    Planes,
+    PointCloud,
+    PointLabels,
+    Product,
+)
 from tests import samples
 from tests.report_runs import cameras_product
 
@@ -272,3 +281,38 @@ def test_cells_that_give_cameras_are_known_by_what_they_give() -> None:
 
     cells = {"a": cell("cloud"), "b": cell("ties", "cameras"), "c": cell(), "d": cell("cameras")}
     assert list(module._makers_of_cameras(cells)) == ["b", "d"]
+
+
+def photographed(*names: str, takes: bool = True) -> Any:
+    """A run that oriented two photos, and could not orient a third; twice."""
+    one = cameras_product().cameras[0]
+    refused = Camera(photo="c.jpg", status="too few ties")
+    first = Cameras(cameras=(replace(one, photo="a.jpg"), refused))
+    last = Cameras(cameras=(replace(one, photo="b.jpg"), replace(one, photo="a.jpg"), refused))
+    taken = {"photos": "shots"} if takes else {}
+    return ToyRun(
+        {
+            "shots": ({}, {"photos": photos(*names)}),
+            "orient": (taken, {"cameras": first}),
+            "bundle": (taken, {"cameras": last}),
+        }
+    )
+
+
+def photos(*names: str) -> Photos:
+    return Photos(photos=tuple(Photo(name=name, encoded=b"", width=4, height=3) for name in names))
+
+
+def test_photos_are_those_that_the_last_cell_oriented(tmp_path: Path) -> None:
+    chosen = Choices(store=tmp_path)
+    run = photographed("a.jpg", "b.jpg", "c.jpg", "d.jpg")
+    found = module._oriented(run, run.cells, chosen)
+    assert [photo.name for photo, _ in found] == ["a.jpg", "b.jpg"]
+    np.testing.assert_allclose(
+        found[0][1].centre_world, cameras_product().cameras[0].viewing().centre_world
+    )
+    first = {name: cell for name, cell in run.cells.items() if name != "bundle"}
+    assert [photo.name for photo, _ in module._oriented(run, first, chosen)] == ["a.jpg"]
+    assert module._oriented(run, {"shots": run.cells["shots"]}, chosen) == ()
+    alone = photographed("a.jpg", takes=False)
+    assert module._oriented(alone, alone.cells, chosen) == ()

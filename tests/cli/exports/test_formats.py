@@ -1,0 +1,97 @@
+"""Formats of exports: which options belong to which, and what is said of those that do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from importlib import import_module
+from typing import Final
+
+import pytest
+
+from orthoflow.cli.exports.choices import Choices
+from orthoflow.cli.exports.formats import FLAGS, FORMATS, check_choices, listed
+from orthoflow.errors import ArgumentError
+
+# What somebody may give; 0 is the first wall, and a grid of none.
+GIVEN: Final[Mapping[str, object]] = {
+    "cell": "plane",
+    "license_text": "CC0-1.0",
+    "author": "A. Nobody",
+    "colour": "rgb",
+    "wall": 0,
+    "box": "0,0,0,1,1,1",
+    "clean": True,
+    "relief": True,
+    "scale": 50,
+    "paper": "A4",
+    "grid_m": 0.0,
+    "title_block": "block.yaml",
+    "beside": ("depth",),
+}
+
+
+def test_every_option_is_one_of_the_choices_and_has_a_flag() -> None:
+    assert FLAGS.keys() == GIVEN.keys()
+    assert FLAGS.keys() <= {field.name for field in fields(Choices)}
+    assert {name for entry in FORMATS.values() for name in entry.options} == FLAGS.keys()
+
+
+@pytest.mark.parametrize("target", FORMATS)
+def test_every_format_has_its_writer(target: str) -> None:
+    module, _, name = FORMATS[target].writer.partition(":")
+    assert callable(getattr(import_module(f"orthoflow.cli.exports.{module}"), name))
+
+
+def test_what_draws_or_shows_rasters_takes_those_beside_the_record() -> None:
+    taking = {target for target, entry in FORMATS.items() if entry.takes_rasters}
+    assert taking == {"dxf", "geojson", "gltf", "tiles", "stac", "sheet"}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_an_option_goes_with_the_formats_that_it_belongs_to(name: str) -> None:
+    chosen = Choices(**{name: GIVEN[name]})  # type: ignore[arg-type]
+    owners = [target for target, entry in FORMATS.items() if name in entry.options]
+    for target in FORMATS:
+        if target in owners:
+            check_choices(chosen, target)
+            continue
+        with pytest.raises(ArgumentError) as caught:
+            check_choices(chosen, target)
+        said = f"{FLAGS[name]} belongs to --to {listed(owners)}, not to --to {target}"
+        assert str(caught.value) == said
+
+
+def test_nothing_else_is_refused() -> None:
+    for target in FORMATS:
+        check_choices(Choices(), target)
+    check_choices(Choices(embed=True), None)
+    check_choices(Choices(embed=True), "ro-crate")
+    check_choices(Choices(embed=True, inputs=("scan=a.laz",)), None)
+    check_choices(Choices(split=True), None)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "target", "said"),
+    [
+        (Choices(), None, "say what to write: --to "),
+        (Choices(split=True), "csv", "so it does not go with --to csv: split first"),
+        (Choices(split=True, embed=True), None, "so it does not go with --embed: split first"),
+        (Choices(embed=True), "csv", "--to csv writes no record, so nothing can be embedded"),
+        (Choices(inputs=("a=b",)), "csv", "--input belongs to --embed, not to --to csv"),
+        (Choices(inputs=("a=b",), split=True), None, "--input belongs to --embed, not to --split"),
+        (Choices(wall=1, embed=True), None, ", not to --embed"),
+        (Choices(wall=1, split=True), None, ", not to --split"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(chosen: Choices, target: str | None, said: str) -> None:
+    with pytest.raises(ArgumentError) as caught:
+        check_choices(chosen, target)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"), [(["a"], "a"), (["a", "b"], "a or b"), (["a", "b", "c"], "a, b or c")]
+)
+def test_names_stand_as_in_a_sentence(names: list[str], said: str) -> None:
+    assert listed(names) == said

@@ -1,0 +1,78 @@
+"""What `plugins check` tells of the checks that it was given, and how it ends."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from orthoflow import testing
+from orthoflow.cli import plugins as module
+from orthoflow.cli.program import program
+
+
+def case(name: str, problem: str = "", *, is_quick: bool = True) -> Any:
+    check = SimpleNamespace(name=name, rule=f"The rule of {name}.", is_quick=is_quick)
+    return SimpleNamespace(check=check, problem=lambda: problem)
+
+
+CASES = [
+    case("fine"),
+    case("stopped", "the method raised"),
+    case("also-fine"),
+    case("as-well", "the method raised"),
+    case("other", "too far", is_quick=False),
+    case("slow", is_quick=False),
+]
+
+
+def checked(monkeypatch: pytest.MonkeyPatch, cases: list[Any], *options: str) -> Result:
+    monkeypatch.setattr(testing, "conformance_cases", lambda _id, **_known: cases)
+    monkeypatch.setattr(module, "_sharing_kernels", lambda _id: nullcontext())
+    return CliRunner().invoke(program, ["plugins", "check", "plane.toy", *options])
+
+
+def test_what_stops_every_run_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = checked(monkeypatch, CASES)
+    assert done.exit_code == 1
+    assert done.output.splitlines() == [
+        "kept    fine: The rule of fine.",
+        "broken  stopped: the method raised",
+        "kept    also-fine: The rule of also-fine.",
+        "skipped as-well: stopped by the same as stopped",
+        "broken  other: too far",
+        "kept    slow: The rule of slow.",
+        "",
+        "plane.toy keeps 3 rules, breaks 2, 1 skipped",
+    ]
+
+
+def test_a_quick_check_leaves_out_what_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = checked(monkeypatch, [CASES[0], *CASES[4:]], "--quick")
+    assert done.exit_code == 0
+    assert done.output.splitlines() == [
+        "kept     fine: The rule of fine.",
+        "left out other: The rule of other.",
+        "left out slow: The rule of slow.",
+        "",
+        "plane.toy keeps 1 rule, 2 left out (--quick)",
+    ]
+
+
+def test_json_has_the_state_and_problem_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = checked(monkeypatch, CASES, "--json")
+    assert done.exit_code == 1
+    told = json.loads(done.output)
+    assert told["method"] == "plane.toy"
+    assert [(one["check"], one["state"], one["problem"]) for one in told["checks"]] == [
+        ("fine", "kept", ""),
+        ("stopped", "broken", "the method raised"),
+        ("also-fine", "kept", ""),
+        ("as-well", "skipped", "the method raised"),
+        ("other", "broken", "too far"),
+        ("slow", "kept", ""),
+    ]
