@@ -7,8 +7,10 @@ together there, each for itself; where most fit one pose, the place is right.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
 from threading import Lock
 from typing import Final
 
@@ -19,6 +21,7 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
+from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Wall
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
@@ -27,6 +30,7 @@ from orthoflow_plugins.match.structures import (
     PHOTO_SIDE_PX,
     Place,
     WallStructure,
+    closer,
     likely_places,
     structure_of,
     wall_structure,
@@ -35,10 +39,17 @@ from orthoflow_plugins.match.tie_pieces import TiePiece
 from orthoflow_plugins.match.tracing import agrees_around, between, fitted_pose
 from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
 
-# So many places of a photo are looked at, over all walls.
-_PLACES: Final = 3
+# So many places of a photo are looked at patch by patch, over all walls: as cameras are held first,
+# then among all other turns. Wrong ones mostly end with their first patches.
+_PLACES: Final = (4, 12)
+# So many are taken from each wall in each turn, and of those that were found roughly so many seen
+# closer.
+_PLACES_EACH: Final = 4
+_CLOSER: Final = 24
 # Radius of search of each round, in coarse cells.
 _RADII: Final = (6, 4, 3, 3)
+# Longer side to which a photo is shrunk, once, for all its patches.
+_SIDE_PX: Final = 1200
 _HALF_PATCH: Final = 10
 _APART_CELLS: Final = 5
 _SCORE_LEAST: Final = 0.3
@@ -48,9 +59,11 @@ _FIT_LEAST: Final = 8
 # Ties of a place that photos beside it may confirm.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
-# At wrong places in simulated rooms at most 0.13 of all patches agreed, at a lead of 5.2 and less;
-# at right ones at least 0.08, mostly, and leads were 5 to 11.
-_LEAD_LEAST: Final = 5.5
+# At wrong places in simulated rooms leads were up to 6.1 where 0.15 of all patches agreed; at right
+# ones 6.2 and more, or 0.3 and more of all patches agreed at leads of 5.5 and more.
+_LEAD_LEAST: Final = 6.5
+_LEAD_LEAST_OF_MANY: Final = 5.5
+_MANY_SHARE: Final = 0.25
 _TIES_LEAST: Final = 40
 _SHARE_LEAST: Final = 0.08
 _OVER_NEXT: Final = 1.5
@@ -66,10 +79,10 @@ _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 # Turns of a photo of which nobody says how it was held, anticlockwise from upright in degrees: as
 # cameras are held first. Structure is found up to some 9 degrees off.
 _QUARTERS_DEG: Final = (0.0, 90.0, -90.0, 180.0)
-_TURNS_DEG: Final = tuple(
-    quarter + roll for roll in (0.0, 15.0, -15.0, 30.0, -30.0, 45.0) for quarter in _QUARTERS_DEG
+_OTHERS_DEG: Final = tuple(
+    quarter + roll for roll in (15.0, -15.0, 30.0, -30.0, 45.0) for quarter in _QUARTERS_DEG
 )
-# Two poses whose photo centres lie nearer on the wall are one place, as a share of the width.
+# Two poses that put the wall nearer than that are one place, as a share of the photo's longer side.
 _SAME_SHARE: Final = 0.1
 
 
@@ -116,39 +129,39 @@ class TurnedPhoto:
         return (shares - 0.5) * self.size_px @ self.axes.T + self.middle_px
 
 
-def turned(rgb: NDArray[np.uint8], degrees: float) -> TurnedPhoto:
+def turned(rgb: NDArray[np.uint8], degrees: float, scale: float = 1.0) -> TurnedPhoto:
     """Turn a photo (height, width, 3) anticlockwise; of other turns than quarters give the middle.
 
     What is cut has the shape that the whole would have when turned by the nearest quarters.
+
+    Args:
+        rgb: the photo, shrunk by a scale.
+        degrees: by so much.
+        scale: one pixel of the whole photo is so many of these.
     """
     import cv2
 
     quarters = round(degrees / 90.0)
     roll_deg = degrees - 90.0 * quarters
     whole = np.ascontiguousarray(np.rot90(rgb, quarters % 4))
-    height, width = whole.shape[:2]
     angle = np.radians(degrees)
     # Quarters are exact.
     cos, sin = np.round([np.cos(angle), np.sin(angle)], 15)
-    size_px = (float(width), float(height))
     if roll_deg:
+        height, width = whole.shape[:2]
         along, across = abs(np.cos(np.radians(roll_deg))), abs(np.sin(np.radians(roll_deg)))
         share = min(
             width / (width * along + height * across), height / (width * across + height * along)
         )
-        shrink = min(1.0, PHOTO_SIDE_PX / max(width, height))
-        small = cv2.resize(whole, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        rows, columns = small.shape[:2]
-        size = (max(1, int(share * columns)), max(1, int(share * rows)))
-        matrix = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), roll_deg, 1.0)
-        matrix[:, 2] += [0.5 * (size[0] - columns), 0.5 * (size[1] - rows)]
-        whole = np.asarray(cv2.warpAffine(small, matrix, size), dtype=np.uint8)
-        size_px = (size[0] * width / columns, size[1] * height / rows)
+        size = (max(1, int(share * width)), max(1, int(share * height)))
+        matrix = cv2.getRotationMatrix2D((0.5 * width - 0.5, 0.5 * height - 0.5), roll_deg, 1.0)
+        matrix[:, 2] += [0.5 * (size[0] - width), 0.5 * (size[1] - height)]
+        whole = np.asarray(cv2.warpAffine(whole, matrix, size), dtype=np.uint8)
     return TurnedPhoto(
         rgb=whole,
-        size_px=size_px,
+        size_px=(whole.shape[1] / scale, whole.shape[0] / scale),
         axes=np.array([[cos, -sin], [sin, cos]]),
-        middle_px=(0.5 * rgb.shape[1], 0.5 * rgb.shape[0]),
+        middle_px=(0.5 * rgb.shape[1] / scale, 0.5 * rgb.shape[0] / scale),
     )
 
 
@@ -168,81 +181,113 @@ class PlacedWalls:
             return self._ready
 
 
-def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
+def places_of(index: int, photo: Photo, walls: PlacedWalls, cores: int = 1) -> list[Placed]:
     """Give the places on the walls where a photo may be, the best first.
 
     Only the first may be clear. A photo of which no EXIF says how it was held is tried in all ways,
-    unless a clear place is found before.
+    unless a clear place is found as cameras are mostly held.
 
     Args:
         index: of the photo.
         photo: the photo.
         walls: the walls.
+        cores: ways are tried by so many threads.
     """
     rgb = photo_rgb(photo)
-    shot = (index, photo, shrunk(rgb, _shrinking(photo.width, photo.height)))
-    upright = _QUARTERS.get(photo.exif_orientation, 0)
-    best: list[Placed] = []
-    for turn_deg in _turns_deg(photo):
-        found = _places_turned(shot, walls, turned(rgb, 90.0 * upright + turn_deg))
-        if not best or (found and found[0].share > best[0].share):
-            best = found
-        if best and best[0].is_clear:
+    longer = max(photo.width, photo.height)
+    scale = min(1.0, _SIDE_PX / longer)
+    small = shrunk(rgb, scale)
+    shot = (index, photo, small)
+    coarse = min(1.0, PHOTO_SIDE_PX / longer)
+    tiny = shrunk(rgb, coarse)
+    upright_deg = 90.0 * _QUARTERS.get(photo.exif_orientation, 0)
+
+    def likely(turn_deg: float, *, roughly: bool) -> list[_Likely]:
+        upright = turned(tiny, upright_deg + turn_deg, coarse)
+        return [
+            _Likely(wall=at, place=place, upright=upright)
+            for at, structure in enumerate(walls.structures())
+            if structure is not None
+            for place in likely_places(upright.rgb, structure, n_most=_PLACES_EACH, roughly=roughly)
+        ]
+
+    def seen_closer(each: _Likely) -> _Likely:
+        structure = walls.structures()[each.wall]
+        assert structure is not None  # noqa: S101 - it has places
+        return replace(each, place=closer(each.upright.rgb, structure, each.place))
+
+    found: list[Placed] = []
+    for nth, turns_deg in enumerate(_turns_deg(photo)):
+        look = partial(likely, roughly=nth > 0)
+        some = _best(chain(*in_order(look, turns_deg, threads=cores)), _CLOSER)
+        if nth > 0:
+            some = list(in_order(seen_closer, some, threads=cores))
+        some = _best(some, _PLACES[nth])
+        looked = in_order(lambda each: _looked_at(shot, walls, each), some, threads=cores)
+        found = _judged([*found, *(each for each in looked if each is not None)])
+        if found and found[0].is_clear:
             break
-    return best
+    return found
 
 
-def _shrinking(width: int, height: int) -> float:
-    """By how much a photo is shrunk, once, for all that is done with it."""
-    return min(1.0, PHOTO_SIDE_PX / max(width, height))
+@dataclass(frozen=True, kw_only=True)
+class _Likely:
+    """A place that a photo may show when it is turned so."""
+
+    wall: int
+    place: Place
+    upright: TurnedPhoto
 
 
-def _turns_deg(photo: Photo) -> Sequence[float]:
-    """Turns from upright in which a photo is tried, in this order."""
+def _best(some: Iterable[_Likely], n_most: int) -> list[_Likely]:
+    return sorted(some, key=lambda each: -each.place.lead)[:n_most]
+
+
+def _turns_deg(photo: Photo) -> Sequence[Sequence[float]]:
+    """Turns from upright in which a photo is tried: first these, then those."""
     if photo.exif_orientation != 1 or photo.exif_focal_px is not None:
-        return (0.0,)
+        return ((0.0,),)
     # Faces of a panorama have no EXIF, and many show no wall: each turn costs as much as the first.
     is_face = photo.intrinsics is not None and photo.intrinsics.source == "given"
-    return _QUARTERS_DEG if is_face else _TURNS_DEG
+    return (_QUARTERS_DEG,) if is_face else (_QUARTERS_DEG, _OTHERS_DEG)
 
 
-def _places_turned(
-    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, upright: TurnedPhoto
-) -> list[Placed]:
-    """Places of a photo, shrunk, that stands upright when it is turned so."""
+def _looked_at(
+    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, likely: _Likely
+) -> Placed | None:
+    """Lay a photo, shrunk, on a wall and bring patches together there."""
     index, photo, small = shot
-    likely = [
-        (at, structure, place)
-        for at, structure in enumerate(walls.structures())
-        if structure is not None
-        for place in likely_places(upright.rgb, structure, n_most=_PLACES)
-    ]
-    found: list[Placed] = []
-    for at, structure, place in sorted(likely, key=lambda each: -each[2].lead)[:_PLACES]:
-        lens, freedom = _lens_before(photo)
-        camera = _camera_at(place, structure, lens, upright)
-        if camera is not None:
-            placed = _tied((index, at), small, (camera, freedom), structure)
-            if placed is not None:
-                found.append(replace(placed, lead=place.lead))
-    found.sort(key=lambda each: -each.share)
-    found = [
-        each
-        for nth, each in enumerate(found)
+    structure = walls.structures()[likely.wall]
+    assert structure is not None  # noqa: S101 - it has places
+    lens, freedom = _lens_before(photo)
+    camera = _camera_at(likely.place, structure, lens, likely.upright)
+    if camera is None:
+        return None
+    placed = _tied((index, likely.wall), small, (camera, freedom), structure)
+    return None if placed is None else replace(placed, lead=likely.place.lead)
+
+
+def _judged(found: Sequence[Placed]) -> list[Placed]:
+    """Places that differ and where enough agrees, the best first; it is clear or not."""
+    best_first = sorted(found, key=lambda each: -each.share)
+    kept = [
+        # What stood out in one of two turns next to each other stands out.
+        replace(each, lead=max(other.lead for other in best_first if _is_same(each, other)))
+        for nth, each in enumerate(best_first)
         if len(each.piece) >= _TIES_FEW
         and each.share >= _SHARE_FEW
-        and not any(_is_same(each.piece, other.piece) for other in found[:nth])
+        and not any(_is_same(each, other) for other in best_first[:nth])
     ]
-    if not found:
+    if not kept:
         return []
-    best = found[0]
+    best = kept[0]
     is_clear = (
-        all(best.share >= _OVER_NEXT * other.share for other in found[1:])
+        all(best.share >= _OVER_NEXT * other.share for other in kept[1:])
         and len(best.piece) >= _TIES_LEAST
         and best.share >= _SHARE_LEAST
-        and best.lead >= _LEAD_LEAST
+        and best.lead >= (_LEAD_LEAST_OF_MANY if best.share >= _MANY_SHARE else _LEAD_LEAST)
     )
-    return [replace(best, is_clear=is_clear), *found[1:]]
+    return [replace(best, is_clear=is_clear), *(replace(one, is_clear=False) for one in kept[1:])]
 
 
 def _lens_before(photo: Photo) -> tuple[ViewingCamera, LensFreedom]:
@@ -308,7 +353,7 @@ def _tied(
     wall, origin = structure.wall, structure.wall.frame.origin_world
     camera, freedom = start
     prior = camera
-    scale = _shrinking(camera.width, camera.height)
+    scale = min(1.0, _SIDE_PX / max(camera.width, camera.height))
     placed: Placed | None = None
     for radius in _RADII:
         projection = project_walls(camera, [wall])[0]
@@ -392,10 +437,10 @@ def _piece(
     return piece.take(points.known & np.isfinite(pixels).all(axis=1))
 
 
-def _is_same(first: TiePiece, second: TiePiece) -> bool:
-    """Whether two sets of ties put a photo at one place of the wall."""
-    if first.wall != second.wall:
+def _is_same(first: Placed, second: Placed) -> bool:
+    """Whether two poses put what a photo's ties show in one place of the photo."""
+    if first.piece.wall != second.piece.wall:
         return False
-    one, other = (np.median(piece.points_world, axis=0) for piece in (first, second))
-    width_m = float(np.ptp(first.points_world, axis=0).max())
-    return float(np.linalg.norm(one - other)) < _SAME_SHARE * width_m
+    camera, pixels = second.camera, first.piece.pixels_photo
+    off_px = np.linalg.norm(camera.project(first.piece.points_world)[:, :2] - pixels, axis=1)
+    return float(np.median(off_px)) < _SAME_SHARE * max(camera.width, camera.height)

@@ -60,7 +60,7 @@ class MatchSift(Method):
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 7
+    result_version: ClassVar[int] = 8
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -269,7 +269,7 @@ def _placed(
     places: dict[int, list[Placed]] = {}
 
     def look(index: int) -> list[Placed]:
-        return places_of(index, photos.photos[index], on_walls)
+        return places_of(index, photos.photos[index], on_walls, ctx.cores // len(unclear))
 
     for index, found in zip(unclear, one_by_one(look, unclear, ctx.cores), strict=True):
         ctx.progress(1.0 - 1.0 / (len(paired) + 1), f"{photos.photos[index].name}, by structure")

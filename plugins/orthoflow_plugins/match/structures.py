@@ -43,10 +43,17 @@ _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
 # Parts that lie mostly beside the wall must not win by what little they show.
 _ENERGY_LEAST: Final = 0.25
-# Longer side to which a photo is shrunk first: no size needs more.
-PHOTO_SIDE_PX: Final = 1200
 # Another place begins so far off, as a share of the photo's width, or at such another size (log).
 _ELSEWHERE: Final = (0.25, 0.25)
+# A photo's longer side has so many cells at most where it is compared, finely or roughly: larger
+# sizes on the wall are compared in cells that are twice as wide, or four times.
+_FINE_CELLS: Final = 250
+_ROUGH_CELLS: Final = 160
+# What is pooled so broadly is as well seen in every second cell.
+_SAMPLE_CELLS: Final = 2
+_LEVELS: Final = 3
+PHOTO_SIDE_PX: Final = 2 * _PART_MOST_CELLS
+"""Longer side to which a photo is shrunk first: no size needs more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,31 +63,39 @@ class WallStructure:
     Attributes:
         wall: in cells of this size.
         channels: its structure.
-        layers: (c, rows, cols) float32 of the channels.
-        energy: (rows, cols) float32 of their squares' sum.
+        fine: likewise in cells of this size, of twice that, and of four times, for photos of up to
+            `_FINE_CELLS`.
+        rough: likewise, of up to `_ROUGH_CELLS`.
         usual_spread_m: as `usual_spread_m` gives it.
     """
 
     wall: Wall
     channels: Channels
-    layers: NDArray[np.float32]
-    energy: NDArray[np.float32]
+    fine: Sequence[Spectra]
+    rough: Sequence[Spectra]
     usual_spread_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Spectra:
-    """A wall's structure as parts of a size are correlated with it.
+class Spectra:
+    """A wall's structure as parts of a photo are correlated with it.
 
     Attributes:
         layers: (c, ...) complex64 of the channels, conjugated.
         energy: likewise, of their squares' sum.
-        padded: rows and columns that they were computed with.
+        shape: rows and columns of samples.
+        padded: that they were computed with, so that parts lie beside the wall before they meet it
+            again.
+        sample_m: a sample is so wide.
+        photo_cells: the longer side of a photo has at most so many cells.
     """
 
     layers: NDArray[np.complex64]
     energy: NDArray[np.complex64]
+    shape: tuple[int, int]
     padded: tuple[int, int]
+    sample_m: float
+    photo_cells: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,17 +125,73 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     coarse = _coarser(wall, factor)
     if min(coarse.frame.shape) < 2 * _PART_LEAST_CELLS or coarse.intensity is None:
         return None
-    known = np.isfinite(coarse.depth_m) & np.isfinite(coarse.intensity)
-    relief = coarse.depth_m / np.float32(_STEP_M)
-    channels = structure_of(np.stack([coarse.intensity, relief], axis=-1), known)
-    layers = np.ascontiguousarray(np.moveaxis(channels.values, -1, 0))
+    channels = _wall_channels(coarse.intensity, coarse.depth_m)
+    levels = [(channels, coarse.frame.gsd_m)]
+    intensity, depth_m = coarse.intensity, coarse.depth_m
+    for _ in range(1, _LEVELS):
+        intensity, depth_m = _halved(intensity), _halved_depth(depth_m)
+        levels.append((_wall_channels(intensity, depth_m), 2.0 * levels[-1][1]))
     return WallStructure(
         wall=coarse,
         channels=channels,
-        layers=layers,
-        energy=np.einsum("cij,cij->ij", layers, layers),
+        fine=[_spectra(*level, _FINE_CELLS) for level in levels],
+        rough=[_spectra(*level, _ROUGH_CELLS) for level in levels],
         usual_spread_m=usual_spread_m(coarse),
     )
+
+
+def _wall_channels(intensity: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Channels:
+    relief = depth_m / np.float32(_STEP_M)
+    known = np.isfinite(depth_m) & np.isfinite(intensity)
+    return structure_of(np.stack([intensity, relief], axis=-1), known)
+
+
+def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Means of 2 x 2 values (rows, cols, ...); an odd last row or column is left out."""
+    import cv2
+
+    rows, columns = (length // 2 for length in values.shape[:2])
+    even = np.ascontiguousarray(values[: 2 * rows, : 2 * columns], dtype=np.float32)
+    return np.asarray(
+        cv2.resize(even, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32
+    )
+
+
+def _halved_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """One of each 2 x 2 depths, NaN where fewer than most of them are known."""
+    known = _halved(np.isfinite(depth_m)) >= _KNOWN_LEAST
+    rows, columns = known.shape
+    one = depth_m[: 2 * rows : 2, : 2 * columns : 2]
+    return np.where(known, one, np.float32(np.nan)).astype(np.float32)
+
+
+def _spectra(channels: Channels, cell_m: float, photo_cells: int) -> Spectra:
+    """Spectra for photos whose longer side has at most so many cells."""
+    from scipy import fft
+
+    layers = _samples(channels)
+    energy = np.einsum("cij,cij->ij", layers, layers)
+    photo = photo_cells // _SAMPLE_CELLS
+    most = photo // 2 + 2 * _slip(photo) + 1
+    rows, columns = (int(fft.next_fast_len(length + most, real=True)) for length in energy.shape)
+    spectra = _spectrum(layers, (rows, columns))
+    return Spectra(
+        layers=np.conj(spectra, out=spectra),
+        energy=_spectrum(energy[None], (rows, columns))[0],
+        shape=(energy.shape[0], energy.shape[1]),
+        padded=(rows, columns),
+        sample_m=_SAMPLE_CELLS * cell_m,
+        photo_cells=photo_cells,
+    )
+
+
+def _samples(channels: Channels) -> NDArray[np.float32]:
+    """Layers (c, rows, cols) of every second cell."""
+    return np.ascontiguousarray(np.moveaxis(_halved(channels.values), -1, 0))
+
+
+def _slip(width: int) -> int:
+    return max(1, int(_SLIP_SHARE * width))
 
 
 def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Channels:
@@ -174,28 +245,40 @@ def _coarser(wall: Wall, factor: int) -> Wall:
     )
 
 
-def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -> list[Place]:
+def likely_places(
+    rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int, roughly: bool = False
+) -> list[Place]:
     """Give the places of a wall that a photo may show, the likeliest first.
 
     Args:
         rgb: (height, width, 3) of the photo, taken roughly upright.
         wall: the wall.
         n_most: at most so many.
+        roughly: compare large photos in wider cells, in less than half of the time; `closer` then
+            tells more of each place.
     """
-    import cv2
-
-    shrink = min(1.0, PHOTO_SIDE_PX / max(rgb.shape[:2]))
-    small = cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    found = []
-    for width in _widths_cells(rgb.shape, wall.energy.shape):
-        height = round(width * rgb.shape[0] / rgb.shape[1])
-        picture = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
-        found.append(_best_at(picture.astype(np.float32) / np.float32(255.0), wall))
+    levels = wall.rough if roughly else wall.fine
+    found = [
+        _best_of_size(rgb, width, levels)
+        for width in _widths_cells(rgb.shape, wall.wall.frame.shape)
+    ]
     places: list[Place] = []
     for place in sorted(found, key=lambda each: -each.lead):
         if len(places) < n_most and all(_is_elsewhere(place, other) for other in places):
             places.append(place)
     return places
+
+
+def closer(rgb: NDArray[np.uint8], wall: WallStructure, place: Place) -> Place:
+    """Give the likeliest place of a photo at the size of one that was found roughly."""
+    return _best_of_size(rgb, place.width_m / wall.wall.frame.gsd_m, wall.fine)
+
+
+def _best_of_size(rgb: NDArray[np.uint8], width: float, levels: Sequence[Spectra]) -> Place:
+    """Best place of a photo whose width is so many cells of the first level."""
+    longer = width * max(1.0, rgb.shape[0] / rgb.shape[1])
+    nth = max(0, math.ceil(math.log2(longer / levels[0].photo_cells)))
+    return _best_at(rgb, width / 2**nth, levels[nth])
 
 
 def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
@@ -212,35 +295,40 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
     return [round(least * _STEP**nth) for nth in range(count)]
 
 
-def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
-    """Best place of a photo of a given size in cells."""
+def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place:
+    """Best place of a photo whose width is so many cells."""
     import cv2
 
-    height, width = picture.shape[:2]
-    structure = structure_of(picture, np.ones((height, width), dtype=np.bool_))
-    channels = np.ascontiguousarray(np.moveaxis(structure.values, -1, 0))
+    # Whole samples.
+    width, height = (
+        max(2, round(length / _SAMPLE_CELLS))
+        for length in (width_cells, width_cells * rgb.shape[0] / rgb.shape[1])
+    )
+    size = (_SAMPLE_CELLS * width, _SAMPLE_CELLS * height)
+    picture = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    known = np.ones(picture.shape[:2], dtype=np.bool_)
+    channels = _samples(structure_of(picture / np.float32(255.0), known))
     side = (height // 2, width // 2)
-    slip = max(1, int(_SLIP_SHARE * width))
+    slip = _slip(width)
     corners = [
         (top, left)
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    spectra = _padded(wall, (side[0] + 2 * slip, side[1] + 2 * slip))
     # Of all parts alike.
-    under = _energy_under(side, spectra)
+    under = _energy_under(side, wall)
     maps = [
-        _part_map(channels[:, top : top + side[0], left : left + side[1]], under, spectra)
+        _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
     ]
     # Where the photo's corner is when its centre is on the wall.
     rows, columns = (
-        np.arange(n) - m // 2 for n, m in zip(wall.wall.frame.shape, (height, width), strict=True)
+        np.arange(n) - m // 2 for n, m in zip(wall.shape, (height, width), strict=True)
     )
     kernel = np.ones((2 * slip + 1, 2 * slip + 1), dtype=np.uint8)
-    scores = np.zeros(wall.wall.frame.shape, dtype=np.float32)
+    scores = np.zeros(wall.shape, dtype=np.float32)
     for part, (top, left) in zip(maps, corners, strict=True):
-        at = np.ix_((rows + top) % spectra.padded[0], (columns + left) % spectra.padded[1])
+        at = np.ix_((rows + top) % wall.padded[0], (columns + left) % wall.padded[1])
         scores += cv2.dilate(part, kernel)[at]
     usual = float(np.median(scores))
     spread = NMAD_FACTOR * float(np.median(np.abs(scores - usual)))
@@ -255,32 +343,15 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
     )
     middles = np.array([[left, top] for top, left in corners]) + half
     return Place(
-        centre_m=wall.wall.frame.gsd_m
-        * (np.array([best[1], best[0]]) + 0.5 * np.array([width, height])),
-        width_m=wall.wall.frame.gsd_m * width,
+        centre_m=wall.sample_m * (np.array([best[1], best[0]]) + 0.5 * np.array([width, height])),
+        width_m=wall.sample_m * width,
         lead=(float(scores.max()) - usual) / max(spread, 1e-9),
         parts_photo=middles / [width, height],
-        parts_m=wall.wall.frame.gsd_m * found,
+        parts_m=wall.sample_m * found,
     )
 
 
-def _padded(wall: WallStructure, side: tuple[int, int]) -> _Spectra:
-    """Spectra of a wall, so wide that parts of a size lie beside it before they meet it again."""
-    from scipy import fft
-
-    rows, columns = (
-        int(fft.next_fast_len(length + more + 1, real=True))
-        for length, more in zip(wall.energy.shape, side, strict=True)
-    )
-    layers = _spectrum(wall.layers, (rows, columns))
-    return _Spectra(
-        layers=np.conj(layers, out=layers),
-        energy=_spectrum(wall.energy[None], (rows, columns))[0],
-        padded=(rows, columns),
-    )
-
-
-def _energy_under(side: tuple[int, int], wall: _Spectra) -> NDArray[np.float32]:
+def _energy_under(side: tuple[int, int], wall: Spectra) -> NDArray[np.float32]:
     """Energy of the wall under a part of a size, at every place of its corner (wrapped)."""
     from scipy import fft
 
@@ -289,7 +360,7 @@ def _energy_under(side: tuple[int, int], wall: _Spectra) -> NDArray[np.float32]:
 
 
 def _part_map(
-    part: NDArray[np.float32], under: NDArray[np.float32], wall: _Spectra
+    part: NDArray[np.float32], under: NDArray[np.float32], wall: Spectra
 ) -> NDArray[np.float32]:
     """Correlation of a part of a photo with the wall, at every place of its corner (wrapped)."""
     from scipy import fft

@@ -15,10 +15,11 @@ from orthoflow_plugins.match.structures import (
     _coarser,
     _energy_under,
     _is_elsewhere,
-    _padded,
     _part_map,
+    _samples,
     _slipped,
     _widths_cells,
+    closer,
     likely_places,
     structure_of,
     wall_structure,
@@ -116,27 +117,50 @@ def test_widths_go_from_a_fifth_of_the_wall_to_more_than_all_of_it(
     assert 1.1 * shorter[-1] > most_shorter - 2 or 1.1 * longer[-1] > most_longer - 2
 
 
-def test_a_part_is_compared_with_what_lies_under_it_everywhere(structure: WallStructure) -> None:
-    channels = np.moveaxis(structure.channels.values, -1, 0).astype(np.float64)
-    height, width = channels.shape[1:]
-    part = channels[:, 40:75, 60:110] + RNG.normal(0.0, 0.2, (5, 35, 50))
-    spectra = _padded(structure, (35, 50))
-    under_it = _energy_under((35, 50), spectra)
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_part_is_compared_with_what_lies_under_it_everywhere(
+    structure: WallStructure, level: int
+) -> None:
+    spectra = structure.fine[level]
+    channels = np.fft.irfft2(np.conj(spectra.layers), spectra.padded)
+    height, width = spectra.shape
+    # Beside the wall there is nothing.
+    assert np.abs(channels[:, height:]).max() < 1e-5
+    assert np.abs(channels[:, :, width:]).max() < 1e-5
+    channels = channels[:, :height, :width]
+    rows, columns = min(35, height // 3), min(40, width // 3)
+    inner = (slice(None), slice(9, 9 + rows), slice(15, 15 + columns))
+    part = channels[inner] + RNG.normal(0.0, 0.2, (5, rows, columns))
+    under_it = _energy_under((rows, columns), spectra)
     found = _part_map(part.astype(np.float32), under_it, spectra)
-    # Hardly larger than the wall and a part: each place once.
-    assert np.all(found.shape > np.array([height + 35, width + 50]))
-    assert found.size < 1.3 * (height + 35) * (width + 50)
+    # So large that the largest part meets the wall at no two places at once.
+    assert np.all(np.array(found.shape) > np.array([height, width]) + 40)
     own = float((part**2).sum())
-    places = [(40, 60), (0, 0), (11, 7), (height - 35, width - 50), (height - 9, 5)]
+    places = [(9, 15), (0, 0), (11, 7), (height - rows, width - columns), (height - 9, 5)]
     # Beside the wall, too.
-    around = np.pad(channels, ((0, 0), (35, 35), (50, 50)))
-    for row, column in [*places, (-20, 30), (-35, -50), (-7, width), (height, 12)]:
-        under = around[:, row + 35 : row + 70, column + 50 : column + 100]
+    around = np.pad(channels, ((0, 0), (rows, rows), (columns, columns)))
+    for row, column in [*places, (-8, 3), (-rows, -columns), (-7, width), (height, 12)]:
+        under = around[:, row + rows : row + 2 * rows, column + columns : column + 2 * columns]
         # What lies beside the wall counts as a quarter of the part itself, at least.
         energy = max(float((under**2).sum()), 0.25 * own)
         expected = float((part * under).sum()) / math.sqrt(own * energy)
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
-    assert np.unravel_index(found.argmax(), found.shape) == (40, 60)
+    assert np.unravel_index(found.argmax(), found.shape) == (9, 15)
+
+
+def test_larger_photos_are_compared_in_wider_cells(wall: Wall, structure: WallStructure) -> None:
+    cell_m, shape = structure.wall.frame.gsd_m, structure.wall.frame.shape
+    for levels in (structure.fine, structure.rough):
+        assert [level.sample_m / cell_m for level in levels] == [2.0, 4.0, 8.0]
+    for level in structure.fine:
+        assert level.shape == tuple(int(length * cell_m / level.sample_m) for length in shape)
+    # Halves of what the wall shows, in every second of those cells: means over four of them.
+    level = structure.fine[0]
+    mine = np.fft.irfft2(np.conj(level.layers), level.padded)[:, : level.shape[0], : level.shape[1]]
+    even = structure.channels.values[: 2 * level.shape[0], : 2 * level.shape[1]]
+    means = even.reshape(level.shape[0], 2, level.shape[1], 2, 5).mean(axis=(1, 3))
+    np.testing.assert_allclose(mine, np.moveaxis(means, 2, 0), atol=1e-5)
+    np.testing.assert_allclose(_samples(structure.channels), np.moveaxis(means, 2, 0), atol=1e-6)
 
 
 def test_a_part_slips_to_the_best_place_nearby_also_across_the_border() -> None:
@@ -188,7 +212,12 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
     np.testing.assert_allclose(np.ptp(best.parts_photo, axis=0), 0.5, atol=0.02)
     expected_m = fine_m * (np.array([left, top]) + best.parts_photo * [width, height])
     assert np.abs(best.parts_m - expected_m).max() < slip_m
-    assert len(likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=1)) == 1
+    rough = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=1, roughly=True)
+    assert len(rough) == 1
+    near = closer(np.repeat(cut[..., None], 3, axis=2), structure, rough[0])
+    # The rough look finds the place, a closer one says by how much it stands out.
+    assert np.abs(near.centre_m - truth_m).max() < slip_m
+    assert near.lead == pytest.approx(best.lead, rel=0.15)
 
 
 def test_a_wall_without_intensity_or_of_few_cells_has_no_structure(wall: Wall) -> None:
