@@ -97,6 +97,23 @@ def test_places_vote_for_the_planes_through_them(seed: int) -> None:
         np.testing.assert_array_equal(found, voted(upright, math.sin(phi), math.cos(phi), n_bins))
 
 
+@pytest.mark.parametrize("axis", [0, 2])
+def test_places_on_the_first_edge_of_the_image_count_and_those_on_the_last_do_not(
+    axis: int,
+) -> None:
+    # Four cells of 1 m about the middle; every second place lies on an edge of a cell.
+    along = np.arange(-2.5, 2.75, 0.25, dtype=np.float32)
+    places = np.full((3, len(along)), 0.5, dtype=np.float32)
+    places[axis] = along
+    weights = np.ones(len(along), dtype=np.int32)
+    angles = np.array([[0.0, 0.0 if axis == 0 else math.pi / 2]])
+    image, votes = np.zeros((4, 4), dtype=np.int32), np.zeros((1, 8), dtype=np.int32)
+    vote_planes(places, weights, angles, np.array([0, 1]), image, 1.0, votes)
+    expected = [0, 0, *[4 * VOTE_SHARES] * 4, 0, 0]
+    np.testing.assert_array_equal(votes[0], expected)
+    assert not image.any()
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_lines_and_points_vote_at_their_distance(seed: int) -> None:
     rng = np.random.default_rng(seed)
