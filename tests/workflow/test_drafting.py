@@ -92,7 +92,7 @@ def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: P
     text = Path("workflow.yaml").read_text()
     assert "room" not in text.partition("\nsteps:")[2]
     # No step waits for a simulated room, none is skipped.
-    assert said("check", "workflow.yaml") == "workflow is fine: 7 steps, 7 cells\n"
+    assert said("check", "workflow.yaml") == "workflow is fine: 7 steps\n"
 
 
 def test_a_plan_is_made_when_it_is_asked_for(data: Path) -> None:
