@@ -5,6 +5,7 @@ import datetime as dt
 import json
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from orthoflow_provenance.model import RunRecord
@@ -21,6 +22,8 @@ from prov.model import (
 
 from orthoflow.records.prov import prov_document
 from orthoflow.records.runs import open_run
+from tests.report_runs import cell as recorded_cell
+from tests.report_runs import record
 from tests.studios import Studio, open_finished_studio
 
 
@@ -113,3 +116,18 @@ def test_strange_names_stay_names(studio: Studio, strange: str) -> None:
     assert told["parameter:none"] == "null"
     assert math.isnan(told["parameter:nan"])
     assert told["parameter:large"] == 10**30
+
+
+def test_software_is_named_with_its_version_and_what_is_not_known_is_unknown() -> None:
+    made = record(
+        [
+            recorded_cell("a", distribution="some-methods", distribution_version="1.2"),
+            recorded_cell("b", distribution="bare"),
+            recorded_cell("c"),
+        ]
+    )
+    document = prov_document(made)
+    relations: Any = document["wasAssociatedWith"]
+    agents = {entry["prov:activity"]: entry["prov:agent"] for entry in relations.values()}
+    names = {activity[-1]: agent.partition(":")[2] for activity, agent in agents.items()}
+    assert names == {"a": "some-methods%201.2", "b": "bare", "c": "unknown"}

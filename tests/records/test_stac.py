@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import pystac
@@ -13,8 +14,10 @@ from pystac.validation import RegisteredValidator
 
 from orthoflow.errors import ArgumentError
 from orthoflow.files.publishing import publish_orthoimages
+from orthoflow.files.raster_places import RasterPlace
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages
+from orthoflow.records import stac
 from orthoflow.records.runs import Run
 from orthoflow.records.stac import write_stac
 from tests import samples
@@ -126,3 +129,58 @@ def test_a_run_without_orthoimages_says_so(finished: Run, tmp_path: Path) -> Non
         path.unlink()
     with pytest.raises(ArgumentError, match="has no orthoimages among its published files"):
         write_stac(finished, tmp_path)
+
+
+# --- the documents by themselves ---
+
+SQUARE = ((10.0, 50.0), (11.0, 50.0), (11.0, 51.0), (10.0, 51.0), (10.0, 50.0))
+
+
+def placed(*, wkt2: str = "", outline: tuple[tuple[float, float], ...] = ()) -> stac._Ortho:
+    place = RasterPlace(
+        shape=(2, 3), transform=(0.5, 0.0, 7.0, 0.0, -0.5, 9.0), epsg=25832 if outline else None,
+        wkt2=wkt2, bounds=(7.0, 8.0, 8.5, 9.0), outline_lonlat=outline, bands=("uint8",),
+    )  # fmt: skip
+    path = PurePosixPath("products/mosaic/wall_0_ortho.tif")
+    return stac._Ortho(path=path, address="mosaic", place=place)
+
+
+def described(folder: Path, ortho: stac._Ortho) -> Any:
+    sidecar = folder / ortho.path.with_suffix(".json")
+    sidecar.parent.mkdir(parents=True, exist_ok=True)
+    sidecar.write_text('{"name": "wall 0", "product_digest": "sha256:12"}')
+    run = Run(path=folder / "run.h5", record=record([cell("mosaic")]))
+    return stac._item(run, folder, ortho, [])
+
+
+def test_an_item_names_the_coordinate_system_where_there_is_one(tmp_path: Path) -> None:
+    on_earth = described(tmp_path, placed(wkt2="PROJCRS[...]", outline=SQUARE))
+    assert on_earth["properties"]["proj:wkt2"] == "PROJCRS[...]"
+    assert on_earth["properties"]["proj:code"] == "EPSG:25832"
+    assert on_earth["geometry"]["coordinates"] == [[list(corner) for corner in SQUARE]]
+    assert on_earth["bbox"] == [10.0, 50.0, 11.0, 51.0]
+    nowhere = described(tmp_path, placed())
+    assert nowhere["properties"]["proj:wkt2"] is None
+    assert nowhere["properties"]["proj:code"] is None
+    assert nowhere["geometry"] is None
+    assert "bbox" not in nowhere
+    for item in (on_earth, nowhere):
+        assert item["properties"]["gsd"] == 0.5
+        assert item["properties"]["processing_digest"] == "sha256:12"
+        assert [link["href"] for link in item["links"]] == ["../../collection.json"] * 3
+
+
+def test_a_collection_reaches_as_far_as_what_lies_on_earth() -> None:
+    run = Run(path=Path("run.h5"), record=record([cell("mosaic")]))
+    moved = tuple((lon + 5.0, lat - 7.0) for lon, lat in SQUARE)
+    here, there, nowhere = placed(outline=SQUARE), placed(outline=moved), placed()
+    for orthos, bbox, is_told in (
+        ([here], [10.0, 50.0, 11.0, 51.0], False),
+        ([here, there], [10.0, 43.0, 16.0, 51.0], False),
+        ([nowhere, here], [10.0, 50.0, 11.0, 51.0], True),
+        ([nowhere], [-180.0, -90.0, 180.0, 90.0], True),
+    ):
+        told: Any = stac._collection(run, orthos)
+        assert told["extent"]["spatial"]["bbox"] == [bbox]
+        assert ("lie in the plane of their wall" in told["description"]) is is_told
+        assert len(told["links"]) == 1 + len(orthos)
