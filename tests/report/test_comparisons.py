@@ -1,0 +1,55 @@
+"""What a table of combinations says of itself: its baseline, what is whole, what is judged."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from orthoflow.report.comparisons import ComparisonTable, Row
+from orthoflow.report.rankings import Sense
+
+
+def row(*variants: str, **more: Any) -> Row:
+    plain: dict[str, Any] = {
+        "run": "hall 1", "variants": variants, "is_baseline": False, "failure": "", "missing": (),
+        "values": (), "time": None, "memory": None, "is_busy": False, "remark": "",
+    }  # fmt: skip
+    return Row(**(plain | more))
+
+
+def table(*rows: Row, senses: tuple[Sense, ...] = (), shows_runs: bool = False) -> ComparisonTable:
+    columns: Any = tuple(SimpleNamespace(sense=sense) for sense in senses)
+    return ComparisonTable(
+        steps=("plane", "wall"), columns=columns, rows=rows, shows_runs=shows_runs, groups={}
+    )
+
+
+def test_the_baseline_is_named_where_there_is_just_one() -> None:
+    plain, first = row("a", "x"), row("b", "x", is_baseline=True)
+    assert table(plain, first).baseline == "plane=b, wall=x"
+    assert table(plain, first, shows_runs=True).baseline == "hall 1: plane=b, wall=x"
+    assert table(plain).baseline == ""
+    assert table(first, plain, row("a", "y", is_baseline=True)).baseline == ""
+
+
+@pytest.mark.parametrize(
+    ("more", "shortfall"),
+    [
+        ({}, ""),
+        ({"failure": "plane: no points"}, "failed"),
+        ({"missing": ("wall",)}, "not computed"),
+        ({"failure": "plane: no points", "missing": ("wall",)}, "failed"),
+    ],
+)
+def test_what_did_not_come_to_its_end_is_counted(more: dict[str, Any], shortfall: str) -> None:
+    short = row("a", "x", **more)
+    assert short.shortfall == shortfall
+    assert table(short, row("b", "x"), row("c", "x")).n_whole == (2 if shortfall else 3)
+
+
+def test_time_and_memory_are_judged_besides_what_has_a_good_side() -> None:
+    assert table().n_judged == 2
+    senses = (Sense.LESS, Sense.NEITHER, Sense.MORE, Sense.NEITHER, Sense.ONE)
+    assert table(senses=senses).n_judged == 5
