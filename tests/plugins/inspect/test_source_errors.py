@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect import source_errors as module
 from orthoflow_plugins.inspect.source_errors import SourceErrors, counted_once, source_findings
 
+from orthoflow.geometry.scenes import SurfaceRole
+from tests import samples
 from tests.inspect_scenes import frame
 
 
@@ -105,3 +110,47 @@ def test_what_is_not_known_is_left_out() -> None:
     }  # fmt: skip
     no_steps = replace(errors, steps=np.zeros((1, 10), dtype=np.bool_))
     assert "step_rmse_u_mm" not in {item.name for item in source_findings([no_steps], 0)}
+
+
+@pytest.mark.parametrize("rectangle", [-1, 0, 1])
+def test_what_shows_an_object_is_a_ghost_whichever_of_the_scenes_surfaces_it_is(
+    monkeypatch: pytest.MonkeyPatch, rectangle: int
+) -> None:
+    where = frame(shape=(1, 2))
+    monkeypatch.setattr(module, "true_camera", lambda *_args: None)
+    monkeypatch.setattr(module, "_near_frame", lambda own, _truth: own)
+    monkeypatch.setattr(module, "depth_step_band", lambda depth_m: np.zeros(depth_m.shape, bool))
+    monkeypatch.setattr(
+        module, "_seen_by_photos", lambda true, asked, *_args: np.array([[True, False]]) & asked
+    )
+
+    def trace(_camera: object, pixels: np.ndarray) -> Any:
+        points = where.world_from_wall(np.tile([0.75, 0.5], (len(pixels), 1)), 0.0)
+        return SimpleNamespace(points=points, rectangle=np.full(len(pixels), rectangle))
+
+    camera = SimpleNamespace(
+        project=lambda points: np.zeros((len(points), 3)), shifted=lambda _origin: camera
+    )
+    cameras: Any = SimpleNamespace(
+        cameras=[SimpleNamespace(photo="a.jpg", status="ok", viewing=lambda: camera)]
+    )
+    role = np.array([SurfaceRole.OBJECT, SurfaceRole.OBJECT])
+    truth: Any = SimpleNamespace(scene=SimpleNamespace(role=role, origin=np.zeros(3)))
+    image = samples.orthoimage(
+        where, rgb=np.zeros((1, 2, 3), np.uint8), sources=("a.jpg", "unknown.jpg")
+    )
+    found = module.trace_sources(
+        image,
+        samples.wall(where),
+        SimpleNamespace(seen=np.ones((1, 2), bool), depth_m=np.zeros((1, 2))),  # type: ignore[arg-type]
+        np.ones((1, 2), dtype=np.bool_),
+        cameras,
+        truth,
+        SimpleNamespace(trace=trace),  # type: ignore[arg-type]
+    )
+    assert found.traced.all()
+    assert found.ghosts.all() == found.ghosts.any() == (rectangle >= 0)
+    # Cells less the place that is shown there.
+    expected = where.gsd_m * np.array([[[0.5 - 0.75, 0.0], [1.5 - 0.75, 0.0]]])
+    np.testing.assert_allclose(found.displacement_m, expected, atol=1e-9)
+    assert (found.n_seen_by_both, found.n_seen_painted) == (1, 1)

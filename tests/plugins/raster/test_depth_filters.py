@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -168,3 +170,49 @@ def test_noise_of_less_than_a_fiftieth_of_a_millimetre_is_left() -> None:
     quiet, noisy = flat(noise_m=1.6e-5), flat(noise_m=2.6e-5)
     assert denoised(quiet, 3) is quiet
     assert denoised(noisy, 3) is not noisy
+
+
+def test_cells_are_sparse_that_have_a_third_of_the_known_ones_that_others_around_have() -> None:
+    rng = np.random.default_rng(5)
+    # The denser the further to the right, and all of it known at one place.
+    is_known = rng.random((40, 60)) < np.linspace(0.05, 0.6, 60)
+    is_known[18:23, 28:33] = True
+    rows, columns = is_known.shape
+
+    def around(values: NDArray[np.generic], row: int, column: int, reach: int) -> Any:
+        part = values[max(0, row - reach) : row + reach + 1]
+        return part[:, max(0, column - reach) : column + reach + 1]
+
+    places = [(row, column) for row in range(rows) for column in range(columns)]
+    near = np.array([around(is_known, *place, 2).sum() for place in places])
+    counts = near.reshape(is_known.shape)
+    most = np.array([around(counts, *place, 16).max() for place in places])
+    expected = is_known & (counts < 0.35 * most.reshape(is_known.shape))
+    np.testing.assert_array_equal(depth_filters._sparse(is_known), expected)
+    assert 0 < np.count_nonzero(expected) < np.count_nonzero(is_known)
+
+
+def weighed(depth_m: NDArray[np.float64], radius: int, reach_m: float) -> NDArray[np.float64]:
+    """A bilateral filter, cell by cell: neighbours in a disc, both weights those of a Gauss."""
+    sigma = 0.5 * max(1.0, float(radius))
+    high = np.pad(depth_m, radius, mode="edge")
+    total, weights = np.zeros_like(depth_m), np.zeros_like(depth_m)
+    rows, columns = depth_m.shape
+    steps = range(-radius, radius + 1)
+    for down, right in [(a, b) for a in steps for b in steps if a * a + b * b <= radius**2]:
+        other = high[radius + down :, radius + right :][:rows, :columns]
+        weight = np.exp(-0.5 * ((other - depth_m) / reach_m) ** 2)
+        weight *= np.exp(-0.5 * (down**2 + right**2) / sigma**2)
+        total, weights = total + weight * other, weights + weight
+    return total / weights
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+def test_noise_is_taken_out_within_three_sigmas_and_then_half_of_that(
+    monkeypatch: pytest.MonkeyPatch, radius: int
+) -> None:
+    monkeypatch.setattr(depth_filters, "depth_noise_m", lambda _depth_m: 0.01)
+    depth_m = flat(30, 30, noise_m=0.012)
+    depth_m[:, 15:] += 0.05
+    expected = weighed(weighed(depth_m.astype(np.float64), radius, 0.03), radius, 0.015)
+    np.testing.assert_allclose(denoised(depth_m, radius), expected, atol=2e-5)
