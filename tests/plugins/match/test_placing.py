@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -147,41 +148,53 @@ def test_a_wall_that_shows_nothing_places_no_photo() -> None:
 # --- how places are judged ---
 
 
-def ties_at(
-    n: int, right_m: float = 0.0, *, wall: int = 0, width_m: float = 2.0, depth_m: float = 0.0
-) -> TiePiece:
-    """Ties along a line of this width that begins so far to the right."""
-    points = np.zeros((n, 3))
-    points[:, 0] = right_m + np.linspace(0.0, width_m, n)
-    points[:, 2] = depth_m
-    return TiePiece(
+BARE = replace(PHOTO, intrinsics=None)
+
+
+def placed_at(
+    off_px: float = 0.0, *, n: int = 90, share: float = 0.3, lead: float = 9.0, wall: int = 0
+) -> Placed:
+    """A place by ties of the whole photo whose camera shows all so much further right."""
+    camera = replace(CAMERA, cx=CAMERA.cx + off_px)
+    along = np.linspace(0.1, 0.9, n)
+    seen = np.column_stack(
+        [along * CAMERA.width, 0.5 * CAMERA.height + 200.0 * np.sin(9.0 * along)]
+    )
+    points = CAMERA.centre_world + 3.0 * CAMERA.rays_world(seen)
+    piece = TiePiece(
         photo=0,
         wall=wall,
-        pixels_photo=np.zeros((n, 2)),
+        pixels_photo=camera.project(points)[:, :2],
         points_world=points,
         sigma_px=np.ones(n),
         sigma_m=np.ones(n),
     )
+    return Placed(piece=piece, camera=camera, lead=lead, share=share, radius_px=1.0)
 
 
 @pytest.mark.parametrize(
     ("other", "is_same"),
     [
-        (ties_at(31, 0.19), True),
-        (ties_at(31, 0.21), False),
-        (ties_at(31, -0.21), False),
-        (ties_at(31, 0.15, depth_m=0.15), False),
-        (ties_at(31, 0.0, width_m=0.3), False),
-        (ties_at(31, wall=1), False),
+        (placed_at(89.0, n=31), True),
+        (placed_at(-89.0, n=31), True),
+        (placed_at(91.0, n=31), False),
+        (placed_at(-91.0, n=31), False),
+        (placed_at(n=31, wall=1), False),
     ],
 )
-def test_places_a_tenth_of_the_width_apart_are_two(other: TiePiece, is_same: bool) -> None:
-    assert placing._is_same(ties_at(21), other) == is_same
+def test_places_a_tenth_of_the_photo_apart_are_two(other: Placed, is_same: bool) -> None:
+    assert CAMERA.width == 900
+    assert placing._is_same(placed_at(n=21), other) == is_same
+    assert placing._is_same(other, placed_at(n=21)) == is_same
 
 
-def test_a_photo_is_shrunk_to_twelve_hundred_pixels_and_never_enlarged() -> None:
-    assert placing._shrinking(2400, 1200) == placing._shrinking(1200, 2400) == 0.5
-    assert placing._shrinking(1200, 900) == placing._shrinking(300, 400) == 1.0
+def test_poses_are_one_place_where_most_of_a_photo_lies_in_one() -> None:
+    first = placed_at(n=21)
+    for n_off, is_same in ((10, True), (11, False)):
+        pixels = first.piece.pixels_photo.copy()
+        pixels[:n_off] += 500.0
+        strays = replace(first, piece=replace(first.piece, pixels_photo=pixels))
+        assert placing._is_same(strays, first) == is_same
 
 
 def test_a_lens_is_what_is_known_of_it_beforehand() -> None:
@@ -206,61 +219,64 @@ def likely(*leads: float) -> list[Place]:
     ]
 
 
-def judged(
+def walls_seen(
     monkeypatch: pytest.MonkeyPatch,
-    leads: tuple[tuple[float, ...], ...],
-    found: dict[float, tuple[int, float, float] | None],
-) -> list[Placed]:
-    """Places of a photo on some walls: by its lead the ties, the share and the way right of each.
+    leads: Sequence[Sequence[float] | None],
+    found: Mapping[float, Placed | None],
+) -> Any:
+    """Walls, each with the leads of a photo's places there; at each lead that is found."""
+    structures = [None if each is None else SimpleNamespace(leads=each) for each in leads]
 
-    Without any, no pose or too few ties are found there.
-    """
-    structures = [SimpleNamespace(leads=each) if each else None for each in leads]
-    monkeypatch.setattr(placing, "likely_places", lambda _, wall, n_most: likely(*wall.leads))
-    monkeypatch.setattr(placing, "_lens_before", lambda _: (None, None))
+    def likely_places(_: Any, wall: Any, *, n_most: int, roughly: bool) -> list[Place]:
+        assert not roughly
+        return likely(*wall.leads)[:n_most]
+
+    monkeypatch.setattr(placing, "likely_places", likely_places)
     monkeypatch.setattr(placing, "_camera_at", lambda place, *_: place if place.lead else None)
 
     def tied(at: tuple[int, int], small: Any, start: Any, structure: Any) -> Placed | None:
-        place: Any = start[0]
         assert structures[at[1]] is structure
-        entry = found[place.lead]
-        if entry is None:
-            return None
-        piece = ties_at(entry[0], entry[2], wall=at[1])
-        return Placed(piece=piece, camera=place, lead=0.0, share=entry[1], radius_px=1.0)
+        some = found[start[0].lead]
+        return None if some is None else replace(some, piece=replace(some.piece, wall=at[1]))
 
     monkeypatch.setattr(placing, "_tied", tied)
-    walls: Any = SimpleNamespace(structures=lambda: structures)
-    upright: Any = SimpleNamespace(rgb=None)
-    return placing._places_turned((0, PHOTO, np.zeros((1, 1, 3), np.uint8)), walls, upright)
+    return SimpleNamespace(structures=lambda: structures)
 
 
-def test_the_three_places_that_stand_out_most_are_tried_and_sorted_by_what_agrees(
+def test_the_four_places_that_stand_out_most_are_tried_and_sorted_by_what_agrees(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found: dict[float, tuple[int, float, float] | None] = {
-        7.0: (50, 0.2, 0.0),
-        6.0: (50, 0.3, 1.0),
-        5.0: (50, 0.4, 0.0),
+    upright = replace(PHOTO, exif_focal_px=840.0)
+    found = {
+        7.0: placed_at(n=50, share=0.2),
+        6.0: placed_at(200.0, n=50, share=0.3),
+        5.5: None,
+        5.0: placed_at(20.0, n=50, share=0.4),
     }
-    places = judged(monkeypatch, ((6.0, 4.0), (), (5.0, 7.0, 3.0)), found)
+    walls = walls_seen(monkeypatch, ((6.0, 4.0), None, (5.0, 5.5, 7.0, 3.0)), found)
+    places = places_of(0, upright, walls)
+    # That of 0.2 lies where that of 0.4 does, on the same wall, and stood out more.
     assert [(place.share, place.lead, place.piece.wall) for place in places] == [
-        (0.4, 5.0, 2),
+        (0.4, 7.0, 2),
         (0.3, 6.0, 0),
     ]
-    # That of 0.2 lies where that of 0.4 does, on the same wall.
     assert not any(place.is_clear for place in places)
-    assert judged(monkeypatch, ((), ()), {}) == []
-    assert judged(monkeypatch, ((0.0, 6.0),), {6.0: None}) == []
+    # Of a fifth place on one wall nobody asks.
+    found[1.0] = None
+    walls = walls_seen(monkeypatch, ((1.0, 1.0, 1.0, 1.0, 7.0),), found)
+    assert places_of(0, upright, walls) == []
+    assert places_of(0, upright, walls_seen(monkeypatch, (None, None), {})) == []
+    walls = walls_seen(monkeypatch, ((0.0, 6.0),), {6.0: None})
+    assert places_of(0, upright, walls) == []
 
 
 @pytest.mark.parametrize(
     ("n_ties", "share", "n_places"), [(20, 0.05, 1), (19, 0.05, 0), (20, 0.049, 0)]
 )
 def test_a_place_has_twenty_ties_and_a_twentieth_of_its_patches(
-    monkeypatch: pytest.MonkeyPatch, n_ties: int, share: float, n_places: int
+    n_ties: int, share: float, n_places: int
 ) -> None:
-    places = judged(monkeypatch, ((9.0,),), {9.0: (n_ties, share, 0.0)})
+    places = placing._judged([placed_at(n=n_ties, share=share)])
     assert len(places) == n_places
     assert not any(place.is_clear for place in places)
 
@@ -268,63 +284,145 @@ def test_a_place_has_twenty_ties_and_a_twentieth_of_its_patches(
 @pytest.mark.parametrize(
     ("lead", "n_ties", "share", "other", "is_clear"),
     [
-        (5.5, 40, 0.08, None, True),
-        (5.4, 40, 0.08, None, False),
-        (5.5, 39, 0.08, None, False),
-        (5.5, 40, 0.079, None, False),
+        (6.5, 40, 0.08, None, True),
+        (6.4, 40, 0.08, None, False),
+        (6.5, 39, 0.08, None, False),
+        (6.5, 40, 0.079, None, False),
+        # It need not stand out so much where a quarter of all patches agrees.
+        (5.5, 40, 0.25, None, True),
+        (5.4, 40, 0.25, None, False),
+        (6.4, 40, 0.249, None, False),
         # Half as much again as the next one.
         (9.0, 90, 0.3, 0.199, True),
         (9.0, 90, 0.3, 0.201, False),
     ],
 )
 def test_a_clear_place_stands_out_by_itself_and_from_the_next(
-    monkeypatch: pytest.MonkeyPatch,
-    lead: float,
-    n_ties: int,
-    share: float,
-    other: float | None,
-    is_clear: bool,
+    lead: float, n_ties: int, share: float, other: float | None, is_clear: bool
 ) -> None:
-    found: dict[float, tuple[int, float, float] | None] = {lead: (n_ties, share, 0.0)}
+    found = [placed_at(n=n_ties, share=share, lead=lead)]
     if other is not None:
-        found[1.0] = (90, other, 5.0)
-    places = judged(monkeypatch, (tuple(found),), found)
+        found.insert(0, placed_at(300.0, share=other))
+    places = placing._judged(found)
     assert [place.is_clear for place in places] == [is_clear, False][: len(found)]
 
 
-def test_turns_are_tried_until_a_place_is_clear_and_the_best_of_all_counts(
+def test_what_was_clear_among_some_turns_is_not_beside_as_good_a_place() -> None:
+    once = placing._judged([placed_at()])
+    assert once[0].is_clear
+    both = placing._judged([*once, placed_at(300.0, share=0.4)])
+    assert [(place.share, place.is_clear) for place in both] == [(0.4, False), (0.3, False)]
+
+
+@dataclass(kw_only=True)
+class Looks:
+    """What is asked of turns of a photo.
+
+    Attributes:
+        leads: of the places in each turn (degrees).
+        found: what is found at places of such leads.
+        turns: in which the photo was laid on the wall, and whether roughly.
+        closer: leads of the places that were then seen closer.
+        patches: leads of the places that were looked at patch by patch.
+        shapes: of the photo as it was laid on the wall, and as its patches were brought together.
+    """
+
+    leads: dict[float, tuple[float, ...]]
+    found: dict[float, Placed]
+    turns: list[tuple[float, bool]] = field(default_factory=list)
+    closer: list[float] = field(default_factory=list)
+    patches: list[float] = field(default_factory=list)
+    shapes: list[tuple[int, ...]] = field(default_factory=list)
+
+    def of(self, photo: Photo, monkeypatch: pytest.MonkeyPatch) -> list[Placed]:
+        """Places of a photo on one wall."""
+
+        def turned(rgb: NDArray[np.uint8], degrees: float, scale: float) -> Any:
+            self.shapes.append(rgb.shape)
+            assert scale == pytest.approx(max(rgb.shape) / max(photo.width, photo.height))
+            return SimpleNamespace(rgb=degrees)
+
+        def likely_places(degrees: Any, _: Any, *, n_most: int, roughly: bool) -> list[Place]:
+            self.turns.append((degrees, roughly))
+            return likely(*self.leads.get(degrees, ()))[:n_most]
+
+        def seen_closer(_: Any, __: Any, place: Place) -> Place:
+            self.closer.append(place.lead)
+            return replace(place, lead=place.lead + 100.0)
+
+        def looked_at(shot: Any, _: Any, each: Any) -> Placed | None:
+            self.shapes.append(shot[2].shape)
+            self.patches.append(each.place.lead)
+            some = self.found.get(each.place.lead)
+            return None if some is None else replace(some, lead=each.place.lead)
+
+        monkeypatch.setattr(placing, "turned", turned)
+        monkeypatch.setattr(placing, "likely_places", likely_places)
+        monkeypatch.setattr(placing, "closer", seen_closer)
+        monkeypatch.setattr(placing, "_looked_at", looked_at)
+        walls: Any = SimpleNamespace(structures=lambda: [SimpleNamespace()])
+        return places_of(0, photo, walls)
+
+
+def test_turns_are_tried_until_a_place_is_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = Looks(leads={-90.0: (7.0,), 15.0: (9.0,)}, found={7.0: placed_at()})
+    places = looks.of(BARE, monkeypatch)
+    assert [(place.lead, place.is_clear) for place in places] == [(7.0, True)]
+    assert looks.turns == [(degrees, False) for degrees in placing._QUARTERS_DEG]
+    assert (looks.closer, looks.patches) == ([], [7.0])
+
+
+def test_of_places_in_all_other_turns_the_best_are_seen_closer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def place(share: float, is_clear: bool = False) -> Placed:
-        none: Any = None
-        return Placed(
-            piece=ties_at(3), camera=none, lead=1.0, share=share, radius_px=1.0, is_clear=is_clear
-        )
+    turns = placing._OTHERS_DEG
+    # Four in each of eight turns; unclear is what a quarter turn gives.
+    leads = {turns[n]: tuple(5.0 + 0.01 * (4 * n + k) for k in range(4)) for n in range(8)}
+    rough = sorted((lead for each in leads.values() for lead in each), reverse=True)
+    looks = Looks(
+        leads={0.0: (4.0,), **leads},
+        found={4.0: placed_at(300.0, share=0.1), rough[11] + 100.0: placed_at()},
+    )
+    places = looks.of(BARE, monkeypatch)
+    assert looks.turns == [
+        *((degrees, False) for degrees in placing._QUARTERS_DEG),
+        *((degrees, True) for degrees in turns),
+    ]
+    assert looks.closer == rough[:24]
+    assert looks.patches == [4.0, *(lead + 100.0 for lead in rough[:12])]
+    # Those of before count, too.
+    assert [(place.share, place.is_clear) for place in places] == [(0.3, True), (0.1, False)]
 
-    asked: list[float] = []
-    turns: list[list[Placed]] = []
-    monkeypatch.setattr(placing, "turned", lambda _, degrees: degrees)
 
-    def places_turned(shot: Any, walls: Any, degrees: float) -> list[Placed]:
-        asked.append(degrees)
-        return turns[len(asked) - 1]
-
-    monkeypatch.setattr(placing, "_places_turned", places_turned)
-    walls = PlacedWalls(walls=[])
-    bare = replace(PHOTO, intrinsics=None)
-    turns[:] = [[], [place(0.1)], [place(0.2)], [place(0.15)], [], *[[]] * 19]
-    assert places_of(0, bare, walls) == turns[2]
-    assert asked == list(placing._TURNS_DEG)
-    asked.clear()
-    turns[:] = [[place(0.1)], [place(0.3, is_clear=True)], [place(0.9)]]
-    assert places_of(0, bare, walls) == turns[1]
-    assert asked == [0.0, 90.0]
-    # EXIF's orientations, by how a camera held so turns the picture.
+def test_exif_turns_a_photo_as_a_camera_held_so_turns_the_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for orientation, degrees in enumerate((0.0, 0.0, 180.0, 180.0, 270.0, 270.0, 90.0, 90.0), 1):
-        asked.clear()
-        shot = replace(bare, exif_orientation=orientation, exif_focal_px=840.0)
-        assert places_of(0, shot, walls) == turns[0]
-        assert asked == [degrees]
+        looks = Looks(leads={}, found={})
+        shot = replace(BARE, exif_orientation=orientation, exif_focal_px=840.0)
+        assert looks.of(shot, monkeypatch) == []
+        assert looks.turns == [(degrees, False)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "laid", "tied"),
+    [
+        ((1200, 2400), (250, 500), (600, 1200)),
+        ((1800, 900), (500, 250), (1200, 600)),
+        ((300, 400), (300, 400), (300, 400)),
+    ],
+)
+def test_a_photo_is_shrunk_to_what_is_needed_and_never_enlarged(
+    monkeypatch: pytest.MonkeyPatch,
+    shape: tuple[int, int],
+    laid: tuple[int, int],
+    tied: tuple[int, int],
+) -> None:
+    looks = Looks(leads={0.0: (7.0,)}, found={})
+    encoded = encode_png(np.zeros((*shape, 3), dtype=np.uint8))
+    photo = replace(BARE, encoded=encoded, height=shape[0], width=shape[1], exif_focal_px=840.0)
+    looks.of(photo, monkeypatch)
+    assert looks.shapes == [(*laid, 3), (*tied, 3)]
 
 
 def test_from_where_nine_parts_of_a_photo_lie_its_pose_follows() -> None:
