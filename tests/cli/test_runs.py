@@ -339,4 +339,4 @@ def test_long_names_and_reasons_are_cut(capsys: pytest.CaptureFixture[str]) -> N
     assert "r" * 1001 not in said
     assert "b: medians of 2 datasets that have a value" in said
     assert "c: medians" not in said
-    assert lines[-1] == "3 runs, 1 others left out"
+    assert lines[-1] == "3 runs, 1 other left out"
