@@ -14,7 +14,17 @@ from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option, store_option
-from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_table, number
+from orthoflow.cli.tables import (
+    ROWS_MOST,
+    counted,
+    echo,
+    echo_distances,
+    echo_json,
+    echo_table,
+    number,
+    quality_place,
+    say_more,
+)
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile
@@ -22,7 +32,6 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
-_ROWS_MOST: Final = 20
 
 
 @click.command(cls=RecordCommand)
@@ -52,7 +61,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     if as_json:
         echo_json(comparison_json(comparison))
     else:
-        _print(comparison, most=None if is_whole else _ROWS_MOST)
+        _print(comparison, most=None if is_whole else ROWS_MOST)
     doubts = [doubt for run in runs if (doubt := broken_seal(run))]
     say_error(*(f"error: {doubt}; rely on nothing that is said of it here" for doubt in doubts))
     return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD
@@ -147,12 +156,7 @@ def _print_pairs(
             for row in different[:most]
         ],
     )
-    _say_more(len(different), most)
-
-
-def _say_more(n_rows: int, most: int | None) -> None:
-    if most is not None and n_rows > most:
-        echo(f"and {n_rows - most} more, which --all prints")
+    say_more(len(different), most)
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:
@@ -172,19 +176,10 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> No
         different = [row for row in chosen if _value(row.left) != _value(row.right)]
         echo("", f"{title}: {len(different)} of {len(chosen)} differ")
         if most is not None and len(different) > most:
-            different.sort(key=lambda row: _place(row.name))
+            different.sort(key=lambda row: quality_place(row.name))
         if different:
             _print_numbers(different[:most])
-        _say_more(len(different), most)
-
-
-def _place(metric: str) -> int:
-    """Where a number stands among those that say how good results are; the others last."""
-    from orthoflow.report.comparisons import FOUND
-    from orthoflow.report.summaries import QUALITY
-
-    order = [*QUALITY, *FOUND]
-    return order.index(metric) if metric in order else len(order)
+        say_more(len(different), most)
 
 
 def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:

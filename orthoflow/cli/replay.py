@@ -127,6 +127,8 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare and say how far the products lie apart."""
+        from orthoflow.records.runs import REPORT_FILE
+
         current_session().resume_hint = (
             "interrupted; what is finished is kept, and the same command with "
             f"-o {self.folder} goes on from there"
@@ -148,7 +150,7 @@ class _Call:
         else:
             echo()
             echo_distances(distances)
-            echo(f"record of the replay: {made.path}")
+            echo(f"record of the replay: {made.path}", f"report: {self.folder / REPORT_FILE}")
         if differs:
             say_error(f"error: the replay of {self.original.path} differs, see above")
         return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD

@@ -14,6 +14,7 @@ from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
+    ROWS_MOST,
     counted,
     duration,
     echo,
@@ -21,6 +22,8 @@ from orthoflow.cli.tables import (
     echo_table,
     echo_warnings,
     number,
+    quality_place,
+    say_more,
     size,
 )
 
@@ -33,12 +36,14 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 @click.command(cls=RecordCommand)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option("--all", "is_whole", is_flag=True, help="Print every metric.")
 @json_option
-def show(run: Path, *, as_json: bool) -> int:
+def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment.
 
-    Of a folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the
-    seal of the record does not hold.
+    Of many metrics those that say how good results are are printed, with --all every one. Of a
+    folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
+    the record does not hold.
     """
     from orthoflow.engine.run_folder import RECORD_FILE
     from orthoflow.records.runs import open_run
@@ -58,7 +63,7 @@ def show(run: Path, *, as_json: bool) -> int:
     else:
         _print_head(opened)
         _print_cells(opened)
-        _print_metrics(opened)
+        _print_metrics(opened, most=None if is_whole else ROWS_MOST)
         _print_environments(opened)
         _print_files(opened)
         echo("", f"whether all of it is as it was written, says `orthoflow verify {run}`")
@@ -118,15 +123,18 @@ def _cell_status(cell: RecordedCell) -> str:
     return f"{cell.status} (cached from {cell.cached_from})" if cell.cached_from else cell.status
 
 
-def _print_metrics(run: Run) -> None:
+def _print_metrics(run: Run, *, most: int | None = None) -> None:
+    told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
+    if most is not None and len(told) > most:
+        told.sort(key=lambda one: quality_place(one[1].name))
     rows = [
         (cell.address, metric.name, number(metric.value), metric.unit)
-        for cell in run.record.cells
-        for metric in cell.metrics
+        for cell, metric in told[:most]
     ]
     if rows:
         echo()
         echo_table(("cell", "metric", "value", "unit"), rows)
+        say_more(len(told), most)
 
 
 def _print_environments(run: Run) -> None:
@@ -148,7 +156,10 @@ def _print_files(run: Run) -> None:
     published = run.record.published
     n_files = sum((run.folder / file.path).exists() for file in published)
     of_all = "" if n_files == len(published) else f" of the {len(published)} that were published"
-    echo("", f"products: {run.products_folder}, {counted(n_files, 'file')}{of_all}")
+    where = f"{run.products_folder}, {counted(n_files, 'file')}{of_all}"
+    if published and not n_files:
+        where = f"none of the {len(published)} published files is beside the record"
+    echo("", f"products: {where}")
     for image in run.orthoimages:
         echo(f"orthoimage: {image}")
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from orthoflow.records.distances import Distance, ProductDistance
 
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
+# Of longer tables the rest is printed when it is asked for.
+ROWS_MOST: Final = 20
 # How people say the units of tolerances; `1` stands for plain numbers.
 _UNITS: Final = {"grey": " grey levels", "1": ""}
 
@@ -110,9 +112,23 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
     for item in told:
         if item.reason:
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
-    if len(told) < len(distances):
-        echo(f"and {len(distances) - len(told)} more, which --all prints")
+    say_more(len(distances), most)
     echo(verdict_counts(distances))
+
+
+def say_more(n_rows: int, most: int | None) -> None:
+    """Say how many rows of a table were left out, and how they are had."""
+    if most is not None and n_rows > most:
+        echo(f"and {n_rows - most} more, which --all prints")
+
+
+def quality_place(metric: str) -> int:
+    """Where a number stands among those that say how good results are; the others last."""
+    from orthoflow.report.comparisons import FOUND
+    from orthoflow.report.summaries import QUALITY
+
+    order = [*QUALITY, *FOUND]
+    return order.index(metric) if metric in order else len(order)
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:

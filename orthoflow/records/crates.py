@@ -28,8 +28,8 @@ from orthoflow.records.crate_entities import (
 )
 from orthoflow.records.datasets import pages_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
-from orthoflow.records.run_files import copy_files, creating, path_inside
-from orthoflow.records.runs import REPORT_FILE, Run
+from orthoflow.records.run_files import copy_files, creating, figure_files, path_inside
+from orthoflow.records.runs import FIGURES_FOLDER, REPORT_FILE, Run
 from orthoflow.records.signatures import SIGNATURE_SUFFIX
 from orthoflow.version import DISTRIBUTION
 
@@ -110,11 +110,13 @@ def _write(folder: Path, name: str, text: str) -> None:
 
 
 def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
-    """Copy record, report and published files; give their paths in the crate."""
+    """Copy record, report with its figures and published files; give their paths in the crate."""
     if record.path != folder / RECORD_FILE:
         with writing_to(folder):
             shutil.copyfile(record.path, folder / RECORD_FILE)
     wanted = [REPORT_FILE, *pages_of(run).values()]
+    # Which the report leads to, where it was written with them.
+    wanted += [f"{FIGURES_FOLDER}/{name}" for name in ("graph.svg", *figure_files(run, run.cells))]
     if record is run and run.path.name == RECORD_FILE:
         wanted.append(f"{RECORD_FILE}{SIGNATURE_SUFFIX}")
     wanted += [
@@ -439,11 +441,13 @@ class _Crate:
 def _how_to_read(record: RunRecord) -> str:
     """Say how somebody who has the crate alone looks at the record and checks the files."""
     version = record.created_by.partition(" ")[2]
+    given = [entry.embedded for entry in record.inputs if entry.files]
+    where = " in it" if given and all(given) else ""
     return (
         f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
-        "anew from the input files; any HDF5 reader opens it, too."
+        f"anew from the input files{where}; any HDF5 reader opens it, too."
     )
 
 

@@ -181,7 +181,7 @@ def _distance(
         name: (_limit(name, tolerance, ours), tolerance.unit)
         for name, tolerance in cls.tolerances.items()
     }
-    differences = measure_payloads(ours, theirs, limits)
+    differences = [_named(found, ours) for found in measure_payloads(ours, theirs, limits)]
     beyond = [difference for difference in differences if difference.n_values]
     if not beyond:
         is_same = payload_digest(ours) == payload_digest(theirs)
@@ -189,6 +189,21 @@ def _distance(
     others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
     reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
     return verdict("different", reason, _by_unit(differences))
+
+
+def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
+    """Tell a value that lies in a list by the name and the unit that stand beside it."""
+    way = difference.name.split("/")
+    beside: JsonValue = dict(payload.metadata)
+    for part in way[:-1]:
+        if isinstance(beside, dict):
+            beside = beside.get(part)
+        elif isinstance(beside, list) and part.isdecimal() and int(part) < len(beside):
+            beside = beside[int(part)]
+    if way[-1] != "value" or not isinstance(beside, dict) or "name" not in beside:
+        return difference
+    unit = beside.get("unit", difference.unit)
+    return replace(difference, name=f"{beside['name']}, {difference.name}", unit=str(unit))
 
 
 def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:

@@ -228,9 +228,10 @@ def require_unchanged(run: Run, *paths: Path) -> None:
 
 
 def _views_note(folder: Path, views: list[str]) -> str:
+    shows, them = ("shows", "it") if len(views) == 1 else ("show", "them")
     return (
-        f"not covered: {', '.join(views)}, which show the record; `orthoflow report {folder}` "
-        "makes them anew"
+        f"not covered: {', '.join(views)}, which {shows} the record; `orthoflow report {folder}` "
+        f"makes {them} anew"
     )
 
 

@@ -31,6 +31,8 @@ RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"
 _DEEPEST: Final = 6
 # Folders of a run, and of what is no run: to look into them costs time and finds nothing.
 _NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pycache__"})
+# In the folder of a run: parts of it, and what was exported.
+_OF_A_RUN: Final = frozenset({"datasets", "export"})
 _FIRST_LINE_BYTES: Final = 1 << 16
 
 
@@ -133,9 +135,12 @@ def told_apart(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str
 def _below(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         if RECORD_FILE in files or JOURNAL in files:
-            folders.clear()
             yield Path(place)
-            continue
+            # Who has a record alone in a folder replays it there.
+            if Path(place) != folder:
+                folders.clear()
+                continue
+            folders[:] = [name for name in folders if name not in _OF_A_RUN]
         depth = len(Path(place).relative_to(folder).parts)
         folders[:] = sorted(
             name

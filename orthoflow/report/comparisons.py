@@ -352,9 +352,9 @@ def _remark(one: Combination) -> str:
     parts = []
     if cached:
         sources = ", ".join(dict.fromkeys(cell.cached_from for cell in cached))
+        n_computed = sum(cell.status != "skipped" for cell in one.varied_cells)
         parts.append(
-            f"{len(cached)} of {len(one.varied_cells)} steps cached, with their time in run "
-            f"{sources}"
+            f"{len(cached)} of {n_computed} steps cached, with their time in run {sources}"
         )
     n_older = sum(cell.status == "ok" and cell.compile_s is None for cell in one.varied_cells)
     if n_older:

@@ -221,7 +221,7 @@ def _states(image: Orthoimage) -> str:
     words = {
         OrthoMask.PAINTED: "painted",
         OrthoMask.FILLED: "filled from neighbours",
-        OrthoMask.NO_SURFACE: "where no station saw a surface",
+        OrthoMask.NO_SURFACE: "where the scan has nothing of the wall",
         OrthoMask.OCCLUDED: "hidden from every photo",
         OrthoMask.NONE: "in no photo",
     }

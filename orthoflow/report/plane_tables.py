@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +50,7 @@ class PlaneTable:
         rows: a row per plane.
         materials: thickness by place and material.
         later: cells that hand the same planes on.
+        before: all cells that have a part in these planes.
     """
 
     cell: str
@@ -57,6 +58,11 @@ class PlaneTable:
     rows: tuple[PlaneRow, ...]
     materials: tuple[MaterialRow, ...]
     later: tuple[str, ...] = ()
+    before: frozenset[str] = frozenset()
+
+    def taken_further(self, tables: Iterable[PlaneTable]) -> bool:
+        """Whether another of the tables shows what a later step made of these planes."""
+        return any(self.cell in table.before for table in tables if table is not self)
 
 
 def plane_tables(run: Run) -> tuple[PlaneTable, ...]:
@@ -79,6 +85,7 @@ def _told(run: Run) -> Iterator[PlaneTable]:
             viewpoint=_viewpoint(planes),
             rows=tuple(_plane_row(planes, index) for index in range(len(planes))),
             materials=tuple(_material_rows(planes)),
+            before=frozenset(cell.address for cell in run.upstream(address)) - {address},
         )
 
 

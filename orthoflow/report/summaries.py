@@ -96,6 +96,13 @@ def answers(run: Run) -> tuple[Answer, ...]:
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
             what = words_of(wanted, row.method, row.words)
+            n_found = int(values.get((row.cell, "n_found"), 0.0))
+            if wanted == "rms_mm" and n_found and row.method.startswith("inspect."):
+                # Of one point it is no RMS, and of few it says little.
+                what = "check point, residual" if n_found == 1 else what
+                n_points = int(values.get((row.cell, "n_points"), n_found))
+                of_all = f"{n_found} of {n_points}" if n_points > n_found else f"{n_found}"
+                value = f"{value}, {of_all} {'point' if n_points == 1 else 'points'}"
             not_held = _NOT_HELD.get(wanted, "")
             found.append(Answer(what=what, value=value, cell=row.cell, not_held=not_held))
     return tuple(found)
@@ -114,15 +121,18 @@ def _is_of_others(run: Run, address: str) -> bool:
 def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, those of one sense together.
 
-    Of the warnings that no later step has settled those that help stand first, then the frequent
-    ones, then the baseline's.
+    Of the warnings that no later step has settled those of what was measured on the results stand
+    first, then those that help, then the frequent ones, then the baseline's.
     """
     failures = alike(
         (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
     )
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
-    warnings = alike(standing_warnings(by_baseline))
+    measuring = {cell.address for cell in by_baseline if cell.method.startswith("inspect.")}
+    warnings = sorted(
+        alike(standing_warnings(by_baseline)), key=lambda item: measuring.isdisjoint(item.places)
+    )
     return (
         *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),

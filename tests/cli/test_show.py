@@ -34,6 +34,19 @@ def test_a_run_without_metrics_has_no_table_of_them(capsys: pytest.CaptureFixtur
     ]
 
 
+def test_of_many_metrics_those_that_say_how_good_results_are_stand_first(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    many = tuple(Metric(name=f"n_{index}", value=1.0, unit="1") for index in range(30))
+    last = cell("last", metrics=(Metric(name="rms_mm", value=1.5, unit="mm"),))
+    run = run_of(cell("a", metrics=many), last)
+    module._print_metrics(run, most=20)
+    told = capsys.readouterr().out.splitlines()
+    assert told[2].split() == ["last", "rms_mm", "1.5", "mm"]
+    assert (len(told), told[-1]) == (23, "and 11 more, which --all prints")
+    assert len(shown(module._print_metrics, run, capsys)) == 33
+
+
 def test_cells_are_counted_by_what_became_of_them() -> None:
     cells = [cell("a"), cell("b", status="skipped"), cell("c"), cell("d", status="failed")]
     assert module._status_text(run_of(*cells)) == "4 cells, 2 ok, 1 failed, 1 skipped"
@@ -61,6 +74,11 @@ def test_files_that_are_gone_are_counted(
     ]
     (tmp_path / "products/b.tif").touch()
     assert shown(module._print_files, run, capsys) == ["", f"{begin}, 2 files", image]
+    for name in ("a.tif", "b.tif"):
+        (tmp_path / "products" / name).unlink()
+    run.orthoimages = []
+    said = "products: none of the 2 published files is beside the record"
+    assert shown(module._print_files, run, capsys) == ["", said]
 
 
 def test_a_metric_has_in_json_what_its_method_says_of_it() -> None:

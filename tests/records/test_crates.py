@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import shutil
 import subprocess
 import sys
 import warnings
@@ -11,12 +13,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from orthoflow_provenance.model import RecordedFigure
 
 from orthoflow.errors import RecordError
-from orthoflow.records.crates import crate_metadata
+from orthoflow.files.images import encode_png
+from orthoflow.records.crates import crate_metadata, write_crate
 from orthoflow.records.runs import open_run
+from orthoflow.report import write_page, write_report
 from tests.crate_contexts import context_of
 from tests.studios import Studio, open_studio
 
@@ -243,6 +250,39 @@ def test_who_has_the_crate_alone_is_told_how_to_read_and_verify_it(
         assert done.exit_code == 0, done.output
     (engine,) = (entity for entity in crate["@graph"] if entity["@id"] == "#engine")
     assert f"orthoflow-tls=={engine['softwareVersion']}" in engine["description"]
+
+
+def test_of_a_record_that_holds_its_input_files_nobody_looks_for_them_elsewhere(
+    studio: Studio,
+) -> None:
+    run = open_run(studio.folder / "first").record
+    for is_embedded, said in ((False, "the input files; "), (True, "the input files in it; ")):
+        inputs = tuple(replace(entry, embedded=is_embedded) for entry in run.inputs)
+        graph: dict[str, Any] = crate_metadata(replace(run, inputs=inputs), [], license_text="CC0")
+        assert said in entities(graph, "Dataset")[0]["description"]
+
+
+def test_what_the_report_links_to_is_in_the_crate(studio: Studio, tmp_path: Path) -> None:
+    run = open_run(shutil.copytree(studio.folder / "first", tmp_path / "drawn"))
+    pixel = encode_png(np.zeros((1, 1, 3), dtype=np.uint8))
+    figure = RecordedFigure(name="dot", caption="A dot.", media_type="image/png", data=pixel)
+    cells = tuple(replace(one, figures=(figure,)) for one in run.record.cells)
+    run = replace(run, record=replace(run.record, cells=cells))
+    write_page(run, run.folder / "report.html")
+    folder = tmp_path / "crate"
+    folder.mkdir()
+    write_crate(run, folder)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    links = {unquote(link) for link in re.findall(r'href="([^"#:]+)"', page)}
+    assert any(link.startswith("figures/") for link in links)
+    assert [link for link in sorted(links) if not (folder / link).is_file()] == []
+    told = json.loads((folder / "ro-crate-metadata.json").read_text(encoding="utf-8"))
+    assert links <= {entity["@id"] for entity in entities(told, "File")}
+    # A report that stands alone leads to no figures, and says how they are had.
+    write_report([run], tmp_path / "alone.html")
+    page = (tmp_path / "alone.html").read_text(encoding="utf-8")
+    assert 'href="figures/' not in page
+    assert "--to figures</code> writes them as PNG" in page
 
 
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:

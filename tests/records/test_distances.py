@@ -140,6 +140,17 @@ def test_grey_of_sixteen_bits_counts_in_steps_of_257(dtype: Any, limit: float) -
     assert module._limit("rgb", grey, payload(rgb=np.zeros(3, dtype=dtype))) == limit
 
 
+def test_a_value_in_a_list_is_told_by_its_name_and_unit() -> None:
+    def told(**beside: Any) -> Any:
+        metadata = {"findings": [{"value": 0.5}, {**beside, "value": 2.0}]}
+        name, at = "findings/1/value", payload(metadata=metadata)
+        found = module._named(difference(name, "1", 0.5, 1), at)
+        return found.name, found.unit
+
+    assert told(name="rms_mm", unit="mm") == ("rms_mm, findings/1/value", "mm")
+    assert told(unit="mm") == ("findings/1/value", "1")
+
+
 def test_of_two_encodings_what_both_state_is_compared() -> None:
     older = payload(1, {"a": 1, "b": {"c": 2, "d": 3}, "e": [{"f": 1}, {"f": 2, "g": 3}]}, n=[1])
     newer = payload(2, {"b": {"c": 9, "x": 1}, "e": [{"f": 5}, {"f": 6}], "y": 0}, n=[1], m=[2])

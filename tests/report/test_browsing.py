@@ -38,6 +38,10 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
     # Each once, in the order of the folders that are given; a run may be one of them.
     twice = run_folders([tmp_path / "b", tmp_path / "a", tmp_path])
     assert [path.relative_to(tmp_path).as_posix() for path in twice] == ["b", "a/x", "1/2/3/4/5/6"]
+    # A run that is itself the folder may have others beside its record, but for parts of it.
+    for place in ("b/again", "b/datasets/one", "b/export/ro-crate"):
+        a_run(tmp_path / place)
+    assert run_folders([tmp_path / "b"]) == [tmp_path / "b", tmp_path / "b/again"]
     (tmp_path / "elsewhere").symlink_to(tmp_path / "a", target_is_directory=True)
     assert run_folders([tmp_path]) == [tmp_path / name for name in found]
     with pytest.raises(

@@ -209,7 +209,14 @@ def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
     )
     told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
     collected = "[...document.querySelectorAll('.points [data-part=list] > div')].pop()"
+    name, told = told.split(" collected: ")
+    assert name == page.evaluate(f"{collected}.querySelector('input').value")
     assert f"wall 0, {told}" in page.evaluate(f"{collected}.innerText")
+    # The cross with its number stands where the click was, and nowhere else.
+    mark = f"[...{FIGURE}.querySelectorAll('.marks > span')].pop()"
+    left, top = page.evaluate(f"[{mark}.style.left, {mark}.style.top].map(parseFloat)")
+    assert (left, top) == (pytest.approx(45.67, abs=0.2), pytest.approx(56.78, abs=0.2))
+    assert f"P{page.evaluate(f'{mark}.innerText')}" == name
     # One that no pointer made, by a script or a keyboard, stays where it is itself.
     page.evaluate(f"({POINTER})('click', 0.25, 0.5)")
     u = re.findall(r"u ([0-9.]+) px", page.evaluate(f"{collected}.innerText"))
@@ -318,6 +325,9 @@ def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
     page.ask("Input.dispatchMouseEvent", type="mouseReleased", **at, **hand)
     assert page.evaluate(f"{rows}.length") == before + 1
     assert f"wall 0, {readout}" in page.evaluate(f"[...{rows}].pop().innerText")
+    marked = f"[...{VIEWER}.querySelectorAll('.marks > span')].pop().getBoundingClientRect()"
+    assert page.evaluate(f"{marked}.left") == pytest.approx(at["x"], abs=1.5)
+    assert page.evaluate(f"{marked}.top") == pytest.approx(at["y"], abs=1.5)
     # A drag moves the picture and collects nothing.
     page.ask("Input.dispatchMouseEvent", type="mousePressed", **at, **hand)
     for _ in range(2):
@@ -329,6 +339,8 @@ def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
     caption = page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText")
     assert "." in caption
     assert not re.search(r"[a-z]\.products/", caption)
+    # What the picture is, and how it is read, are two sentences.
+    assert ". Lines of the building" in caption
     page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
 
 

@@ -90,3 +90,25 @@ def test_planes_that_a_later_step_hands_on_stand_there_once() -> None:
         ("moved", (), "stations"),
         ("mixed", (), "photos (1), guess (1)"),
     ]
+    assert not any(table.taken_further(tables) for table in tables)
+
+
+def test_planes_that_a_later_step_changed_are_taken_further() -> None:
+    planes = wall_and_floor()
+    products = {
+        ("plane", "planes"): planes,
+        ("sides", "planes"): replace(planes, viewpoint="photos"),
+    }
+    cells = [
+        cell("plane", outputs={"planes": given("", "a", "planes")}),
+        cell(
+            "sides",
+            inputs={"planes": given("plane.planes", "a", "planes")},
+            outputs={"planes": given("", "b", "planes")},
+        ),
+    ]
+    tables = plane_tables(HeldRun(path=Path("run.h5"), record=record(cells), products=products))
+    assert [(one.cell, one.taken_further(tables)) for one in tables] == [
+        ("plane", True),
+        ("sides", False),
+    ]

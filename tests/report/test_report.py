@@ -192,6 +192,22 @@ def test_check_points_of_the_own_orthoimage_are_told_before_those_of_others() ->
     assert answer.cell == "points_theirs"
 
 
+def test_the_number_of_check_points_stands_beside_their_rms() -> None:
+    def told(**values: float) -> tuple[str, str]:
+        check = cell("points", method="inspect.checkpoints", metrics=metrics(rms_mm=2.1, **values))
+        (answer,) = answers(run(check))
+        return answer.what, answer.value
+
+    assert told(n_found=1.0, n_points=4.0) == ("check point, residual", "2.1 mm, 1 of 4 points")
+    assert told(n_found=3.0, n_points=4.0) == ("check points, RMS", "2.1 mm, 3 of 4 points")
+
+
+def test_warnings_of_what_was_measured_are_the_first_limits() -> None:
+    scan = cell("scan", method="read.scan", warnings=("set view_from of it: a guess",))
+    check = cell("points", method="inspect.checkpoints", warnings=("3 of 4 points are missing",))
+    assert [limit.cells for limit in limits(run(scan, check))] == [("points",), ("scan",)]
+
+
 def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
     plane = cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6))
     for value, first in ((0.0, ("main wall of the scene", "not found")), (1.0, None)):

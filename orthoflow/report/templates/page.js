@@ -292,7 +292,7 @@
       const depth = known === null ? NaN : known / 1000;
       const world = [0, 1, 2].map((axis) => place.origin[axis]
         + place.gsd * (u * place.u[axis] + v * place.v[axis]) + (known === null ? 0 : depth) * place.n[axis]);
-      return { wall: place.wall, of: place.name, u, v, depth, world };
+      return { id: place.id, x, y, wall: place.wall, of: place.name, u, v, depth, world };
     };
     const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${
       Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, ${
@@ -305,7 +305,18 @@
       if (list) input.setAttribute("list", list);
       return input;
     };
+    // A cross with its number where a point was collected, small and enlarged.
+    const cross = (point) => {
+      const mark = document.createElement("span"), number = document.createElement("b");
+      Object.assign(mark.style, { left: `${100 * point.x}%`, top: `${100 * point.y}%` });
+      number.textContent = point.number;
+      mark.append(number);
+      return mark;
+    };
     const update = () => {
+      for (const { id } of places) for (const box of document.querySelectorAll(`[data-marks="${id}"]`)) {
+        box.replaceChildren(...points.filter((point) => point.id === id).map(cross));
+      }
       part.checkpoints.disabled = part.ties.disabled = points.length === 0;
       part.told.textContent = "";
     };
@@ -367,7 +378,17 @@
       const readout = document.createElement("output");
       readout.className = "readout";
       readout.textContent = "move over the picture for coordinates";
-      figure.querySelector("figcaption").append(readout);
+      // Directly below the picture: a long caption would push it out of sight.
+      figure.querySelector("figcaption").before(readout);
+      const marks = document.createElement("div");
+      marks.className = "marks";
+      marks.dataset.marks = place.id;
+      figure.querySelector(".picture").append(marks);
+      new ResizeObserver(() => Object.assign(marks.style, {
+        left: `${image.offsetLeft + image.clientLeft}px`, top: `${image.offsetTop + image.clientTop}px`,
+        width: `${image.clientWidth}px`, height: `${image.clientHeight}px`,
+      })).observe(image);
+      const collected = (point) => `${collect(point)} collected: ${words(point)}`;
       let pointer = null;
       const follow = (event) => {
         const point = under(place, image, event);
@@ -380,12 +401,12 @@
         // A click is told in whole pixels of the screen; the pointer that made it knows its place within one.
         const isIts = pointer && Math.abs(pointer.clientX - event.clientX) < 1 && Math.abs(pointer.clientY - event.clientY) < 1;
         const point = under(place, image, isIts ? pointer : event);
-        if (point) collect(point);
+        if (point) readout.textContent = collected(point);
       });
       pointing.set(figure, (copy, event, isClick) => {
         const point = under(place, copy, event);
         if (!point) return "";
-        return isClick ? `${collect(point)} collected: ${words(point)}` : words(point);
+        return isClick ? collected(point) : words(point);
       });
     }
   }
@@ -401,6 +422,7 @@
   const lie = () => {
     const shown = view.stage.firstElementChild;
     shown.style.transform = `translate(${place.x}px, ${place.y}px) scale(${place.scale})`;
+    shown.style.setProperty("--back", 1 / place.scale);
     const perCell = (place.scale * size.width) / size.cells;
     shown.classList.toggle("cells", perCell > 2);
     const whole = size.metres ? `, 10 cm are ${Math.round((0.1 * place.scale * size.width) / size.metres)} px` : "";
@@ -430,6 +452,8 @@
     shown.className = `shown ${figure.className} ${picture.className.replace("picture", "")}`;
     for (const part of picture.querySelectorAll(":scope > img, :scope > svg:not(.legend)")) shown.append(part.cloneNode(true));
     shown.querySelector("img.few")?.removeAttribute("style");
+    const marks = picture.querySelector(":scope > .marks")?.cloneNode(true);
+    if (marks) { marks.removeAttribute("style"); shown.append(marks); }
     Object.assign(shown.style, { width: `${size.width}px`, height: `${size.height}px` });
     view.stage.replaceChildren(shown);
     view.caption.textContent = [...figure.querySelectorAll("figcaption strong, figcaption .soft")]

@@ -135,9 +135,12 @@ class InspectCheckpoints(Method):
             )
         for doubt in doubts(points, inputs.checkpoints, pictures):
             ctx.warn(doubt)
-        missed = missed_points(points, inputs.checkpoints, pictures, inputs.walls)
+        is_simulated = inputs.truth is not None
+        missed = missed_points(
+            points, inputs.checkpoints, pictures, inputs.walls, is_simulated=is_simulated
+        )
         # In a simulated room points are hidden on purpose.
-        if missed and inputs.truth is None:
+        if missed and not is_simulated:
             ctx.warn(said_of_missed(missed, len(points)))
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -12,6 +13,8 @@ from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
 _NAMED: Final = 4
 _NEAR_M: Final = 1.0
+# Said of points that a larger wall would have.
+_BESIDE: Final = re.compile(r" (?:left of|right of|above|below) ")
 
 
 def missed_points(
@@ -19,6 +22,8 @@ def missed_points(
     surveyed: CheckPoints,
     pictures: Sequence[Picture],
     walls: Walls,
+    *,
+    is_simulated: bool = False,
 ) -> dict[str, str]:
     """Name the points that count nowhere, each with the reason, in the order of the survey.
 
@@ -27,14 +32,16 @@ def missed_points(
         surveyed: the points.
         pictures: what they were looked for in; at least one.
         walls: those of the pictures.
+        is_simulated: points were looked for by the scene's truth, not as targets.
     """
+    sought = "nothing like it" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}
     found: dict[str, str] = {}
     for index, point in enumerate(points):
         if np.isfinite(point.place).all():
             continue
         if point.how != "outside":
-            found[surveyed.names[index]] = f"nothing like it was recognised on {names[point.wall]}"
+            found[surveyed.names[index]] = f"{sought} was recognised on {names[point.wall]}"
             continue
         number = int(surveyed.wall[index])
         found[surveyed.names[index]] = (
@@ -51,9 +58,12 @@ def said_of_missed(missed: Mapping[str, str], n_points: int) -> str:
         return ""
     named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
     more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
+    ways = ["measure them in an orthoimage"]
+    if any(_BESIDE.search(reason) for reason in missed.values()):
+        ways.append("let `margin_m` of raster.grid make walls larger")
     return (
         f"{len(missed)} of {n_points} check points count nowhere: {', '.join(named)}{more}; "
-        "measure them in an orthoimage, or let `margin_m` of raster.grid make walls larger"
+        f"{', or '.join(ways)}"
     )
 
 

@@ -178,9 +178,9 @@ def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepCon
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:
         ctx.warn(
-            f"neither stations nor photos say from which side {', '.join(guessed)} of "
-            f"{len(planes)} planes were seen; the side with more of the other points was taken: if "
-            "an image comes out mirrored, set view_from of read.scan"
+            f"neither stations nor photos say from which side {len(guessed)} of {len(planes)} "
+            f"planes were seen ({', '.join(guessed)}); the side with more of the other points was "
+            "taken: if an image comes out mirrored, set view_from of read.scan"
         )
 
 

@@ -307,11 +307,17 @@ def _extents(
 
 
 def _log_cuts(
-    frames: Mapping[int, WallFrame], planes: Planes, extent_of: ExtentOf, ctx: StepContext
+    frames: Mapping[int, WallFrame],
+    planes: Planes,
+    extent_of: ExtentOf,
+    ctx: StepContext,
+    *,
+    margin_m: float,
 ) -> None:
     """Say what of a wall lies beyond its rectangle because what adjoins it runs askew."""
     for index, frame in frames.items():
-        for side, cut_m in extent_of(index).cut_m.items():
+        for side, askew_m in extent_of(index).cut_m.items():
+            cut_m = askew_m - margin_m
             if cut_m > frame.gsd_m:
                 tell = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
                 tell(
@@ -347,7 +353,7 @@ def _crops(
     if params.crs is not None:
         reach_m = max(max(extent_of(index).buffer_m) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
-    _log_cuts(frames, planes, extent_of, ctx)
+    _log_cuts(frames, planes, extent_of, ctx, margin_m=params.margin_m)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
     for place in params.near:
         index = nearest_plane(planes, list(frames), np.array(place))

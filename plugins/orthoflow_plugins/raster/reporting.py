@@ -136,7 +136,14 @@ def _causes(empty: Emptiness) -> str:
     causes.sort(key=lambda cause: -cause[0])
     # Tiles on the rim of a hole belong to it and to what is about it.
     least = max(0.01, 0.1 * empty.share)
-    return "; ".join(f"{share:.0%} {words}" for share, words in causes if share >= least)
+    told = [(round(100.0 * share), words) for share, words in causes if share >= least]
+    # What is printed adds up to the whole that is printed.
+    rest = round(100.0 * empty.share) - sum(percent for percent, _ in told)
+    if rest > 0 and any(0.0 < share < least for share, _ in causes):
+        told.append((rest, "have smaller causes"))
+    elif rest and told:
+        told[0] = (told[0][0] + rest, told[0][1])
+    return "; ".join(f"{percent}% {words}" for percent, words in told)
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

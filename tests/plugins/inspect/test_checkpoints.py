@@ -140,6 +140,22 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
     assert "margin_m" in said
 
 
+def test_points_that_are_no_targets_are_not_helped_by_larger_walls(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    places = np.array([[50.0, 40.0], [60.0, 60.0]])
+    pixels = np.full((2, 2), np.nan)
+    pixels[0] = places[0]
+    points = points_at(walls.walls[0].frame.world_from_wall(places), pixels=pixels)
+    points = replace(points, wall=np.array([0, -1], dtype=np.int32))
+    image = inspect_scenes.displaced(0, 0)
+    _, _, ctx = inspect(tmp_path, points, walls, image)
+    (said,) = ctx.warnings
+    assert said == (
+        "1 of 2 check points count nowhere: P1 (no black and white quadrant target was recognised "
+        f"on {image.name}); measure them in an orthoimage"
+    )
+
+
 def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     places = np.column_stack([np.linspace(40.0, 300.0, 20), np.linspace(40.0, 200.0, 20)])

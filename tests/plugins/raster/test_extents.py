@@ -148,6 +148,11 @@ def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said
         "plane 0: what adjoins it at its bottom runs askew, and its raster ends where that comes "
         "nearest: up to 80 mm of the wall are left out there; margin_m adds them"
     )
+    # What a margin has added is not missing.
+    (tmp_path / "wider").mkdir()
+    ctx = scenes.context(tmp_path / "wider")
+    RasterGrid().run(inputs, chosen.model_copy(update={"margin_m": 0.085}), ctx)
+    assert not [text for text in ctx.warnings if "askew" in text]
 
 
 def test_growth_adds_whole_cells_and_moves_none(tmp_path: Path) -> None:

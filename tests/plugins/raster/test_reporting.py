@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -175,7 +176,7 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
         "wall 0: 60% of its cells are empty: 31% lie between the scan's points (raise gsd_m or "
         "recover_gap_cells); 20% lie behind the buffer, about 0.43 m behind the plane (raise "
         "buffer_behind_m if that is the wall); 6% show nothing that was scanned: glass, or what no "
-        "station sees"
+        "station sees; 3% have smaller causes"
     )
 
 
@@ -187,7 +188,17 @@ def test_a_tenth_of_empty_cells_is_worth_words_and_a_hundredth_of_a_cause(
     )
     [said] = listener.warnings
     assert said.startswith("wall 0: 10% of its cells are empty: 9% are hidden by what stands")
+    assert said.endswith("; 1% have smaller causes")
     assert "gsd_m" not in said
+
+
+def test_rounded_shares_of_empty_cells_add_up(listener: Listener) -> None:
+    reporting.report_empty(
+        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.154, sparse=0.104, unseen=0.094)]
+    )
+    [said] = listener.warnings
+    shares = [int(text) for text in re.findall(r"(\d+)%", said)]
+    assert shares[0] == sum(shares[1:]) == 35
 
 
 def test_a_picture_of_a_depth_is_grey_where_it_is_void_and_spreads_the_rest() -> None:
