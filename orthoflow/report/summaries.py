@@ -96,14 +96,14 @@ def answers(run: Run) -> tuple[Answer, ...]:
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
             what = words_of(wanted, row.method, row.words)
+            not_held = _NOT_HELD.get(wanted, "")
             n_found = int(values.get((row.cell, "n_found"), 0.0))
             if wanted == "rms_mm" and n_found and row.method.startswith("inspect."):
                 # Of one point it is no RMS, and of few it says little.
                 what = "check point, residual" if n_found == 1 else what
                 n_points = int(values.get((row.cell, "n_points"), n_found))
                 of_all = f"{n_found} of {n_points}" if n_points > n_found else f"{n_found}"
-                value = f"{value}, {of_all} {'point' if n_points == 1 else 'points'}"
-            not_held = _NOT_HELD.get(wanted, "")
+                not_held = f"{of_all} {'point' if n_points == 1 else 'points'}"
             found.append(Answer(what=what, value=value, cell=row.cell, not_held=not_held))
     return tuple(found)
 

@@ -196,10 +196,11 @@ def test_the_number_of_check_points_stands_beside_their_rms() -> None:
     def told(**values: float) -> tuple[str, str]:
         check = cell("points", method="inspect.checkpoints", metrics=metrics(rms_mm=2.1, **values))
         (answer,) = answers(run(check))
-        return answer.what, answer.value
+        return answer.what, answer.not_held
 
-    assert told(n_found=1.0, n_points=4.0) == ("check point, residual", "2.1 mm, 1 of 4 points")
-    assert told(n_found=3.0, n_points=4.0) == ("check points, RMS", "2.1 mm, 3 of 4 points")
+    assert told(n_found=1.0, n_points=4.0) == ("check point, residual", "1 of 4 points")
+    assert told(n_found=3.0, n_points=4.0) == ("check points, RMS", "3 of 4 points")
+    assert told(n_found=1.0, n_points=1.0) == ("check point, residual", "1 point")
 
 
 def test_warnings_of_what_was_measured_are_the_first_limits() -> None:

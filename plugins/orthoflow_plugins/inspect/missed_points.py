@@ -60,7 +60,7 @@ def said_of_missed(missed: Mapping[str, str], n_points: int) -> str:
     more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
     ways = ["measure them in an orthoimage"]
     if any(_BESIDE.search(reason) for reason in missed.values()):
-        ways.append("let `margin_m` of raster.grid make walls larger")
+        ways.append("let margin_m of raster.grid make walls larger")
     return (
         f"{len(missed)} of {n_points} check points count nowhere: {', '.join(named)}{more}; "
         f"{', or '.join(ways)}"
