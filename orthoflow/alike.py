@@ -28,7 +28,7 @@ _MARKS: Final = re.compile(
 )
 # Words of sentences that say what one can do.
 _ADVICE: Final = re.compile(
-    r"\b(?:set|give|check|choose|turn|lower|raise|free|repeat|helps?|need(?:s|ed)?|instead)\b|--\w",
+    r"\b(?:set|give|check|measure|choose|turn|lower|raise|free|repeat|helps?|need(?:s|ed)?|instead)\b|--\w",
     re.IGNORECASE,
 )
 
@@ -64,6 +64,11 @@ class Alike:
         return f"{self.text} ({self.count} times{'; also ' if named else ''}{named})"
 
     @property
+    def is_advice(self) -> bool:
+        """Whether it says what one can do."""
+        return _ADVICE.search(self.text) is not None
+
+    @property
     def where(self) -> str:
         """The first of the places, and how many more there are."""
         return first_few(self.places, most=1)
@@ -83,7 +88,7 @@ def alike(said: Iterable[tuple[str, str]]) -> tuple[Alike, ...]:
     for place, text in said:
         groups.setdefault(sense(text), []).append((place, text))
     found = [_together(group) for group in groups.values()]
-    return tuple(sorted(found, key=lambda item: (not _ADVICE.search(item.text), -item.count)))
+    return tuple(sorted(found, key=lambda item: (not item.is_advice, -item.count)))
 
 
 def sense(text: str) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -38,6 +39,8 @@ QUALITY: Final[Mapping[str, str]] = {
 }
 
 _DECLARED_MOST: Final = 3
+_IMAGE: Final = re.compile(r"/wall_(\d+)_ortho\.tif$")
+_PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
@@ -121,8 +124,9 @@ def _is_of_others(run: Run, address: str) -> bool:
 def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, those of one sense together.
 
-    Of the warnings that no later step has settled those of what was measured on the results stand
-    first, then those that help, then the frequent ones, then the baseline's.
+    Of the warnings that no later step has settled those that help stand first, of them those of
+    what was measured on the results, then the frequent ones, then the baseline's; last what speaks
+    only of planes of which no orthoimage was made.
     """
     failures = alike(
         (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
@@ -130,13 +134,27 @@ def limits(run: Run) -> tuple[Limit, ...]:
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
     measuring = {cell.address for cell in by_baseline if cell.method.startswith("inspect.")}
+    imaged = {
+        found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
+    }
     warnings = sorted(
-        alike(standing_warnings(by_baseline)), key=lambda item: measuring.isdisjoint(item.places)
+        alike(standing_warnings(by_baseline)),
+        key=lambda item: (
+            _is_of_others_than(imaged, item.sentence),
+            not item.is_advice,
+            measuring.isdisjoint(item.places),
+        ),
     )
     return (
         *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),
     )
+
+
+def _is_of_others_than(imaged: Collection[str], text: str) -> bool:
+    """Whether a sentence names planes, but none of those of which there is an orthoimage."""
+    named = _PLANE.findall(text)
+    return bool(imaged and named) and not any(number in imaged for number in named)
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:

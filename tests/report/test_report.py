@@ -203,10 +203,27 @@ def test_the_number_of_check_points_stands_beside_their_rms() -> None:
     assert told(n_found=1.0, n_points=1.0) == ("check point, residual", "1 point")
 
 
-def test_warnings_of_what_was_measured_are_the_first_limits() -> None:
+def test_advice_on_what_was_measured_is_the_first_limit() -> None:
     scan = cell("scan", method="read.scan", warnings=("set view_from of it: a guess",))
-    check = cell("points", method="inspect.checkpoints", warnings=("3 of 4 points are missing",))
+    check = cell(
+        "points", method="inspect.checkpoints", warnings=("2 of 4 are missing: measure them",)
+    )
     assert [limit.cells for limit in limits(run(scan, check))] == [("points",), ("scan",)]
+    check = replace(check, warnings=("one is an outlier",))
+    assert [limit.cells for limit in limits(run(scan, check))] == [("scan",), ("points",)]
+
+
+def test_what_is_said_of_planes_without_an_orthoimage_stands_last() -> None:
+    guessed = "from which side {} was seen is a guess: set view_from"
+    told = [
+        cell(name, warnings=(text,))
+        for name, text in (("a", guessed.format("wall 6")), ("b", "wall 0: cells are empty"))
+    ]
+    image = PublishedFile(path="products/mosaic/wall_0_ortho.tif", size_bytes=1, sha256="0")
+    of_one = replace(run(*told), record=replace(run(*told).record, published=(image,)))
+    assert [limit.cells for limit in limits(of_one)] == [("b",), ("a",)]
+    # Where no images are published nothing is known of them.
+    assert [limit.cells for limit in limits(run(*told))] == [("a",), ("b",)]
 
 
 def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
