@@ -40,13 +40,16 @@ SAME_WALL = (
     *("--set", "wall.n_walls_max=1"),
 )
 FOOT_M = 0.3048
+# What the surveyor has of six photos in two rows of three: those of the left and the middle, which
+# overlap as all do.
+BROUGHT = {f"photo_{place:02d}.jpg" for place in (0, 1, 3, 4)}
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `quickstart.yaml` ran once, small, as `run`, everything embedded."""
     shell = Shell(tmp_path_factory.mktemp("quick"), store)
-    # The run on own files forks its steps; here libraries and kernels are loaded once for all.
+    # Libraries and kernels are loaded once for all steps, and no chart is drawn.
     how = (*SMALL, "--embed", "--executor", "inline")
     ended = shell("run", "quickstart.yaml", *how, "-o", "run", timeout_s=900)
     assert ended.code == 0, ended.said
@@ -247,7 +250,8 @@ def write_survey(folder: Path, run: Run, survey: Survey) -> None:
     )
     (folder / "photos").mkdir()
     for photo in photos.photos:
-        (folder / "photos" / photo.name).write_bytes(photo.encoded)
+        if photo.name in BROUGHT:
+            (folder / "photos" / photo.name).write_bytes(photo.encoded)
     write_calibration(folder / "calibration.yaml", calibration)
 
 
@@ -292,11 +296,17 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell, name: 
         *("--input", f"scan={folder / 'scan.las'}", "--input", f"photos={folder / 'photos'}"),
         *("--input", f"calibration={folder / 'calibration.yaml'}"),
     ]
-    ended = quick("run", "photos-on-scan.yaml", "-o", folder / "run", *said, timeout_s=900)
+    ended = quick(
+        *("run", "photos-on-scan.yaml", "-o", folder / "run", *said, "--executor", "inline"),
+        timeout_s=900,
+    )
     assert ended.code == 0, ended.said
     found = json.loads((folder / "run" / "products" / "orient" / "cameras.json").read_text())
     oriented = 0
+    assert found["cameras"].keys() == BROUGHT
     for true in truth.cameras.cameras:
+        if true.photo not in BROUGHT:
+            continue
         camera = found["cameras"][true.photo]
         if camera["status"] != "ok":
             continue
@@ -314,7 +324,7 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell, name: 
         # OpenCV counts from the centre of the first pixel. A sixth of a cell on the wall.
         errors_px = found_px.reshape(-1, 2) + 0.5 - pixels[inside]
         assert np.sqrt((errors_px**2).mean()) * PHOTO_GSD_MM < GSD_MM / 6
-    assert oriented >= len(truth.cameras.cameras) - 1
+    assert oriented >= len(BROUGHT) - 1
     given = folder / "run" / "products" / "orient" / "cameras.json"
     again = quick(
         *("run", "photos-on-scan.yaml", "-o", folder / "given", *said),
