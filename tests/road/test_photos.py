@@ -328,7 +328,7 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell, name: 
     given = folder / "run" / "products" / "orient" / "cameras.json"
     again = quick(
         *("run", "photos-on-scan.yaml", "-o", folder / "given", *said),
-        *("--input", f"cameras={given}", "--executor", "inline"),
+        *("--input", f"cameras={given}"),  # each step in its own process
         timeout_s=900,
     )
     assert again.code == 0, again.said
