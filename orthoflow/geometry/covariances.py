@@ -54,9 +54,22 @@ def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
     """Give the larger of two covariances (p, p), along each axis in which the first is one."""
-    root = np.linalg.cholesky(plain)
+    root = _root(plain)
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ spread @ inverse.T)
     widened = root @ axes * np.sqrt(np.maximum(values, 1.0))
     result: NDArray[np.float64] = widened @ widened.T
     return result
+
+
+def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Give R (p, p) with R R' the covariance, or a little more where rounding left it none."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        # Some unknowns are hardly determined: their variances dwarf the others.
+        sigmas = np.sqrt(np.diag(covariance))
+        values, axes = np.linalg.eigh(covariance / np.outer(sigmas, sigmas))
+        least = len(values) * np.finfo(np.float64).eps * values[-1]
+        root = sigmas[:, None] * axes * np.sqrt(np.maximum(values, least))
+        return np.asarray(root, dtype=np.float64)

@@ -73,3 +73,17 @@ def test_the_larger_counts_in_each_direction() -> None:
     spread = lower @ axes @ np.diag(shares) @ axes.T @ lower.T
     wanted = lower @ axes @ np.diag(np.maximum(shares, 1.0)) @ axes.T @ lower.T
     np.testing.assert_allclose(widened(plain, spread), wanted)
+
+
+def test_a_covariance_that_rounding_left_without_a_root_is_widened_all_the_same() -> None:
+    # Two unknowns that are as good as one, one of them known to a million of its units.
+    sigmas = np.array([1e-3, 1e6, 2.0])
+    correlation = np.array([[1.0, 1.0, 0.0], [1.0, 1.0 - 2e-16, 0.0], [0.0, 0.0, 1.0]])
+    plain = correlation * np.outer(sigmas, sigmas)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(plain)
+    spread = np.diag([0.0, 0.0, 36.0])
+    found = widened(plain, spread)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [1e-3, 1e6, 6.0], rtol=1e-6)
+    np.testing.assert_allclose(found, found.T)
+    np.testing.assert_allclose(found[0, 1], 1e3, rtol=1e-6)
