@@ -7,11 +7,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.candidates import Rules
 
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
 
 NOISE_M = 0.002
+RULES = Rules(
+    find_m=0.05,
+    fit_m=0.015,
+    n_planes_most=10,
+    least_share=0.1,
+    stop_unclassified_share=0.05,
+    tilt_most_deg=10.0,
+    stop_rest_share=0.0,
+    is_exact=False,
+    joins_parts=True,
+)
 
 
 @dataclass(frozen=True)

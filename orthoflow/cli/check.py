@@ -52,7 +52,7 @@ class _Verdict:
 
 def _check(workflow: str, changes: Changes) -> _Verdict:
     from orthoflow.catalog.discovery import discover_catalog
-    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.cells import expand_cells, is_plain
     from orthoflow.workflow.doubts import doubts_about
     from orthoflow.workflow.inputs import resolve_input_files
 
@@ -64,9 +64,7 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
     without_data = f", {skipped} of them skipped for lack of optional data" if skipped else ""
     n_data = len(loaded.chosen_data)
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
-    # Where nothing varies, a step is its only cell.
-    is_plain = all(cell.address == cell.step for cell in cells)
-    n_cells = "" if is_plain else f", {datasets}{counted(len(cells), 'cell')}"
+    n_cells = "" if is_plain(cells) else f", {datasets}{counted(len(cells), 'cell')}"
     summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"
         f"{n_cells}{without_data}{_baseline_text(loaded)}"

@@ -12,7 +12,7 @@ import click
 
 from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
+from orthoflow.cli.failures import code_for
 from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import (
     ROWS_MOST,
@@ -21,6 +21,7 @@ from orthoflow.cli.tables import (
     echo_distances,
     echo_json,
     echo_table,
+    first_rows,
     number,
     quality_place,
     say_more,
@@ -62,9 +63,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
         echo_json(comparison_json(comparison))
     else:
         _print(comparison, most=None if is_whole else ROWS_MOST)
-    doubts = [doubt for run in runs if (doubt := broken_seal(run))]
-    say_error(*(f"error: {doubt}; rely on nothing that is said of it here" for doubt in doubts))
-    return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD
+    return code_for(map(broken_seal, runs), "rely on nothing that is said of it here")
 
 
 def comparison_json(comparison: RunComparison) -> dict[str, object]:
@@ -132,8 +131,6 @@ def _print_pairs(
 ) -> None:
     """Print the rows that differ under a title, what both have first, or that none does."""
     different = [row for row in rows if not row.is_same]
-    if most is not None and len(different) > most:
-        different.sort(key=lambda row: not row.is_shared)
     if not different:
         echo("", f"{title}: same")
         return
@@ -153,7 +150,7 @@ def _print_pairs(
                 ".".join(part for part in (row.cell, row.name) if part),
                 *(_NOTHING if side is None else text(side) for side in (row.left, row.right)),
             )
-            for row in different[:most]
+            for row in first_rows(different, most, lambda row: not row.is_shared)
         ],
     )
     say_more(len(different), most)
@@ -175,10 +172,8 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> No
         chosen = [row for row in rows if row.either.is_cost == is_cost]
         different = [row for row in chosen if _value(row.left) != _value(row.right)]
         echo("", f"{title}: {len(different)} of {len(chosen)} differ")
-        if most is not None and len(different) > most:
-            different.sort(key=lambda row: quality_place(row.name))
         if different:
-            _print_numbers(different[:most])
+            _print_numbers(first_rows(different, most, lambda row: quality_place(row.name)))
         say_more(len(different), most)
 
 

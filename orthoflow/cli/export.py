@@ -11,7 +11,7 @@ from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import FORMATS, Format, check_choices
 from orthoflow.cli.exports.products import make_empty
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
+from orthoflow.cli.failures import code_for, say_error
 from orthoflow.cli.options import input_option, store_option
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError
@@ -176,10 +176,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
         else:
             said = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {said}")
-    if doubt := broken_seal(opened):
-        say_error(f"error: {doubt}; rely on nothing in {folder}")
-        return EXIT_RECORD_DIFFERS
-    return EXIT_GOOD
+    return code_for([broken_seal(opened)], f"rely on nothing in {folder}")
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Iterable
 from typing import Final
 
 import click
@@ -79,6 +80,15 @@ def say_error(*lines: str) -> None:
     """Write lines to standard error; a closed one is no reason to fail."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
+
+
+def code_for(doubts: Iterable[str], consequence: str) -> int:
+    """Tell which records are not as they were written and what follows, and give the exit code."""
+    told = [f"error: {doubt}; {consequence}" for doubt in doubts if doubt]
+    if not told:
+        return EXIT_GOOD
+    say_error(*told)
+    return EXIT_RECORD_DIFFERS
 
 
 def silence_stdout() -> None:

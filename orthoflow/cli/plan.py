@@ -63,8 +63,10 @@ def plan(
 
 
 def _noun(planned: Sequence[PlannedCell]) -> str:
-    """What a row is: where nothing varies, a step is its only cell."""
-    return "step" if all(item.cell.address == item.cell.step for item in planned) else "cell"
+    """What a row is."""
+    from orthoflow.workflow.cells import is_plain
+
+    return "step" if is_plain(item.cell for item in planned) else "cell"
 
 
 def _status(item: PlannedCell) -> tuple[str, str]:

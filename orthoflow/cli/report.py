@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
+from orthoflow.cli.failures import code_for
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError
 
@@ -46,5 +46,4 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
     else:
         write_report(opened, target, doubts=doubts)
     echo(f"report: {target}")
-    say_error(*(f"error: {doubt}; the page says so" for doubt in doubts.values()))
-    return EXIT_RECORD_DIFFERS if doubts else EXIT_GOOD
+    return code_for(doubts.values(), "the page says so")

@@ -10,7 +10,7 @@ import click
 
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.diagnosis import LIBRARIES
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
+from orthoflow.cli.failures import EXIT_GOOD, code_for
 from orthoflow.cli.options import json_option
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
@@ -21,6 +21,7 @@ from orthoflow.cli.tables import (
     echo_json,
     echo_table,
     echo_warnings,
+    first_rows,
     number,
     quality_place,
     say_more,
@@ -67,10 +68,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
         _print_environments(opened)
         _print_files(opened)
         echo("", f"whether all of it is as it was written, says `orthoflow verify {run}`")
-    if doubt := broken_seal(opened):
-        say_error(f"error: {doubt}; rely on nothing that is said of it here")
-        return EXIT_RECORD_DIFFERS
-    return EXIT_GOOD
+    return code_for([broken_seal(opened)], "rely on nothing that is said of it here")
 
 
 def _print_head(run: Run) -> None:
@@ -125,11 +123,9 @@ def _cell_status(cell: RecordedCell) -> str:
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
     told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
-    if most is not None and len(told) > most:
-        told.sort(key=lambda one: quality_place(one[1].name))
     rows = [
         (cell.address, metric.name, number(metric.value), metric.unit)
-        for cell, metric in told[:most]
+        for cell, metric in first_rows(told, most, lambda one: quality_place(one[1].name))
     ]
     if rows:
         echo()

@@ -6,8 +6,8 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.distances import Distance, ProductDistance
 
+Row = TypeVar("Row")
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
 # Of longer tables the rest is printed when it is asked for.
 ROWS_MOST: Final = 20
@@ -94,9 +95,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
         distances: of products.
         most: rows that are printed, those that differ first; all without it.
     """
-    told = list(distances)
-    if most is not None and len(told) > most:
-        told = sorted(told, key=lambda item: item.verdict == "identical")[:most]
+    told = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(
         ("product", "type", "verdict", "largest differences"),
         [
@@ -114,6 +113,13 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
     say_more(len(distances), most)
     echo(verdict_counts(distances))
+
+
+def first_rows(rows: Sequence[Row], most: int | None, place: Callable[[Row], int]) -> Sequence[Row]:
+    """Give the rows of a table that are printed: all, or the first by their place of too many."""
+    if most is None or len(rows) <= most:
+        return rows
+    return sorted(rows, key=place)[:most]
 
 
 def say_more(n_rows: int, most: int | None) -> None:

@@ -447,9 +447,7 @@ class Store:
         if publisher is None:
             return
         files = aside / "files"
-        files.mkdir()
-        publisher(product, files, digest)
-        require_plain_files(files, f"a {product.type_name}")
+        publish_into(files, product, publisher, digest)
         sync_tree(files)
 
     def _place(self, aside: Path, final: Path) -> None:
@@ -532,6 +530,13 @@ class Store:
                 f"cannot be set aside: {error}"
             ) from error
         return True
+
+
+def publish_into(folder: Path, product: Product, publisher: Publisher, digest: str) -> None:
+    """Let a product publish its files in a new folder: plain files alone."""
+    folder.mkdir(parents=True)
+    publisher(product, folder, digest)
+    require_plain_files(folder, f"a {product.type_name}")
 
 
 def digest_of(product: Product) -> str:

@@ -29,7 +29,7 @@ from orthoflow.records.crate_entities import (
 from orthoflow.records.datasets import pages_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating, figure_files, path_inside
-from orthoflow.records.runs import FIGURES_FOLDER, REPORT_FILE, Run
+from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, REPORT_FILE, Run
 from orthoflow.records.signatures import SIGNATURE_SUFFIX
 from orthoflow.version import DISTRIBUTION
 
@@ -116,7 +116,7 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
             shutil.copyfile(record.path, folder / RECORD_FILE)
     wanted = [REPORT_FILE, *pages_of(run).values()]
     # Which the report leads to, where it was written with them.
-    wanted += [f"{FIGURES_FOLDER}/{name}" for name in ("graph.svg", *figure_files(run, run.cells))]
+    wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
     if record is run and run.path.name == RECORD_FILE:
         wanted.append(f"{RECORD_FILE}{SIGNATURE_SUFFIX}")
     wanted += [

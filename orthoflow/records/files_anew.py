@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.file_digests import file_sha256
-from orthoflow.engine.objects import require_plain_files
+from orthoflow.engine.store import publish_into
 from orthoflow.products import Orthoimages, Walls
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
@@ -64,9 +64,7 @@ def _published(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
             if publish is None:
                 continue
             own = folder / str(len(found)) / port
-            own.mkdir(parents=True)
-            publish(run.product(address, port), own, output.digest)
-            require_plain_files(own, f"a {output.type_name}")
+            publish_into(own, run.product(address, port), publish, output.digest)
             files = sorted(path for path in own.rglob("*") if path.is_file())
             found.setdefault(address, {})[port] = {path: file_sha256(path) for path in files}
     return found

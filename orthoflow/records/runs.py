@@ -27,6 +27,7 @@ REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; take another copy of it, `orthoflow verify` says whether that one is whole"
 FIGURES_FOLDER: Final = "figures"
+GRAPH_FILE: Final = "graph.svg"
 # Of a run on several datasets, a page for each.
 PAGES_FOLDER: Final = "pages"
 

@@ -14,7 +14,7 @@ from orthoflow.files.plain_svg import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
 from orthoflow.records.run_files import figure_files, write_files
-from orthoflow.records.runs import FIGURES_FOLDER, Run
+from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
@@ -118,7 +118,7 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
     """
     named = figure_files(run, addresses)
     contents: dict[str, Callable[[], bytes | None]] = {
-        "graph.svg": lambda: run_diagram(run, stands_alone=True).encode("utf-8")
+        GRAPH_FILE: lambda: run_diagram(run, stands_alone=True).encode("utf-8")
     }
     contents |= {path: partial(_content, figure) for path, figure in named.items()}
     way = f"{inside}/" if inside else ""

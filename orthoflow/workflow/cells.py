@@ -159,6 +159,11 @@ def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
 
 
+def is_plain(cells: Iterable[Cell]) -> bool:
+    """Whether nothing varies, so that each step is its only cell."""
+    return all(cell.address == cell.step for cell in cells)
+
+
 def variants_text(assignment: Mapping[str, str]) -> str:
     """Say which variants are chosen, `plane=ransac, orient=pnp`; empty for none."""
     return ", ".join(f"{step}={variant}" for step, variant in assignment.items())

@@ -407,7 +407,7 @@ def _fit_block(
             depth adds.
         along: (3, 5) room for what is needed in between.
     """
-    for k in range(N_TERMS // 5):
+    for k in range(3):
         for r in range(3):
             f0, f1, f2 = nodes[0, r, 0, k], nodes[0, r, 1, k], nodes[0, r, 2, k]
             g0, g2 = nodes[1, r, 0, k] - f0, nodes[1, r, 2, k] - f2

@@ -19,14 +19,14 @@ from orthoflow_plugins.plane.assembling import (
     side_of_remaining,
     side_of_stations,
 )
-from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, verify
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, verify
 from orthoflow_plugins.plane.final_fit import label
 from orthoflow_plugins.plane.measuring import Deviations, measure_planes
 from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import PointCloud
-from tests.plane_scenes import cloud_of
+from tests.plane_scenes import RULES, cloud_of
 
 UP = np.array([0.0, 0.0, 1.0])
 # At y = 2, its normal to the south; 4 x 2 m about (0, 2, 0).
@@ -182,17 +182,6 @@ def test_without_other_points_no_side_is_told(n_points: int) -> None:
 # --- products ---
 
 ORIGIN = np.array([300.0, -200.0, 40.0])
-RULES = Rules(
-    find_m=0.05,
-    fit_m=0.015,
-    n_planes_most=10,
-    least_share=0.1,
-    stop_unclassified_share=0.05,
-    tilt_most_deg=10.0,
-    stop_rest_share=0.0,
-    is_exact=False,
-    joins_parts=True,
-)
 
 
 @dataclass(frozen=True)

@@ -9,29 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import final_fit
-from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, verify
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, verify
 from orthoflow_plugins.plane.final_fit import fit_to_all, label, name_points
 from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
 from orthoflow_plugins.plane.support import cell_for
 
 from orthoflow.geometry import Plane, angle_between_deg
-from tests.plane_scenes import Rectangle, cloud_of, sampled
+from tests.plane_scenes import RULES, Rectangle, cloud_of, sampled
 
 # Three quarters of the points and a quarter.
 WALLS = (
     Rectangle("south", (0, 2, 0), (2, 0, 0), (0, 0, 1), 30_000),
     Rectangle("west", (-2, 0, 0), (0, 2, 0), (0, 0, 1), 10_000),
-)
-RULES = Rules(
-    find_m=0.05,
-    fit_m=0.015,
-    n_planes_most=10,
-    least_share=0.1,
-    stop_unclassified_share=0.05,
-    tilt_most_deg=10.0,
-    stop_rest_share=0.0,
-    is_exact=False,
-    joins_parts=True,
 )
 
 
