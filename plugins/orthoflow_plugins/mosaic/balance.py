@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Camera, Layer, Wall
 from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means
 from orthoflow_plugins.mosaic.depth_edges import depth_edges_in
@@ -523,7 +524,7 @@ def _solved(
     for sweep in range(_SWEEPS):
         residuals = np.abs(apart - matrix @ found).mean(axis=1)
         for part in np.split(np.arange(len(apart)), ends[:-1]):
-            spread = max(_SPREAD_LEAST, 1.4826 * float(np.median(residuals[part])))
+            spread = max(_SPREAD_LEAST, median_deviation(residuals[part], 0.0))
             counted = min(1.0, _INDEPENDENT / len(part)) / spread**2
             # At first nothing is known of exposures, and what lies apart is no outlier.
             limit = np.inf if sweep == 0 else _OUTLIER * spread
