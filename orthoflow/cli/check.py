@@ -64,10 +64,10 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
     without_data = f", {skipped} of them skipped for lack of optional data" if skipped else ""
     n_data = len(loaded.chosen_data)
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
-    n_cells = "" if is_plain(cells) else f", {datasets}{counted(len(cells), 'cell')}"
+    n_runs = "" if is_plain(cells) else f", {datasets}run {counted(len(cells), 'time')} in all"
     summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"
-        f"{n_cells}{without_data}{_baseline_text(loaded)}"
+        f"{n_runs}{without_data}{_baseline_text(loaded)}"
     )
     return _Verdict(summary=summary, warnings=doubts_about(loaded))
 

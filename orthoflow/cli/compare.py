@@ -46,8 +46,8 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
     Says in what their inputs, workflows, parameters, versions and environments differ, and how
     far their metrics and products lie apart. A parameter with * was set, others are defaults.
-    Cells are the same when their addresses are, or else when each step that varies on their way
-    has one method with the same parameters; what only one run has is counted apart. Of long tables
+    Steps are the same when their addresses are, or else when all that varies on their way has one
+    method with the same parameters; what only one run has is counted apart. Of long tables
     the first rows are printed, of metrics those that say how good results are. --json has also
     what is equal. Ends with 3 where the seal of a record does not hold.
     """
@@ -101,7 +101,7 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
         echo(
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
-            f"seed {record.seed}, {counted(len(record.cells), 'cell')}"
+            f"seed {record.seed}, {counted(len(record.cells), 'step')}"
         )
     _print_pairs("inputs", comparison.inputs, _files_text, most)
     if comparison.workflow:
@@ -111,7 +111,7 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
-    _print_pairs("cells", comparison.cells, str, most)
+    _print_pairs("steps", comparison.cells, str, most)
     for theirs, ours in comparison.readdressed.items():
         echo(f"the same, though called otherwise: {ours} (A), {theirs} (B)")
     _print_pairs(
@@ -134,15 +134,7 @@ def _print_pairs(
     if not different:
         echo("", f"{title}: same")
         return
-    shared = [row for row in rows if row.is_shared]
-    alone = (
-        (sum(row.right is None for row in rows), "only in A"),
-        (sum(row.left is None for row in rows), "only in B"),
-    )
-    n_different = sum(not row.is_same for row in shared)
-    counts = [f"{n_different} of {len(shared)} differ"] if shared else []
-    counts += [f"{n} {where}" for n, where in alone if n]
-    echo("", f"{title}: {', '.join(counts)}")
+    echo("", f"{title}: {_counts(rows)}")
     echo_table(
         ("", "A", "B"),
         [
@@ -154,6 +146,18 @@ def _print_pairs(
         ],
     )
     say_more(len(different), most)
+
+
+# Any: rows of all kinds.
+def _counts(rows: Sequence[Pair[Any]]) -> str:
+    """Say in how many rows the runs differ."""
+    from orthoflow.records.comparison import Difference
+
+    found = Difference.of(rows)
+    counts = [f"{found.n_different} of {found.n_shared} differ"] if found.n_shared else []
+    alone = ((found.n_left, "only in A"), (found.n_right, "only in B"))
+    counts += [f"{n} {where}" for n, where in alone if n]
+    return ", ".join(counts) or "none"
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:
@@ -170,8 +174,8 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> No
     """Print every metric that differs; times and memory, which always do, apart and last."""
     for title, is_cost in (("metrics", False), ("times and memory", True)):
         chosen = [row for row in rows if row.either.is_cost == is_cost]
-        different = [row for row in chosen if _value(row.left) != _value(row.right)]
-        echo("", f"{title}: {len(different)} of {len(chosen)} differ")
+        different = [row for row in chosen if not row.is_same]
+        echo("", f"{title}: {_counts(chosen)}")
         if different:
             _print_numbers(first_rows(different, most, lambda row: quality_place(row.name)))
         say_more(len(different), most)
@@ -195,7 +199,3 @@ def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:
             for row in rows
         ],
     )
-
-
-def _value(side: ComparedMetric | None) -> float | None:
-    return None if side is None else side.value

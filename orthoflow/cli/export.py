@@ -66,12 +66,14 @@ _HELP: Final = "\n\n".join(
 @input_option
 @store_option
 @click.option(
+    "--step",
     "--cell",
+    "cell",
     metavar="ADDRESS",
-    help="colmap: the cell whose orientations are meant; without it the last one that oriented "
-    "photos. laz, copc, ply, e57: the cell that found the planes; without it the last one that "
-    "did. layers: the cell that laid photos onto walls, likewise. figures: the only cell that is "
-    "meant. gltf, tiles, sheet, dxf, geojson: the cell that made the orthoimages, likewise.",
+    help="colmap: the step whose orientations are meant; without it the last one that oriented "
+    "photos. laz, copc, ply, e57: the step that found the planes; without it the last one that "
+    "did. layers: the step that laid photos onto walls, likewise. figures: the only step that is "
+    "meant. gltf, tiles, sheet, dxf, geojson: the step that made the orthoimages, likewise.",
 )
 @click.option(
     "--license",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from inspect import signature
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from orthoflow.catalog.wording import did_you_mean
@@ -17,12 +15,11 @@ from orthoflow.cli.run import prepared
 from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
+    from orthoflow.products.product import JsonValue
     from orthoflow.report.notebooks import OpenedRun
 
 # Options that are no fields of the engine's.
 _POPPED: Final = ("set_files", "embed")
-_TABLE: Final = "datasets.csv"
-_SET: Final = "set"
 _OF_STEPS: Final = ("only", "from_", "until", "force")
 
 
@@ -49,7 +46,8 @@ def run(
             variant of each value.
         inputs: files by name of the input.
         datasets: a table of datasets, a CSV file; or what a workflow would say of them, `{"hall":
-            {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`.
+            {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a list of paths,
+            from the working directory.
         only_data: of these datasets only.
         output: folder of the run; `runs/<name>-<run id>` without one.
         store: folder of stored results.
@@ -67,7 +65,7 @@ def run(
         sets=tuple(f"{name}={json.dumps(value)}" for name, value in (set or {}).items()),
         set_files=_several(options.pop("set_files", ())),
         inputs=tuple(given),
-        datasets="" if isinstance(datasets, Mapping) else str(datasets),
+        datasets=_datasets(datasets),
         only_data=tuple(only_data),
     )
     embed = bool(options.pop("embed", False))
@@ -75,42 +73,34 @@ def run(
     # One step is as good as a list of one.
     options |= {name: _several(options[name]) for name in _OF_STEPS if name in options}
     folder = None if output is None else Path(output)
-    with TemporaryDirectory(prefix="orthoflow-") as scratch:
-        if isinstance(datasets, Mapping):
-            table = _written(datasets, Path(scratch) / _TABLE)
-            changes = replace(changes, datasets=str(table))
-        with prepared(str(workflow), changes, folder, Path(store), embed=embed, **options) as call:
-            made = call.make()
+    with prepared(str(workflow), changes, folder, Path(store), embed=embed, **options) as call:
+        made = call.make()
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.run.path)
 
 
 # Any: whatever somebody calls a dataset.
-def _written(datasets: Mapping[str, Any], table: Path) -> Path:
-    """Write a mapping of datasets as the table that says the same."""
-    rows: dict[str, dict[str, str]] = {}
-    for name, said in datasets.items():
-        if not isinstance(said, Mapping) or not isinstance(said.get(_SET, {}), Mapping):
-            raise ArgumentError(
-                f"the dataset {name} must be a mapping of inputs to files, and of {_SET} to "
-                f"parameters, got {said!r}"
-            )
-        files = {key: value for key, value in said.items() if key != _SET}
-        for key, value in files.items():
-            if not isinstance(value, str | Path):
-                raise ArgumentError(
-                    f"the input {key} of dataset {name} must be a path, got {value!r}; a folder or "
-                    "a pattern stands for several files"
-                )
-        rows[name] = {key: str(Path(value).absolute()) for key, value in files.items()}
-        rows[name] |= {key: json.dumps(value) for key, value in said.get(_SET, {}).items()}
-    columns = dict.fromkeys(key for row in rows.values() for key in row)
-    lines = [["name", *columns]]
-    lines += [[name, *(row.get(key, "") for key in columns)] for name, row in rows.items()]
-    with table.open("w", encoding="utf-8", newline="") as stream:
-        csv.writer(stream).writerows(lines)
-    return table
+def _datasets(given: str | Path | Mapping[str, Any]) -> str | Mapping[str, JsonValue]:
+    if isinstance(given, Mapping):
+        return {str(name): _said(said, f"datasets=[{name!r}]") for name, said in given.items()}
+    return str(given)
+
+
+# Any: likewise.
+def _said(value: Any, where: str) -> JsonValue:
+    """Give what a workflow file would hold of a value: paths as texts, any sequence as a list."""
+    if isinstance(value, Mapping):
+        return {str(key): _said(item, f"{where}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, str | bool | int | float | None):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Sequence):
+        return [_said(item, f"{where}[{index}]") for index, item in enumerate(value)]
+    raise ArgumentError(
+        f"{where} must be a path, a text, a number, a list or a mapping, got {value!r}"
+    )
 
 
 def _refuse_unknown(options: Mapping[str, object]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -12,6 +12,7 @@ import click
 
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
+    from orthoflow.products.product import JsonValue
     from orthoflow.workflow.format import Workflow
 
 # Any: click decorates functions as well as commands.
@@ -26,7 +27,7 @@ class Changes:
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
-    datasets: str
+    datasets: str | Mapping[str, JsonValue]
     only_data: tuple[str, ...]
     set_files: tuple[str, ...] = ()
 

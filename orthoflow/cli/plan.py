@@ -37,7 +37,7 @@ def plan(
     # Any: the fields of RunOptions, whose types click has checked.
     **selection: Any,
 ) -> int:
-    """Say for every cell of WORKFLOW whether its result is stored, and if not, why it would run.
+    """Say for every step of WORKFLOW whether its result is stored, and if not, why it would run.
 
     Nothing is computed. "unknown yet" means that it depends on results that are not there yet;
     some of its own are stored, and it may be one of these.
@@ -55,36 +55,21 @@ def plan(
         echo_json([_as_json(item) for item in planned])
         return EXIT_GOOD
     echo_table(
-        (_noun(planned), "method", "status", "reason"),
-        [(item.cell.address, item.cell.method, *_status(item)) for item in planned],
+        ("step", "method", "status", "reason"),
+        [(item.cell.address, item.cell.method, item.status, item.reason) for item in planned],
     )
     echo("", _summary(planned))
     return EXIT_GOOD
 
 
-def _noun(planned: Sequence[PlannedCell]) -> str:
-    """What a row is."""
-    from orthoflow.workflow.cells import is_plain
-
-    return "step" if is_plain(item.cell for item in planned) else "cell"
-
-
-def _status(item: PlannedCell) -> tuple[str, str]:
-    """What will happen to a cell, and why."""
-    # Of what never ran with this store nothing can be stored, whatever it will be given.
-    if item.status == "unknown yet" and item.took_s is None:
-        return "will run", "no result of its method is stored"
-    return item.status, item.reason
-
-
 def _summary(planned: Sequence[PlannedCell]) -> str:
-    said = [_status(item)[0] for item in planned]
+    said = [item.status for item in planned]
     counts = [
         f"{number} {status}"
         for status in ("cached", "will run", "unknown yet", "skipped")
         if (number := said.count(status))
     ]
-    return f"{counted(len(planned), _noun(planned))}: {', '.join(counts)}"
+    return f"{counted(len(planned), 'step')}: {', '.join(counts)}"
 
 
 def _as_json(item: PlannedCell) -> dict[str, object]:
@@ -92,8 +77,8 @@ def _as_json(item: PlannedCell) -> dict[str, object]:
         "cell": item.cell.address,
         "step": item.cell.step,
         "method": item.cell.method,
-        "status": _status(item)[0],
-        "reason": _status(item)[1],
+        "status": item.status,
+        "reason": item.reason,
         "key": item.key.key if item.key is not None else None,
         "params": dict(item.cell.params),
     }

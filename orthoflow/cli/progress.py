@@ -236,7 +236,7 @@ class LiveProgress:
 
         cells, now_s = self._state.cells(), time.monotonic()
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("cell", "state", "time", "left", ""):
+        for title in ("step", "state", "time", "left", ""):
             table.add_column(title, no_wrap=True, overflow="ellipsis")
         for address, cell in visible_cells(cells, self._console.height - 4).items():
             running = cell.state == "running"

@@ -219,7 +219,7 @@ def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> Non
     run, cells = made.run, made.run.record.cells
     echo()
     echo_table(
-        ("cell", "method", "status", "time", "remark"),
+        ("step", "method", "status", "time", "remark"),
         [
             (cell.address, cell.method, _status(cell, made.kept), _time(cell), _remark(cell))
             for cell in cells

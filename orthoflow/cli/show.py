@@ -40,7 +40,7 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 @click.option("--all", "is_whole", is_flag=True, help="Print every metric.")
 @json_option
 def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
-    """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment.
+    """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
 
     Of many metrics those that say how good results are are printed, with --all every one. Of a
     folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
@@ -93,13 +93,13 @@ def _status_text(run: Run) -> str:
         for status in ("ok", "failed", "skipped")
         if (count := sum(cell.status == status for cell in run.record.cells))
     ]
-    return f"{counted(len(run.record.cells), 'cell')}, {', '.join(counts)}"
+    return f"{counted(len(run.record.cells), 'step')}, {', '.join(counts)}"
 
 
 def _print_cells(run: Run) -> None:
     echo()
     echo_table(
-        ("cell", "method", "status", "time", "memory"),
+        ("step", "method", "status", "time", "memory"),
         [
             (
                 cell.address,
@@ -129,7 +129,7 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
     ]
     if rows:
         echo()
-        echo_table(("cell", "metric", "value", "unit"), rows)
+        echo_table(("step", "metric", "value", "unit"), rows)
         say_more(len(told), most)
 
 

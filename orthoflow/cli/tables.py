@@ -70,8 +70,8 @@ def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lay rows under a header, columns aligned.
 
-    >>> table_lines(("cell", "time"), [("cloud", "1.0 s")])
-    ['cell   time', 'cloud  1.0 s']
+    >>> table_lines(("step", "time"), [("cloud", "1.0 s")])
+    ['step   time', 'cloud  1.0 s']
     """
     # Escaped first: what is written out is longer.
     laid = [[shown(text) for text in row] for row in (header, *rows)]
@@ -194,8 +194,8 @@ def number(value: float) -> str:
 def counted(count: int, noun: str) -> str:
     """Say a number with its noun.
 
-    >>> counted(1, "cell"), counted(3, "cell")
-    ('1 cell', '3 cells')
+    >>> counted(1, "step"), counted(3, "step")
+    ('1 step', '3 steps')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 

@@ -37,6 +37,7 @@ CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]
 _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
+_FORCED: Final = "forced"
 # Of results that lost their objects so many are passed over.
 _MOST_LOOKED_AT: Final = 5
 # To start a process and to read and keep its products.
@@ -99,7 +100,8 @@ class PlannedCell:
 
     Attributes:
         cell: the cell.
-        status: `cached`, `will run`, `unknown yet` (its inputs are not known yet) or `skipped`.
+        status: `cached`, `will run`, `unknown yet` (its inputs are not known yet, and what it may
+            be given is in the store or not) or `skipped`.
         reason: why; names the ingredient that changed since the nearest earlier result.
         key: its key where its inputs are known, else None.
         inputs: port -> product where they are known.
@@ -244,6 +246,12 @@ class _Planner:
         planned = self._without_inputs(cell) or self._with_inputs(cell)
         is_run = planned.status in ("will run", "unknown yet")
         took_s = self._took_s(cell) if is_run else 0.0
+        if planned.status == "unknown yet" and cell.step in self.force:
+            planned = replace(planned, status="will run", reason=_FORCED)
+        elif planned.status == "unknown yet" and took_s is None and not self._is_known(cell.method):
+            # Of what never ran with this store nothing can be stored, whatever it will be given.
+            reason = "no result of its method is stored"
+            planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)
 
     def _without_inputs(self, cell: Cell) -> PlannedCell | None:
@@ -269,7 +277,7 @@ class _Planner:
         is_forced = cell.step in self.force
         result = None if is_forced else self.store.result(key.key)
         if result is None:
-            reason = "forced" if is_forced else self._why(cell, key)
+            reason = _FORCED if is_forced else self._why(cell, key)
             return PlannedCell(cell=cell, status="will run", reason=reason, key=key, inputs=refs)
         reason = f"in the store since {result.ended}"
         return PlannedCell(
@@ -302,6 +310,9 @@ class _Planner:
             found = next((result for result in results if result is not None), None)
             self._times[place] = None if found is None else found.wall_s + _START_S
         return self._times[place]
+
+    def _is_known(self, method: str) -> bool:
+        return any(self.store.result(item.key) is not None for item in self._before(method))
 
     def _before(self, method: str) -> tuple[Preimage, ...]:
         if method not in self._earlier:

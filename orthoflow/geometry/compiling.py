@@ -18,7 +18,6 @@ from typing import Any, Final, TypeVar, cast
 import numba
 from numba.core import event, sigutils, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
 
 from orthoflow.geometry.kept_kernels import KeptKernels
@@ -127,38 +126,22 @@ class _Compilation(event.Listener):
     def __init__(self) -> None:
         self._depth = 0
         self._n_begun = 0
-        self._n_known = 0
 
     def on_start(self, event: event.Event) -> None:
-        """Say what is compiled, and how many of this process are known to be needed so far."""
+        """Say what is compiled, and how many were in this process.
+
+        How many there will be nobody knows: what a step needs hangs on its data.
+        """
         kernel = event.data["dispatcher"]
-        if self._depth == 0:
-            self._n_known = self._n_begun + _uncompiled(kernel, set())
         self._depth += 1
         self._n_begun += 1
-        n_known = max(self._n_known, self._n_begun)
-        tell(f"compiling {self._n_begun} of {n_known} or more: {kernel.py_func.__name__}")
+        tell(f"compiling {kernel.py_func.__name__} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
         """Say that it is there."""
         self._depth -= 1
         if self._depth == 0:
             tell("")
-
-
-def _uncompiled(kernel: Dispatcher, looked_at: set[Dispatcher]) -> int:
-    """How many there are of a kernel and all that it calls, without what is compiled already.
-
-    What is put into its callers is not compiled for itself, but may call others.
-    """
-    if kernel in looked_at:
-        return 0
-    looked_at.add(kernel)
-    is_counted = not kernel.signatures and kernel.targetoptions.get("inline") != "always"
-    called = (kernel.py_func.__globals__.get(name) for name in kernel.py_func.__code__.co_names)
-    return is_counted + sum(
-        _uncompiled(item, looked_at) for item in called if isinstance(item, Dispatcher)
-    )
 
 
 event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]

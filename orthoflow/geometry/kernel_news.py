@@ -15,8 +15,8 @@ def heard_by(hear: Hear) -> Iterator[None]:
     """Tell a function of the kernels that are compiled while the block runs, in any thread.
 
     Args:
-        hear: gets `compiling 3 of 7 or more: NAME` when one is begun, and nothing, an empty text,
-            when it and all that it needs is there.
+        hear: gets `compiling NAME (3 so far)` when one is begun, and nothing, an empty text, when
+            it and all that it needs is there.
     """
     _listeners.append(hear)
     try:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 from orthoflow_provenance.digests import canonical_json
@@ -70,6 +70,35 @@ class Pair(Generic[Side]):
         if side is None:
             raise AssertionError("a pair stands for something that a run has")
         return side
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """In how many of some rows two runs differ.
+
+    Attributes:
+        n_different: rows of which both say something, and not the same.
+        n_shared: rows of which both say something.
+        n_left: rows of which only the first does.
+        n_right: rows of which only the second does.
+    """
+
+    n_different: int
+    n_shared: int
+    n_left: int
+    n_right: int
+
+    @classmethod
+    def of(cls, rows: Iterable[Pair[Any]]) -> Difference:
+        """Count rows."""
+        rows = tuple(rows)
+        shared = [row for row in rows if row.is_shared]
+        return cls(
+            n_different=sum(not row.is_same for row in shared),
+            n_shared=len(shared),
+            n_left=sum(row.right is None and row.left is not None for row in rows),
+            n_right=sum(row.left is None and row.right is not None for row in rows),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,21 +205,19 @@ class RunComparison:
     products: tuple[ProductDistance, ...]
 
     def __repr__(self) -> str:
-        differing = [
-            f"{sum(not row.is_same for row in rows)} of {len(rows)} {name}"
-            for name, rows in (
-                ("inputs", self.inputs),
-                ("parameters", self.shared(self.parameters)),
-                ("metrics", self.measured),
-            )
-        ]
+        counted = {
+            "inputs": Difference.of(self.inputs),
+            "parameters": Difference.of(self.shared(self.parameters)),
+            "metrics": Difference.of(self.measured),
+        }
+        differing = [f"{one.n_different} of {one.n_shared} {name}" for name, one in counted.items()]
         n_products = sum(item.verdict == "different" for item in self.products)
         n_unknown = sum(item.verdict == "not measured" for item in self.products)
         unknown = f" ({n_unknown} more not measured)" if n_unknown else ""
         differing.append(f"{n_products}{unknown} of {len(self.products)} products")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
         n_alone = sum(not row.is_shared for row in self.cells)
-        alone = f"; {n_alone} cells in one of them only" if n_alone else ""
+        alone = f"; {n_alone} steps in one of them only" if n_alone else ""
         return f"<RunComparison of {runs}: {', '.join(differing)} differ{alone}>"
 
     def _repr_html_(self) -> str:

@@ -195,7 +195,7 @@ class _Crate:
             "@type": "Dataset",
             "name": f"{record.name}, run {record.run_id}",
             "description": f"Run of the workflow {record.name} with {record.created_by}: "
-            f"{len(record.cells)} cells, {record.status}. {RECORD_FILE} is the record of all of "
+            f"{len(record.cells)} steps, {record.status}. {RECORD_FILE} is the record of all of "
             f"it. {_how_to_read(record)}",
             "datePublished": record.ended,
             "license": self.license_text,
@@ -406,7 +406,7 @@ class _Crate:
             "@id": _RUN,
             "@type": "CreateAction",
             "name": f"run {record.run_id} of {record.name}",
-            "description": f"{len(self._cells)} cells, seed {record.seed}",
+            "description": f"{len(self._cells)} steps, seed {record.seed}",
             "instrument": ref(WORKFLOW_FILE),
             "startTime": record.started,
             "endTime": record.ended,
@@ -466,7 +466,7 @@ def _source_id(source: str, outputs: Mapping[str, str]) -> str:
         return _input_id(name)
     if source not in outputs:
         raise RecordError(
-            f"the record says that {source} was taken, which no cell that ran gave: "
+            f"the record says that {source} was taken, which no step that ran gave: "
             "`orthoflow verify` says what else does not fit"
         )
     return outputs[source]

@@ -132,7 +132,7 @@ def _workflow(run: Run) -> Workflow:
     except WorkflowError as error:
         raise UnreplayableRunError((f"{run.path}: {error}",)) from error
     strangers = tuple(
-        f"{run.path}: its workflow has no cell {cell.address}"
+        f"{run.path}: its workflow has no step {cell.address}"
         for cell in run.record.cells
         if _variant(cell, workflow) is None
     )
@@ -212,7 +212,7 @@ class _MethodCheck:
     def add(self, cell: RecordedCell) -> None:
         """Check the method of one more cell."""
         if cell.seed is not None and cell.seed < 0:
-            _add(self.others, f"cell {cell.address}: a seed is not negative, got {cell.seed}")
+            _add(self.others, f"step {cell.address}: a seed is not negative, got {cell.seed}")
         try:
             cls = self.catalog.method(cell.method).load()
             for product in cell.outputs.values():
@@ -243,7 +243,7 @@ class _MethodCheck:
             name = ".".join(str(part) for part in first["loc"])
             _add(
                 self.others,
-                f"cell {cell.address}: the installed {cell.method} refuses the recorded "
+                f"step {cell.address}: the installed {cell.method} refuses the recorded "
                 f"parameter {name}: {first['msg']}",
             )
 

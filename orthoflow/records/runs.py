@@ -81,7 +81,7 @@ class Run:
         """
         if address not in self.cells:
             raise ArgumentError(
-                f"the run {self.record.run_id} has no cell {address!r}; it has "
+                f"the run {self.record.run_id} has no step {address!r}; it has "
                 f"{', '.join(self.cells)}"
             )
         return self.cells[address]
@@ -101,7 +101,7 @@ class Run:
     def __repr__(self) -> str:
         counts = Counter(cell.status for cell in self.record.cells)
         statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
-        return shown(f"<Run {self.record.name} in {self.folder}: {statuses or 'no cells'}>")
+        return shown(f"<Run {self.record.name} in {self.folder}: {statuses or 'no steps'}>")
 
     def metric_rows(self) -> tuple[MetricRow, ...]:
         """Every number of every cell, those that the engine measured included."""
@@ -116,7 +116,7 @@ class Run:
         figures = {figure.name: figure for figure in self.cell(address).figures}
         if name not in figures:
             raise ArgumentError(
-                f"the cell {address} has no figure {name!r}; it has "
+                f"the step {address} has no figure {name!r}; it has "
                 f"{', '.join(figures) or 'none at all'}"
             )
         return figures[name]
@@ -153,7 +153,7 @@ class Run:
         outputs = self.cell(address).outputs
         if port not in outputs:
             raise ArgumentError(
-                f"the cell {address} has no output {port!r}; it has "
+                f"the step {address} has no output {port!r}; it has "
                 f"{', '.join(outputs) or 'none at all'}"
             )
         if not outputs[port].embedded:

@@ -214,7 +214,7 @@ def _pictured(run: Run, cell: str | None) -> str:
     everything = [*found["orthoimages"], *found["walls"]]
     if cell not in everything:
         raise ArgumentError(
-            f"the cell {cell} holds no orthoimages or walls; those of this run: "
+            f"the step {cell} holds no orthoimages or walls; those of this run: "
             f"{', '.join(everything) or 'none'}"
         )
     return cell

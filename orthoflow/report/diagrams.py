@@ -130,7 +130,7 @@ def _state_words(cells: Sequence[RecordedCell]) -> str:
     if len(cells) == 1:
         return f"{cells[0].method}, {seconds}" if done else cells[0].status
     n_failed = sum(cell.status == "failed" for cell in cells)
-    return f"{len(cells)} cells, {seconds}" + (f", {n_failed} failed" if n_failed else "")
+    return f"run {len(cells)} times, {seconds}" + (f", {n_failed} failed" if n_failed else "")
 
 
 def _state(cells: Sequence[RecordedCell]) -> str:

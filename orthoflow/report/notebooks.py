@@ -77,7 +77,7 @@ class OpenedRun(Run):
 
     @cached_property
     def figures(self) -> Figures:
-        """All pictures of the methods, by `cell/name`; a notebook shows them."""
+        """All pictures of the methods, by `step/name`; a notebook shows them."""
         return Figures(
             {
                 f"{cell.address}/{figure.name}": figure
@@ -105,7 +105,7 @@ class OpenedRun(Run):
         chosen = cell or next(iter([*baseline, *places]), "")
         if chosen not in places:
             raise ArgumentError(
-                f"the run {self.record.run_id} has no orthoimages of {cell or 'any cell'}; cells "
+                f"the run {self.record.run_id} has no orthoimages of {cell or 'any step'}; steps "
                 f"with some: {', '.join(places) or 'none'}"
             )
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
@@ -149,7 +149,7 @@ class OpenedRun(Run):
         told = _html(", ".join(f"{count} {status}" for status, count in counts.items()))
         return (
             f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>"
-            f"cells: {told or 'none'}</p>"
+            f"steps: {told or 'none'}</p>"
             + (
                 f'<img alt="first orthoimage" src="{picture}" style="max-width:100%">'
                 if picture

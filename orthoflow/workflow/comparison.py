@@ -187,9 +187,9 @@ def require_few_cells(workflow: Workflow, count: int) -> None:
         of_what = "datasets, combinations" if n_data else "combinations"
         fewer = "fewer datasets (--only-data), fewer variants" if n_data else "fewer variants"
         raise WorkflowError(
-            f"the comparison of {workflow.name} has {count} cells ({of_what} of variants, and "
-            f"repeats), more than {MOST_CELLS}; use design: one-at-a-time, {fewer} or a "
-            "smaller repeat"
+            f"the comparison of {workflow.name} runs its steps {count} times ({of_what} of "
+            f"variants, and repeats), more than {MOST_CELLS}; use design: one-at-a-time, {fewer} "
+            "or a smaller repeat"
         )
 
 

@@ -6,10 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
-from orthoflow.files.yaml_positions import Entry, Table, join, plain
+from orthoflow.files.yaml_positions import (
+    Entry,
+    Position,
+    Table,
+    Value,
+    join,
+    plain,
+    unplaced,
+)
+from orthoflow.products.product import JsonValue
 from orthoflow.workflow.dataset_files import read_rows, read_text
 from orthoflow.workflow.format import (
     DATA,
@@ -26,6 +36,9 @@ from orthoflow.workflow.inputs import some_of
 from orthoflow.workflow.parameters import CallName, Override, assign_settings, resolve_params
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.steps import DraftStep
+
+# What a caller from Python wrote them behind.
+_ARGUMENT: Final = "datasets="
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,20 +61,25 @@ class DatasetReader:
     calls: Mapping[tuple[str, str], StepVariant]
     log: ProblemLog
 
-    def read(self, section: Entry | None, table: str) -> dict[str, Dataset]:
+    def read(
+        self, section: Entry | None, table: str | Mapping[str, JsonValue]
+    ) -> dict[str, Dataset]:
         """Read the table of `--datasets`, else the section, which may name a table itself.
 
         Args:
             section: of the workflow file.
-            table: of the command line, relative to the working directory; empty for none.
+            table: of the command line, relative to the working directory; empty for none. From
+                Python it may be what the section would say, with paths from there, too.
         """
+        if isinstance(table, Mapping):
+            return self._from_python(unplaced(dict(table)))
         if table:
             return self._from_table(
                 Path(table), table, partial(self.log.add_option, f"--datasets {table}")
             )
         if section is None:
             return {}
-        self._check_steps(section)
+        self._check_steps(section.position, self.log)
         found = DATASETS.shape.read(section.value, DATASETS.name, self.log)
         if isinstance(found, str):
             report = partial(self.log.add, section.value.position, DATASETS.name)
@@ -69,14 +87,20 @@ class DatasetReader:
         one = _OneFile(reader=self, log=self.log, path=DATASETS.name, folder=self.folder)
         return {entry.key: one.dataset(entry) for entry in found or ()}
 
-    def _check_steps(self, section: Entry) -> None:
+    def _check_steps(self, position: Position, log: ProblemLog) -> None:
         if any(step.name == DATA for step in self.steps):
-            self.log.add(
-                section.position,
+            log.add(
+                position,
                 DATASETS.name,
                 f"a step is called {DATA}, which stands for the dataset in addresses; give the "
                 "step another name",
             )
+
+    def _from_python(self, said: Value) -> dict[str, Dataset]:
+        log = self.log.beside(_ARGUMENT, "")
+        self._check_steps(said.position, log)
+        one = _OneFile(reader=self, log=log, path="", folder=Path.cwd(), is_given=True)
+        return {entry.key: one.dataset(entry) for entry in NAMED_DATASETS.read(said, "", log)}
 
     def _from_table(self, path: Path, name: str, report: partial[None]) -> dict[str, Dataset]:
         if any(step.name == DATA for step in self.steps):
@@ -106,6 +130,7 @@ class _OneFile:
         path: what stands before the names of datasets in problems.
         folder: what relative paths start from.
         table: the file's name, empty for the workflow itself.
+        is_given: its paths were given with the call, from the working directory.
     """
 
     reader: DatasetReader
@@ -113,6 +138,7 @@ class _OneFile:
     path: str
     folder: Path
     table: str = ""
+    is_given: bool = False
 
     def dataset(self, entry: Entry) -> Dataset:
         """Read one dataset."""
@@ -144,6 +170,7 @@ class _OneFile:
             name=f"{item.key}@{dataset.key}",
             files=FILES.shape.read(item.value, join(here, item.key), self.log) or (),
             folder=self.folder,
+            is_given=self.is_given,
             said_in=f"{self.table}:{dataset.position.line}" if self.table else "",
         )
 
@@ -167,8 +194,9 @@ class _OneFile:
 
     def _calls(self, settings: Table, here: str) -> dict[tuple[str, str], StepVariant]:
         reader = self.reader
-        assigned = assign_settings(settings, join(here, SET.name), reader.steps, self.log)
-        blame = partial(self.log.add, settings.position, join(here, SET.name))
+        path, is_column = join(here, SET.name), bool(self.table)
+        assigned = assign_settings(settings, path, reader.steps, self.log, is_column=is_column)
+        blame = partial(self.log.add, settings.position, path)
         calls = {}
         for step in reader.steps:
             for variant in step.variants:

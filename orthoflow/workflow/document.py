@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from orthoflow.alike import first_few
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Entry, Position, Table, plain, read_yaml
+from orthoflow.products.product import JsonValue
 from orthoflow.workflow.comparison import check_baseline, first_variants, read_compare
 from orthoflow.workflow.datasets import DatasetReader, choose_data
 from orthoflow.workflow.format import (
@@ -55,7 +57,7 @@ def load_workflow(
     *,
     sets: Sequence[str] = (),
     inputs: Sequence[str] = (),
-    datasets: str = "",
+    datasets: str | Mapping[str, JsonValue] = "",
     only_data: Sequence[str] = (),
     set_files: Sequence[str | Path] = (),
 ) -> Workflow:
@@ -66,7 +68,8 @@ def load_workflow(
         catalog: the installed plugins.
         sets: `step[.variant].param=value`, each as behind `--set`.
         inputs: `NAME=PATH`, each as behind `--input`; relative to the working directory.
-        datasets: a table in the place of the file's datasets, as behind `--datasets`.
+        datasets: a table in the place of the file's datasets, as behind `--datasets`, or what the
+            file would say of them.
         only_data: names of datasets, each as behind `--only-data`.
         set_files: YAML files of `step.parameter: value`, as behind `--set-file`; what stands
             behind `--set` goes before them.
@@ -124,7 +127,7 @@ class _Options:
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
-    datasets: str
+    datasets: str | Mapping[str, JsonValue]
     only_data: tuple[str, ...]
     profiles: tuple[_Profile, ...]
 
@@ -236,8 +239,11 @@ class _Reader:
         yield from (f"--set {text}" for text in self.options.sets)
 
     def _data_options(self) -> Iterator[str]:
-        if self.options.datasets:
-            yield f"--datasets {Path(self.options.datasets).name}"
+        datasets = self.options.datasets
+        if isinstance(datasets, Mapping):
+            yield f"datasets={first_few(list(datasets))}"
+        elif datasets:
+            yield f"--datasets {Path(datasets).name}"
         yield from (f"--only-data {text}" for text in self.options.only_data)
 
     def _name(self, table: Table) -> str:

@@ -352,7 +352,10 @@ METRICS: Final = Key(
 COMPARISON: Final = Section(
     words="a mapping",
     about="Variants fan out: every step behind them runs once per combination that really "
-    "differs. Without a comparison only the baseline runs, the first variant of each step.",
+    "differs. Tables list each of these runs as a step of its own, by its address: the step, the "
+    "variants that make it and the repeat, `ortho@plane=ransac,orient=pnp#2`; columns and keys of "
+    "files call the address `cell`. Without a comparison only the baseline runs, the first variant "
+    "of each step.",
     keys=(DESIGN, BASELINE, EXCLUDE, METRICS),
 )
 

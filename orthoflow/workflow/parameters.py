@@ -74,29 +74,36 @@ def assign_overrides(
 
 
 def assign_settings(
-    settings: Table, path: str, steps: Sequence[DraftStep], log: ProblemLog
+    settings: Table,
+    path: str,
+    steps: Sequence[DraftStep],
+    log: ProblemLog,
+    *,
+    is_column: bool = False,
 ) -> Mapping[CallName, tuple[Override, ...]]:
     """Find the method calls that each `step.parameter: value` of a mapping means.
 
     Args:
         settings: the mapping.
-        path: what stands before its keys in problems of values; those of keys bear the key alone,
-            so that a column of a table is told of once.
+        path: what stands before its keys in problems.
         steps: of the workflow.
         log: takes the problems.
+        is_column: the keys are columns of a table; problems of these bear the key alone, so that
+            they are told of once.
     """
     assigned: dict[CallName, list[Override]] = {}
     for entry in settings:
+        here = entry.key if is_column else join(path, entry.key)
         parts = entry.key.split(".")
         if len(parts) < 2 or not all(parts):
-            log.add(entry.position, entry.key, "expected step.parameter or step.variant.parameter")
+            log.add(entry.position, here, "expected step.parameter or step.variant.parameter")
             continue
         report = partial(log.add, entry.value.position, join(path, entry.key))
         try:
             for call, override in _targets(report, parts, plain(entry.value), steps):
                 assigned.setdefault(call, []).append(override)
         except ArgumentError as error:
-            log.add(entry.position, entry.key, str(error))
+            log.add(entry.position, here, str(error))
     return {call: tuple(overrides) for call, overrides in assigned.items()}
 
 

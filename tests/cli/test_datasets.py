@@ -126,7 +126,7 @@ def test_some_of_the_datasets_can_be_run_alone(folder: Path) -> None:
 
 def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) -> None:
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "rooms.csv")
-    assert done.stdout == "rooms is fine: 4 steps, 3 datasets, 8 cells\n"
+    assert done.stdout == "rooms is fine: 4 steps, 3 datasets, run 8 times in all\n"
     (folder / "gone.csv").write_text("name,number\nhall,data/hall.txt\na,a.txt\nb,b.txt\n")
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "gone.csv")
     assert done.returncode == 2

@@ -83,8 +83,8 @@ def test_every_figure_is_written_on_demand(studio: Studio) -> None:
     assert done.exit_code == 0, done.output
     assert "0 figures and the graph" in done.stdout
     assert (studio.folder / "first" / "export" / "figures" / "graph.svg").is_file()
-    refused = studio("export", "first", "--to", "figures", "--cell", "nowhere", "-o", "other")
-    assert (refused.exit_code, "has no cell 'nowhere'" in refused.stderr) == (2, True)
+    refused = studio("export", "first", "--to", "figures", "--step", "nowhere", "-o", "other")
+    assert (refused.exit_code, "has no step 'nowhere'" in refused.stderr) == (2, True)
 
 
 def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:

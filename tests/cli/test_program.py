@@ -108,7 +108,7 @@ def test_help_names_every_command_and_every_exit_code() -> None:
     listed = [line.split()[0] for line in shown.partition("Commands:")[2].splitlines() if line]
     assert listed == COMMANDS
     words = " ".join(shown.split())
-    for code in ("0 good", "1 some cell failed", "2 the workflow", "3 a record", "4 a plugin"):
+    for code in ("0 good", "1 some step failed", "2 the workflow", "3 a record", "4 a plugin"):
         assert code in words
     assert "130 interrupted" in words
 

@@ -324,7 +324,7 @@ def test_show_tells_cells_metrics_warnings_and_environment(
     finished: tuple[Path, str, str],
 ) -> None:
     shown = orthoflow(finished[0], "show", "good").stdout
-    assert "2 cells, 2 ok" in shown.splitlines()[0]
+    assert "2 steps, 2 ok" in shown.splitlines()[0]
     assert "overrides: --set survey.offset_m=-3" in shown
     assert "input number: not given" in shown
     assert "warning, survey: the plane lies behind the viewer" in shown
@@ -443,7 +443,9 @@ def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -
         f"{text.replace('use: paint.plain', swept)}compare: {{design: product}}\n", encoding="utf-8"
     )
     done = orthoflow(tmp_path, "check", "studio.yaml")
-    assert done.stdout.endswith("3 cells; baseline paint=rough\n"), done.stdout + done.stderr
+    assert done.stdout.endswith("run 3 times in all; baseline paint=rough\n"), (
+        done.stdout + done.stderr
+    )
     done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "out")
     assert "baseline: paint=rough, with which the others are compared" in done.stdout.splitlines()
 

@@ -139,7 +139,7 @@ def test_json_and_csv_have_every_number(runs: Path) -> None:
 def test_a_folder_of_runs_is_shown_as_their_table(runs: Path) -> None:
     assert said("show", "runs") == said("runs", "runs")
     assert json.loads(said("show", "runs", "--json")) == json.loads(said("runs", "runs", "--json"))
-    assert said("show", "runs/a").startswith("hall, run r1: 2 cells")
+    assert said("show", "runs/a").startswith("hall, run r1: 2 steps")
     assert asked("show", "runs/going").exit_code == 2
 
 

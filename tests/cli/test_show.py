@@ -29,7 +29,7 @@ def test_a_run_without_metrics_has_no_table_of_them(capsys: pytest.CaptureFixtur
     told = cell("a", metrics=(Metric(name="rms_mm", value=1.5, unit="mm"),))
     assert shown(module._print_metrics, run_of(told), capsys) == [
         "",
-        "cell  metric  value  unit",
+        "step  metric  value  unit",
         "a     rms_mm  1.5    mm",
     ]
 
@@ -49,8 +49,8 @@ def test_of_many_metrics_those_that_say_how_good_results_are_stand_first(
 
 def test_cells_are_counted_by_what_became_of_them() -> None:
     cells = [cell("a"), cell("b", status="skipped"), cell("c"), cell("d", status="failed")]
-    assert module._status_text(run_of(*cells)) == "4 cells, 2 ok, 1 failed, 1 skipped"
-    assert module._status_text(run_of(cell("a"))) == "1 cell, 1 ok"
+    assert module._status_text(run_of(*cells)) == "4 steps, 2 ok, 1 failed, 1 skipped"
+    assert module._status_text(run_of(cell("a"))) == "1 step, 1 ok"
 
 
 def test_files_that_are_gone_are_counted(

@@ -153,17 +153,17 @@ def different_runs() -> RunComparison:
 
 
 HEADS = [
-    "A: room, run r1, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 1, 1 cell",
-    "B: room, run r2, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 9, 0 cells",
+    "A: room, run r1, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 1, 1 step",
+    "B: room, run r2, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 9, 0 steps",
 ]
 
 
 def test_equal_runs_are_said_to_be_equal(capsys: pytest.CaptureFixture[str]) -> None:
     _print(same_runs())
-    titles = ["inputs", "workflow", "options", "cells", "parameters (* set, others are defaults)"]
+    titles = ["inputs", "workflow", "options", "steps", "parameters (* set, others are defaults)"]
     lines = [f"{title}: same" for title in [*titles, "environment"]]
     lines[1] = "workflow: same text"
-    lines += ["metrics: 0 of 0 differ", "times and memory: 0 of 0 differ", "products"]
+    lines += ["metrics: none", "times and memory: none", "products"]
     spaced = [text for line in lines for text in ("", line)]
     assert printed(capsys) == [*HEADS, *spaced, "0 products"]
 
@@ -192,7 +192,7 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
         "  A        B",
         "  a=1 b=2",
         "",
-        "cells: 1 of 1 differ, 1 only in B",
+        "steps: 1 of 1 differ, 1 only in B",
         f"   {'A'.ljust(len(fine))}  B",
         f"a  {fine}  {failed}",
         f"b  {'-'.ljust(len(fine))}  {fine}",
@@ -205,7 +205,7 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
         "        A     B",
         "python  3.11  -",
         "",
-        "metrics: 2 of 3 differ",
+        "metrics: 1 of 2 differ, 1 only in B",
         "metric    A    B     B - A  unit",
         "a.rms_mm  1.5  1.25  -0.25  mm",
         "a.max_mm  -    2            mm",
@@ -426,7 +426,7 @@ TARGETS = (*FORMATS, None)
         (
             {"cell": "a"},
             {*FORMATS} - {"csv", "prov", "ro-crate", "stac"},
-            "--cell belongs to --to colmap",
+            "--step belongs to --to colmap",
         ),
         ({"license_text": ""}, {"ro-crate"}, "--license belongs to --to ro-crate"),
         ({"author": "A"}, {"ro-crate"}, "--author belongs to --to ro-crate"),

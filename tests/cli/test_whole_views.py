@@ -28,13 +28,13 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
     wall = "wall@plane=hough2d,orient=pnp#2"
     sha256 = record.inputs[0].files[0].sha256[:12]
     rows = [
-        ("cell", "method", "status", "time   memory"),
+        ("step", "method", "status", "time   memory"),
         ("cloud", "read.scan 0.1.0", "ok (cached from earlier-run)", "1.5 s  64 MiB"),
         (wall, "raster.grid 0.1.0", "ok", "1.5 s  64 MiB"),
         ("ortho", "ortho.pointcloud-direct", "failed", ""),
     ]
     assert said("show", path).splitlines() == [
-        "court-yard, run 20250102-abc: 3 cells, 2 ok, 1 failed",
+        "court-yard, run 20250102-abc: 3 steps, 2 ok, 1 failed",
         "2025-01-02T03:04:05Z to 2025-01-02T03:05:05Z, orthoflow 0.1.0, seed 7",
         "overrides: wall.gsd_m=0.01",
         f"input scan: hall.laz, 1.0 TiB, sha256 {sha256}",
@@ -44,7 +44,7 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
         "ortho failed: no cell has enough points",
         f"warning, {wall}: the scan has no intensity",
         "",
-        f"{'cell':31}  metric  value  unit",
+        f"{'step':31}  metric  value  unit",
         f"{wall}  rms_mm  1.25   mm",
         f"{wall}  cells   5400   1",
         "",
@@ -149,16 +149,16 @@ def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     assert asked == [(tmp_path, None, False), (tmp_path, 2.5, True), (tmp_path, None, False)]
 
 
-def planned(status: str, *, key: object = None, took_s: float | None = 1.0) -> Any:
+def planned(status: str, *, key: object = None) -> Any:
     cell = SimpleNamespace(address=f"a@b={status}", step="a", method="a.b", params={"n": 1})
-    return SimpleNamespace(status=status, reason="so", cell=cell, key=key, took_s=took_s)
+    return SimpleNamespace(status=status, reason="so", cell=cell, key=key)
 
 
 def test_a_plan_is_summed_up_by_status() -> None:
     assert _summary([]) == "0 steps: "
     statuses = ("skipped", "cached", "will run", "cached", "unknown yet")
     assert _summary([planned(status) for status in statuses]) == (
-        "5 cells: 2 cached, 1 will run, 1 unknown yet, 1 skipped"
+        "5 steps: 2 cached, 1 will run, 1 unknown yet, 1 skipped"
     )
     assert _as_json(planned("cached", key=SimpleNamespace(key="abc"))) == {
         "cell": "a@b=cached",
@@ -170,12 +170,3 @@ def test_a_plan_is_summed_up_by_status() -> None:
         "params": {"n": 1},
     }
     assert _as_json(planned("will run"))["key"] is None
-    # What never ran before is in no store, whatever it will be given.
-    new = planned("unknown yet", took_s=None)
-    assert _summary([new]) == "1 cell: 1 will run"
-    assert (_as_json(new)["status"], _as_json(new)["reason"]) == (
-        "will run",
-        "no result of its method is stored",
-    )
-    new.cell.address = new.cell.step
-    assert _summary([new]) == "1 step: 1 will run"

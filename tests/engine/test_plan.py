@@ -235,8 +235,8 @@ def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
 def test_a_first_plan_knows_only_the_first_step(world: World) -> None:
     assert world.status(CHAIN) == {
         "first": ("will run", "never ran before"),
-        "second": ("unknown yet", "needs first, which will run"),
-        "third": ("unknown yet", "needs second, which is not known yet"),
+        "second": ("will run", "no result of its method is stored"),
+        "third": ("will run", "no result of its method is stored"),
     }
     assert not world.store.folder.exists()
 
@@ -273,6 +273,11 @@ def test_forced_steps_run_and_equal_results_end_it_there(world: World) -> None:
     run(world, CHAIN)
     status = world.status(CHAIN, force=("second",))
     assert status["second"] == ("will run", "forced")
+    assert status["third"] == ("unknown yet", "needs second, which will run")
+    status = world.status(CHAIN, force=("first",))
+    assert status["second"] == ("unknown yet", "needs first, which will run")
+    assert status["third"] == ("unknown yet", "needs second, which is not known yet")
+    assert world.status(CHAIN, force=("first", "third"))["third"] == ("will run", "forced")
     outcome = world.run(CHAIN, into="again", executor="inline", force=("second",))
     assert set(outcome.cached) == {"first", "third"}
     assert outcome.results["second"].run_id == outcome.run_id

@@ -131,7 +131,7 @@ KNOWN: Final = {
         target="WORKFLOW",
         file="w.yaml",
         content=_variants(12, 10).encode(),
-        words=r"has \d{13} cells .* more than 20000",
+        words=r"steps \d{13} times .* more than 20000",
     ),
     "cells by repeats": Known(
         target="WORKFLOW",
@@ -141,7 +141,7 @@ KNOWN: Final = {
                 "v1: {use: plane.hough2d}", "v1: {use: plane.ransac, repeat: 9999}"
             )
         ).encode(),
-        words="has 20012 cells",
+        words="steps 20012 times",
     ),
     "brackets": Known(
         target="WORKFLOW",

@@ -50,7 +50,7 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     assert not any(changes(studio, "again").values())
     assert verdicts(studio, "again") == [("survey", "identical", []), ("paint", "identical", [])]
     shown = studio("compare", "first", "again").stdout
-    for line in ("inputs: same", "workflow: same text", "cells: same", "environment: same"):
+    for line in ("inputs: same", "workflow: same text", "steps: same", "environment: same"):
         assert line in shown.splitlines()
     assert "metrics: 0 of 2 differ" in shown.splitlines()
     assert shown.splitlines()[-1] == "2 products: 2 identical"
@@ -85,9 +85,9 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
         ("paint", "identical"),
     ]
     assert {row.cell for row in told.shared(told.parameters)} == {"survey", "paint"}
-    assert repr(told).endswith("differ; 2 cells in one of them only>")
+    assert repr(told).endswith("differ; 2 steps in one of them only>")
     shown = studio("compare", "first", "swept").stdout
-    assert "cells: 0 of 2 differ, 2 only in B" in shown
+    assert "steps: 0 of 2 differ, 2 only in B" in shown
     assert "the same, though called otherwise: paint (A), paint@paint=grey-128 (B)" in shown
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 

@@ -318,7 +318,7 @@ def test_what_no_cell_gave_is_told(studio: Studio) -> None:
     record = open_run(studio.folder / "first").record
     without = replace(record, cells=tuple(cell for cell in record.cells if cell.step != "survey"))
     assert len(without.cells) < len(record.cells)
-    with pytest.raises(RecordError, match=r"survey\.planes was taken, which no cell that ran gave"):
+    with pytest.raises(RecordError, match=r"survey\.planes was taken, which no step that ran gave"):
         crate_metadata(without, [], license_text="none")
 
 

@@ -444,7 +444,7 @@ def test_parameters_that_fit_their_key_and_not_their_method_are_refused(
     assert verify_run(run).findings == ()
     done = finished("replay", run, "-o", "again")
     assert done.exit_code == 3, done.output
-    assert f"cell paint: the installed paint.plain refuses the recorded {refused}" in done.stderr
+    assert f"step paint: the installed paint.plain refuses the recorded {refused}" in done.stderr
     assert not Path("again").exists()
 
 

@@ -128,10 +128,10 @@ def test_a_drawing_is_as_wide_as_its_boxes_and_lanes() -> None:
         ([cell()], "a.b, 2 s", "ok"),
         ([cell("skipped")], "skipped", "skipped"),
         ([cell("failed")], "failed", "failed"),
-        ([cell(), cell(wall_s=3.0)], "2 cells, 5 s", "ok"),
-        ([cell(), cell("failed", 9.0), cell("failed")], "3 cells, 2 s, 2 failed", "failed"),
-        ([cell("skipped"), cell("skipped")], "2 cells, 0 s", "skipped"),
-        ([cell("skipped"), cell()], "2 cells, 2 s", "ok"),
+        ([cell(), cell(wall_s=3.0)], "run 2 times, 5 s", "ok"),
+        ([cell(), cell("failed", 9.0), cell("failed")], "run 3 times, 2 s, 2 failed", "failed"),
+        ([cell("skipped"), cell("skipped")], "run 2 times, 0 s", "skipped"),
+        ([cell("skipped"), cell()], "run 2 times, 2 s", "ok"),
     ],
 )
 def test_a_box_says_what_became_of_its_cells(cells: list[Any], words: str, state: str) -> None:

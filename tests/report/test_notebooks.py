@@ -58,7 +58,7 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     html = run._repr_html_()
     assert len(html) < 5_000
     assert "points to their plane, RMS" in html
-    assert "cells: 4 ok" in html
+    assert "steps: 4 ok" in html
     assert "&lt;Run" not in html
     assert "\x1b" not in html
 
@@ -149,7 +149,7 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
     assert image.file is None
     with pytest.raises(ArgumentError, match="mosaic has no orthoimage of wall 0; walls: 3, 8"):
         run.orthoimage(0)
-    with pytest.raises(ArgumentError, match="no orthoimages of first; cells with some: mosaic"):
+    with pytest.raises(ArgumentError, match="no orthoimages of first; steps with some: mosaic"):
         run.orthoimage(cell="first")
 
 
@@ -209,12 +209,14 @@ def test_what_is_wrong_with_a_workflow_is_raised(
     for files in ("fine.yaml", [tmp_path / "fine.yaml"]):
         with pytest.raises(OrthoflowError, match=r"fine\.yaml:2:1: .*there is no parameter gsd in"):
             orthoflow.run("direct.yaml", set_files=files)
-    # A mapping of datasets is what a table of them says.
+    # What is wrong with a mapping of datasets is placed in what its author wrote.
     for said, message in (
-        ({"set": {"plane.tolerance": 0.1}}, "there is no parameter tolerance in"),
-        ({"scan": "missing.e57"}, r"missing\.e57"),
-        ({"scan": ["a.e57", "b.e57"]}, "the input scan of dataset hall must be a path"),
-        (0.1, "the dataset hall must be a mapping of inputs to files"),
+        ({"set": {"plane.tolerance": 1}}, r"^datasets=: hall\.set\.plane\.tolerance: there is no "),
+        ({"scna": "a.e57"}, r"^datasets=: hall\.scna: there is no input scna \(did you mean scan"),
+        ({"scan": ["a.e57", Path("b.e57")]}, r"^input scan@hall: there is no file a\.e57 in the w"),
+        ({"scan": 1}, r"^datasets=: hall\.scan: expected a text, got 1"),
+        (0.1, r"^datasets=: hall: expected a mapping, got 0\.1"),
+        ({"scan": {1}}, r"^datasets=\['hall'\]\['scan'\] must be a path, a text, .* got \{1\}"),
     ):
         with pytest.raises(OrthoflowError, match=message):
             orthoflow.run("direct.yaml", datasets={"hall": said})  # type: ignore[dict-item]

@@ -526,7 +526,7 @@ def test_the_diagram_of_many_cells_has_a_box_per_step() -> None:
     drawing = run_diagram(run(*cells))
     assert drawing.count("<rect") == 2
     assert drawing.count('class="arrow"') == 1
-    assert "40 cells, 40.0 s" in drawing
+    assert "run 40 times, 40.0 s" in drawing
 
 
 def test_depths_run_from_blue_over_white_to_red() -> None:

@@ -448,7 +448,7 @@ def test_more_than_two_dozen_cells_become_a_box_per_step(n_cells: int, n_boxes: 
     drawing = run_diagram(run(*cells))
     assert drawing.count("<rect") == n_boxes
     if n_boxes == 1:
-        assert "plane: 25 cells, 22.0 s, 3 failed<" in drawing
+        assert "plane: run 25 times, 22.0 s, 3 failed<" in drawing
 
 
 def test_a_box_of_some_cached_cells_is_not_cached() -> None:

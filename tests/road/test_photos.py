@@ -103,14 +103,14 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
     cameras = orthoflow.open_run(quick.folder / "run").product("orient", "cameras").cameras
     ended = quick("export", "run", "--to", "colmap", "-o", "model")
     assert ended.code == 0, ended.said
-    assert "note: the orientations of orient; --cell takes others: first" in ended.said
+    assert "note: the orientations of orient; --step takes others: first" in ended.said
     assert ended.out.startswith(f"colmap: model: {len(cameras)} photos, 1 camera, ")
     assert ended.out.rstrip().endswith(" of orient")
     scene = pycolmap.Reconstruction(str(quick.folder / "model"))
     centres = {image.name: image.projection_center() for image in scene.images.values()}
     for camera in cameras:
         np.testing.assert_allclose(centres[camera.photo], camera.viewing().centre_world, atol=1e-9)
-    first = quick("export", "run", "--to", "colmap", "--cell", "first")
+    first = quick("export", "run", "--to", "colmap", "--step", "first")
     assert first.code == 0, first.said
     assert (quick.folder / "run" / "export" / "colmap" / "images.txt").is_file()
 
@@ -162,11 +162,11 @@ def test_the_orthoimages_are_handed_over(quick: Shell, target: str, file: str) -
     ("arguments", "sentence"),
     [
         (
-            ("--to", "colmap", "--cell", "wall", "-o", "elsewhere"),
-            "the cell wall holds no orientations; those",
+            ("--to", "colmap", "--step", "wall", "-o", "elsewhere"),
+            "the step wall holds no orientations; those",
         ),
-        (("--to", "colmap", "--cell", "wal", "-o", "elsewhere"), "has no cell 'wal'"),
-        (("--to", "laz", "--cell", "wall"), "the cell wall holds no labels of points; those"),
+        (("--to", "colmap", "--step", "wal", "-o", "elsewhere"), "has no step 'wal'"),
+        (("--to", "laz", "--step", "wall"), "the step wall holds no labels of points; those"),
         (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
         (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', "),
         (("--to", "ply", "--wall", "99"), "--wall 99: the run has "),

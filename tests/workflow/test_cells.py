@@ -351,7 +351,7 @@ steps:
           variants: {{{variants.replace("plane.ransac", "raster.grid")}}}}}
 compare: {{}}
 """
-    with pytest.raises(WorkflowError, match=r"flow has 40201 cells .*one-at-a-time"):
+    with pytest.raises(WorkflowError, match=r"flow runs its steps 40201 times .*one-at-a-time"):
         cells_of(text, write, catalog)
 
 

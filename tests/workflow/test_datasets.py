@@ -280,15 +280,15 @@ MAPPINGS = {
     ),
     "unknown step": (
         "datasets: {hall: {set: {walls.gsd_m: 1}}}",
-        "rooms.yaml:18:25: walls.gsd_m: there is no step walls (did you mean wall?)",
+        "rooms.yaml:18:25: datasets.hall.set.walls.gsd_m: there is no step walls (did you mean wall?)",
     ),
     "unknown parameter": (
         "datasets: {hall: {set: {wall.gsd: 1}}}",
-        "rooms.yaml:18:25: wall.gsd: there is no parameter gsd in raster.grid",
+        "rooms.yaml:18:25: datasets.hall.set.wall.gsd: there is no parameter gsd in raster.grid",
     ),
     "no parameter": (
         "datasets: {hall: {set: {wall: 1}}}",
-        "rooms.yaml:18:25: wall: expected step.parameter or step.variant.parameter",
+        "rooms.yaml:18:25: datasets.hall.set.wall: expected step.parameter or step.variant.parameter",
     ),
     "value out of range": (
         "datasets: {hall: {set: {wall.gsd_m: -1}}}",
@@ -460,7 +460,7 @@ def test_more_cells_than_anybody_can_run_are_counted_before_they_are_built(
 ) -> None:
     rows = "".join(f"r{index},hall.e57\n" for index in range(4000))
     workflow = load(ROOMS, catalog, datasets=table(f"name,scan\n{rows}"))
-    with pytest.raises(WorkflowError, match=r"has 20001 cells .* fewer datasets \(--only-data\)"):
+    with pytest.raises(WorkflowError, match=r"steps 20001 times .* fewer datasets \(--only-data\)"):
         expand_cells(workflow, catalog)
 
 

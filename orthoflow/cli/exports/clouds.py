@@ -136,7 +136,7 @@ def _found(run: Run, chosen: Choices) -> _Found:
         taken = [item.digest for item in recorded.inputs.values() if item.type_name == "cloud"]
         if len(taken) != 1:
             raise ArgumentError(
-                f"the cell {address} labels no cloud of its own: it takes {len(taken)} clouds"
+                f"the step {address} labels no cloud of its own: it takes {len(taken)} clouds"
             )
         labels = product_of(run, digest, PointLabels, chosen.store)
         digest = taken[0]

@@ -55,7 +55,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "csv": Format(
         writer="results:export_csv",
-        summary="tables of cells, metrics, parameters, inputs, products and environments",
+        summary="tables of steps, metrics, parameters, inputs, products and environments",
     ),
     "dxf": Format(
         writer="drawings:export_dxf",
@@ -142,7 +142,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 # Of the options that belong to formats, how they are written. `embed` and `inputs` are apart.
 FLAGS: Final = {
-    "cell": "--cell",
+    "cell": "--step",
     "license_text": "--license",
     "author": "--author",
     "colour": "--colour",

@@ -71,7 +71,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
         run.cell(cell)
         if cell not in found:
             raise ArgumentError(
-                f"the cell {cell} holds no {named}; those of this run: {', '.join(found) or 'none'}"
+                f"the step {cell} holds no {named}; those of this run: {', '.join(found) or 'none'}"
             )
         return cell, found[cell]
     if not found:
@@ -79,7 +79,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     *others, last = found
     if others:
         few = first_few(others, most=_MOST_NAMED)
-        say_error(f"note: the {named} of {last}; --cell takes others: {few}")
+        say_error(f"note: the {named} of {last}; --step takes others: {few}")
     return last, found[last]
 
 

@@ -76,7 +76,7 @@ def _check_counts(planes: Planes) -> None:
     if len(planes) > MOST_PLANES or n_parts > MOST_PARTS:
         raise InputError(
             f"the run has {len(planes)} planes of {n_parts} connected parts, at most {MOST_PLANES} "
-            f"of {MOST_PARTS} are drawn: run it with fewer planes, or name another step by --cell"
+            f"of {MOST_PARTS} are drawn: run it with fewer planes, or name another step by --step"
         )
 
 

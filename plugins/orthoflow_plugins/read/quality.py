@@ -129,9 +129,9 @@ def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
     ctx.metric("thickness_scan_steps", quality.sigma_m / quality.scan_step_m, "1")
     if quality.is_thick:
         ctx.warn(
-            f"the cloud is thicker than its scan step: across surfaces, pieces of "
-            f"{1e2 * quality.side_m:.0f} cm each, its points scatter by {sigma_mm:.1f} mm (95 % "
-            f"within {1e3 * quality.width_95_m:.1f} mm), and along them the nearest other point is "
+            f"the cloud is thicker than its scan step: across surfaces, in pieces of about "
+            f"{1e2 * quality.side_m:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within "
+            f"{1e3 * quality.width_95_m:.1f} mm), and along them the nearest other point is "
             f"{step_mm:.1f} mm away: planes and depths are no better than that; look for noise, "
             f"rough surfaces and scans that were joined without fitting"
         )

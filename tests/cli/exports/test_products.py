@@ -39,7 +39,7 @@ def test_the_last_cell_is_taken_and_the_first_five_others_are_named(
     seven = [f"plane@plane=v{k}" for k in range(7)]
     assert output_of(run_of(*seven), "labels", None) == (seven[-1], "out")
     said = capsys.readouterr().err
-    assert f"note: the labels of points of {seven[-1]}; --cell takes others: " in said
+    assert f"note: the labels of points of {seven[-1]}; --step takes others: " in said
     assert ", ".join(seven[:5]) in said
     assert "and 1 more" in said
     assert output_of(run_of(*seven[:6]), "labels", None)[0] == seven[5]
@@ -52,7 +52,7 @@ def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
     run = run_of("a", "b")
     with pytest.raises(ArgumentError) as caught:
         output_of(run, "labels", "scan")
-    assert str(caught.value) == ("the cell scan holds no labels of points; those of this run: a, b")
+    assert str(caught.value) == ("the step scan holds no labels of points; those of this run: a, b")
     with pytest.raises(ArgumentError, match=r"^the run r1 has read no cloud$"):
         output_of(run, "cloud", None)
     with pytest.raises(ArgumentError, match="those of this run: none"):

@@ -125,7 +125,7 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
     }
     thick, apart = ctx.warnings
     assert thick.startswith(
-        "the cloud is thicker than its scan step: across surfaces, pieces of 10 cm each, its "
+        "the cloud is thicker than its scan step: across surfaces, in pieces of about 10 cm, its "
         "points scatter by 3.1 mm (95 % within 12.5 mm), and along them the nearest other point is "
         "2.0 mm away: planes and depths"
     )
