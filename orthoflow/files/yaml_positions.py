@@ -123,17 +123,6 @@ class Problems(Protocol):
         """Keep a problem: its place, the keys that lead to it joined by dots, and one sentence."""
 
 
-def unplaced(value: JsonValue) -> Value:
-    """Give what a document would say of a value that comes from none."""
-    nowhere = Position(line=0, column=0)
-    if isinstance(value, dict):
-        entries = [Entry(position=nowhere, key=key, value=unplaced(value[key])) for key in value]
-        return Table(position=nowhere, entries=tuple(entries))
-    if isinstance(value, list):
-        return Listing(position=nowhere, items=tuple(map(unplaced, value)))
-    return Text(position=nowhere, value=value)
-
-
 def plain(value: Value) -> JsonValue:
     """Give a value without positions."""
     if isinstance(value, Text):

@@ -12,12 +12,13 @@ from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import (
     Entry,
+    Listing,
     Position,
     Table,
+    Text,
     Value,
     join,
     plain,
-    unplaced,
 )
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.dataset_files import read_rows, read_text
@@ -72,7 +73,7 @@ class DatasetReader:
                 Python it may be what the section would say, with paths from there, too.
         """
         if isinstance(table, Mapping):
-            return self._from_python(unplaced(dict(table)))
+            return self._from_python(_unplaced(dict(table)))
         if table:
             return self._from_table(
                 Path(table), table, partial(self.log.add_option, f"--datasets {table}")
@@ -210,6 +211,19 @@ class _OneFile:
                     call, params=params.resolved, params_set=params.as_set
                 )
         return calls
+
+
+def _unplaced(value: JsonValue) -> Value:
+    """Give what a document would say of a value that comes from none."""
+    nowhere = Position(line=0, column=0)
+    if isinstance(value, dict):
+        entries = [
+            Entry(position=nowhere, key=key, value=_unplaced(item)) for key, item in value.items()
+        ]
+        return Table(position=nowhere, entries=tuple(entries))
+    if isinstance(value, list):
+        return Listing(position=nowhere, items=tuple(map(_unplaced, value)))
+    return Text(position=nowhere, value=value)
 
 
 def choose_data(

@@ -280,7 +280,7 @@ MAPPINGS = {
     ),
     "unknown step": (
         "datasets: {hall: {set: {walls.gsd_m: 1}}}",
-        "rooms.yaml:18:25: datasets.hall.set.walls.gsd_m: there is no step walls (did you mean wall?)",
+        "rooms.yaml:18:25: datasets.hall.set.walls.gsd_m: there is no step walls",
     ),
     "unknown parameter": (
         "datasets: {hall: {set: {wall.gsd: 1}}}",
@@ -288,7 +288,7 @@ MAPPINGS = {
     ),
     "no parameter": (
         "datasets: {hall: {set: {wall: 1}}}",
-        "rooms.yaml:18:25: datasets.hall.set.wall: expected step.parameter or step.variant.parameter",
+        "rooms.yaml:18:25: datasets.hall.set.wall: expected step.parameter or step.variant",
     ),
     "value out of range": (
         "datasets: {hall: {set: {wall.gsd_m: -1}}}",
