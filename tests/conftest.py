@@ -20,6 +20,7 @@ from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.long_loops import IS_LONG
 from tests.memory_folder import has_room, in_memory
+from tests.shared_bytecode import write_share
 from tests.undrawn_charts import FIGURE, keep_dot
 
 if TYPE_CHECKING:
@@ -81,8 +82,25 @@ settings.load_profile("everywhere")
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int | None:
+    """Spread tests over a process more than there are cores: one of them often waits."""
+    if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS"):
+        return None
+    return len(os.sched_getaffinity(0)) + 1 if sys.platform == "linux" else None
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Make bytecode of all tests together, before each process imports them all."""
+    config = session.config
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker and [*config.args] == config.getini("testpaths"):
+        write_share(config, int(worker[2:]), int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Write into memory; the processes that tests are spread over write where this one does."""
+    config.pluginmanager.register(_Examples())  # a hook of this module sees files beside it only
     is_spread = "PYTEST_XDIST_WORKER" in os.environ
     if not is_spread and config.option.basetemp is None and has_room():
         config.add_cleanup(_entered(in_memory()))
@@ -95,11 +113,19 @@ def _entered(context: AbstractContextManager[None]) -> Callable[[], object]:
     return stack.close
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
-    """Look for no examples in the docstrings of tests: there are none."""
-    collectors = yield
-    return [item for item in collectors if not isinstance(item, DoctestModule)]
+class _Examples:
+    """Looks for examples in docstrings only where there are some: it imports what it looks at."""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_collect_file(
+        self, file_path: Path
+    ) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+        collectors = yield
+        if any(isinstance(item, DoctestModule) for item in collectors) and (
+            _ROOT / "tests" in file_path.parents or b">>>" not in file_path.read_bytes()
+        ):
+            return [item for item in collectors if not isinstance(item, DoctestModule)]
+        return collectors
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -21,7 +21,7 @@ from orthoflow.engine.memory import available_memory
 
 _MEMORY: Final = Path("/dev/shm")
 _NAME: Final = "orthoflow-tests"
-# All tests leave 3 GB, and two processes with what they start take as much.
+# All tests leave 3 GB, and each process with what it starts takes 1.5.
 _ROOM_BYTES: Final = 6 << 30
 _LEFT_BYTES: Final = 10 << 30
 

@@ -173,19 +173,21 @@ class _BoxTree:
         The cost of a child is its number of rectangles times the surface of its box, which is how
         often rays come by (Goldsmith and Salmon 1987); visiting a node costs about one rectangle.
         """
+        if len(members) == 1:
+            return None
         low, high = self._low[members], self._high[members]
         whole = _surface_m2(high.max(axis=0) - low.min(axis=0))
-        best_cost, best = len(members) * whole, None
-        for axis in range(3):
-            order = np.argsort(low[:, axis] + high[:, axis], kind="stable")
-            heads = _running_surfaces(low[order], high[order])[:-1]
-            tails = _running_surfaces(low[order[::-1]], high[order[::-1]])[:-1][::-1]
-            counts = np.arange(1, len(members))
-            costs = whole + counts * heads + (len(members) - counts) * tails
-            if len(costs) and costs.min() < best_cost:
-                best_cost = float(costs.min())
-                best = np.zeros(len(members), dtype=np.bool_)
-                best[order[: int(np.argmin(costs)) + 1]] = True
+        # Along all three axes at once, (n, axis): most nodes have few members.
+        order = np.argsort(low + high, axis=0, kind="stable")
+        heads = _running_surfaces(low[order], high[order])[:-1]
+        tails = _running_surfaces(low[order[::-1]], high[order[::-1]])[:-1][::-1]
+        counts = np.arange(1, len(members))[:, np.newaxis]
+        costs = whole + counts * heads + (len(members) - counts) * tails
+        last, axis = np.argmin(costs, axis=0), int(np.argmin(costs.min(axis=0)))
+        if costs[last[axis], axis] >= len(members) * whole:
+            return None
+        best = np.zeros(len(members), dtype=np.bool_)
+        best[order[: last[axis] + 1, axis]] = True
         return best
 
 
@@ -194,8 +196,9 @@ def _surface_m2(sides: NDArray[np.float64]) -> float:
 
 
 def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Surface of the box round the first 1, 2, ... members."""
-    x, y, z = (np.maximum.accumulate(high) - np.minimum.accumulate(low)).T
+    """Surfaces (n, k) of boxes round the first 1, 2, ... members of k orders, (n, k, 3) each."""
+    sides = np.maximum.accumulate(high) - np.minimum.accumulate(low)
+    x, y, z = sides[..., 0], sides[..., 1], sides[..., 2]
     surfaces: NDArray[np.float64] = x * y + y * z + z * x
     return surfaces
 

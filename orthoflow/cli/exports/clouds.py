@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -95,28 +95,29 @@ def _export(
         )
     wall, wall_plane = _wall(found.walls, chosen.wall)
     box_world = _box(chosen.box)
+    dressed = DressedCloud(
+        cloud=found.cloud,
+        colouring=colouring,
+        neighbourhoods=neighbourhoods_of(found.cloud),
+        planes=found.planes,
+        labels=found.labels,
+        photo_names=tuple(photo.name for photo, _ in found.oriented),
+        wall=wall,
+        wall_plane=wall_plane,
+        box_world=box_world,
+        is_cleaned=chosen.clean,
+        crs_wkt=_crs_wkt(found.walls),
+        name=found.digest,
+    )
+    if dressed.is_empty:
+        raise ArgumentError(
+            f"no point of the cloud of {found.address} is left: choose another --wall or --box"
+        )
     make_empty(folder)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        dressed = DressedCloud(
-            cloud=found.cloud,
-            colouring=colouring,
-            neighbourhoods=neighbourhoods_of(found.cloud),
-            planes=found.planes,
-            labels=found.labels,
-            photo_colours=_photo_colours(found, Path(scratch)) if colouring == "photos" else None,
-            photo_names=tuple(photo.name for photo, _ in found.oriented),
-            wall=wall,
-            wall_plane=wall_plane,
-            box_world=box_world,
-            is_cleaned=chosen.clean,
-            crs_wkt=_crs_wkt(found.walls),
-            name=found.digest,
-        )
+        if colouring == "photos":
+            dressed = replace(dressed, photo_colours=_photo_colours(found, Path(scratch)))
         n_written = write(folder / name, dressed)
-        if n_written == 0:
-            raise ArgumentError(
-                f"no point of the cloud of {found.address} is left: choose another --wall or --box"
-            )
         describe_cloud(folder / "cloud.json", dressed, name, n_written)
     of_all = "" if n_written == len(found.cloud) else f" of {len(found.cloud)}"
     return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {found.address}"

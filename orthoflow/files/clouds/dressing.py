@@ -121,6 +121,11 @@ class DressedCloud:
         known = values[np.isfinite(values)]
         return round_scale_m(float(np.percentile(known, _SCALE_PERCENT)) if len(known) else 0.0)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no point is chosen."""
+        return not any(self._chosen(part, None).any() for part in self._parts())
+
     @cached_property
     def scans(self) -> tuple[int, ...]:
         """Numbers of the scans that have points, cropping aside."""
