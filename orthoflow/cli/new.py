@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -84,9 +85,10 @@ def _print(draft: Draft, output: Path) -> None:
         echo(f"{name}: {said}")
     for said in draft.left_out:
         echo_folded(f"not used: {said}")
+    name = shlex.quote(str(output))
     echo(
         f"wrote {output}, after the recipe {draft.recipe}",
         "",
-        f"next: orthoflow check {output}",
-        f"      orthoflow run {output} --set wall.gsd_m=0.02    # a coarse first look",
+        f"next: orthoflow check {name}",
+        f"      orthoflow run {name} --set wall.gsd_m=0.02    # a coarse first look",
     )

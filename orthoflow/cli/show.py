@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -67,7 +68,8 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
         _print_metrics(opened, most=None if is_whole else ROWS_MOST)
         _print_environments(opened)
         _print_files(opened)
-        echo("", f"whether all of it is as it was written, says `orthoflow verify {run}`")
+        verify = f"`orthoflow verify {shlex.quote(str(run))}`"
+        echo("", f"whether all of it is as it was written, says {verify}")
     return code_for([broken_seal(opened)], "rely on nothing that is said of it here")
 
 

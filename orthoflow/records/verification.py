@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
@@ -230,8 +231,8 @@ def require_unchanged(run: Run, *paths: Path) -> None:
 def _views_note(folder: Path, views: list[str]) -> str:
     shows, them = ("shows", "it") if len(views) == 1 else ("show", "them")
     return (
-        f"not covered: {', '.join(views)}, which {shows} the record; `orthoflow report {folder}` "
-        f"makes {them} anew"
+        f"not covered: {', '.join(views)}, which {shows} the record; `orthoflow report "
+        f"{shlex.quote(str(folder))}` makes {them} anew"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -176,7 +177,7 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
         if is_wanted and not (run.folder / path).exists():
             raise RecordError(
                 f"{path} is gone from {run.folder}, where the run left it: copy it back, or "
-                f"make it anew by `orthoflow replay {run.path} -o NEW`"
+                f"make it anew by `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
             )
 
 

@@ -197,7 +197,7 @@ class _OneFile:
         reader = self.reader
         path, is_column = join(here, SET.name), bool(self.table)
         assigned = assign_settings(settings, path, reader.steps, self.log, is_column=is_column)
-        blame = partial(self.log.add, settings.position, path)
+        blame = partial(self.log.add, settings.position, here if is_column else path)
         calls = {}
         for step in reader.steps:
             for variant in step.variants:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
+# Paragraphs of a recipe's heading that are not about files of one's own: its commands, stand-ins.
+_NOT_OWN: Final = ("#   ", "# Without a scan of your own")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +161,7 @@ class _Drafting:
         said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
         said += [f"#   {name}: {text}" for name, text in described.items()]
         said += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
-        run = json.dumps(self.target.name)[1:-1]
+        run = shlex.quote(self.target.name)
         said += [
             "#",
             f"#   orthoflow check {run}       is anything wrong with it?",
@@ -168,7 +171,9 @@ class _Drafting:
             "# What follows are the recipe's own words.",
             "#",
         ]
-        return "\n".join(map(_seen, said)) + "\n" + start
+        paragraphs = start.rstrip("\n").split("\n#\n")
+        kept = [text for text in paragraphs if not text.startswith(_NOT_OWN)]
+        return "\n".join(map(_seen, said)) + "\n" + "\n#\n".join(kept) + "\n"
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:

@@ -195,7 +195,8 @@ class _Reporter:
         if report := self.reports.get(name, self.blame):
             # It names the parameter itself, but nothing inside it, and datasets not even that.
             is_named = name in self.reports and len(location) == 1
-            report(message if is_named else f"{_inner_name(location)}: {message}")
+            who = str(location[-1]) if location else f"the parameters of {self.info.id}"
+            report(message if is_named else f"{who}: {message}")
             return
         path = "".join(
             f"[{part}]" if isinstance(part, int) else f".{part}" for part in ("params", *location)
@@ -205,7 +206,7 @@ class _Reporter:
 
     def _message(self, details: ErrorDetails) -> str:
         location = details["loc"]
-        name = _inner_name(location)
+        name = str(location[-1]) if location else ""
         match details["type"]:
             case "extra_forbidden":
                 known = tuple(self.info.method.Params.model_fields) if len(location) == 1 else ()
@@ -235,10 +236,6 @@ class _Reporter:
             else:
                 break
         return position
-
-
-def _inner_name(location: tuple[int | str, ...]) -> str:
-    return str(location[-1]) if location else "the parameters"
 
 
 def _shown(value: object) -> str:

@@ -296,7 +296,7 @@ MAPPINGS = {
     ),
     "parameters that disagree": (
         "datasets: {hall: {set: {plane.hough2d.cell_m: 0.06}}}",
-        "rooms.yaml:18:24: datasets.hall.set: the parameters: cell_m 0.06 must not exceed",
+        "rooms.yaml:18:24: datasets.hall.set: the parameters of plane.hough2d: cell_m 0.06 must",
     ),
     "no mapping inside": (
         "datasets: {hall: {set: {plane.hough2d.cell_m.deep: 1}}}",

@@ -83,14 +83,15 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     assert "not used: notes.txt: text, left out beside scans of other formats" in out
     assert "not used: plan.dwg: no method reads such files" in out
     assert "not used: IMG_7.CR2: camera raw, which is not read: develop to TIFF of 16 bits" in out
-    assert "next: orthoflow check jobs/hall 1.yaml" in out
+    assert "next: orthoflow check 'jobs/hall 1.yaml'" in out
 
 
 def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: Path) -> None:
     out = json.loads(said("new", data / "hall.las", data / "checks.csv", "--json"))
     assert (out["file"], out["recipe"], out["left_out"]) == ("workflow.yaml", "direct", [])
     text = Path("workflow.yaml").read_text()
-    assert "room" not in text.partition("\nsteps:")[2]
+    assert "room" not in text
+    assert "orthoflow run direct.yaml" not in text
     # No step waits for a simulated room, none is skipped.
     assert said("check", "workflow.yaml") == "workflow is fine: 7 steps\n"
 
