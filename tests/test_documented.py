@@ -133,6 +133,8 @@ def _of_orthoflow(command: Documented, catalog: Catalog) -> str:
         call = called(command.words[1:])
     except click.ClickException as error:
         return error.format_message()
+    if (new := call.values.get("new_kind")) in catalog.kinds:
+        return f"the kind {new} is there already"
     workflow = call.values.get("workflow")
     if isinstance(workflow, tuple):  # `warm` takes several
         workflow = workflow[0] if workflow else None

@@ -371,7 +371,7 @@ def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
 @click.argument("name", metavar="NAME")
 @click.option("--kind", default="", metavar="KIND", help="Kind of the method, e.g. plane.")
 @click.option(
-    "--new-kind", default="", metavar="KIND", help="A kind of its own instead, e.g. segment."
+    "--new-kind", default="", metavar="KIND", help="A kind of its own instead, e.g. mark."
 )
 @click.option(
     "--takes",
