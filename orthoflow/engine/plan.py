@@ -257,12 +257,7 @@ class _Planner:
     def _without_inputs(self, cell: Cell) -> PlannedCell | None:
         if cell.skip_reason:
             return PlannedCell(cell=cell, status="skipped", reason=cell.skip_reason)
-        before = [self.planned[address] for address in needed_addresses(cell)]
-        for earlier in before:
-            if earlier.status == "skipped":
-                reason = f"needs {earlier.cell.address}, which is skipped"
-                return PlannedCell(cell=cell, status="skipped", reason=reason)
-        for earlier in before:
+        for earlier in (self.planned[address] for address in needed_addresses(cell)):
             if earlier.status != "cached":
                 what = "will run" if earlier.status == "will run" else "is not known yet"
                 reason = f"needs {earlier.cell.address}, which {what}"

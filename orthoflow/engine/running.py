@@ -296,8 +296,7 @@ class _Call:
             return cls.Params.model_validate_json(json.dumps(dict(self.task.params)), strict=True)
         except ValidationError as error:
             said = "; ".join(
-                f"{'.'.join(map(str, one['loc']))}: {one['msg']}"
-                for one in error.errors(include_url=False)
+                f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()
             )
             raise MethodError(f"{self.task.who} refuses its parameters: {said}") from error
 

@@ -288,7 +288,6 @@ def _row(
     cpu_s = sum(cell.cpu_s for cell in varied)
     # Old records do not know the seconds of the processor.
     is_busy = has_cost and cpu_s > 0.0 and max(cpu_s + _BUSY_S, _BUSY_TIMES * cpu_s) < time_s
-    memory_mib = max((cell.peak_rss_mib for cell in varied), default=0.0)
     cost_group = "".join(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
     )
@@ -302,9 +301,7 @@ def _row(
             _value(one.measured(column.step, column.metric), one.run, origins) for column in columns
         ),
         time=_time(time_s, cost_group) if has_cost else Value(),
-        memory=(
-            Value(text=f"{memory_mib:.0f}", sort=memory_mib, group=group) if has_cost else Value()
-        ),
+        memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
         is_busy=is_busy,
         remark="; ".join(
             part
@@ -323,6 +320,10 @@ def _row(
 def _time(seconds: float, group: str) -> Value:
     text = f"{seconds:.2f}" if seconds < 1.0 else f"{seconds:.1f}"
     return Value(text=text, sort=seconds, spread=_TIMED_S, group=group)
+
+
+def _memory(mib: float, group: str) -> Value:
+    return Value(text=f"{mib:.0f}", sort=mib, group=group)
 
 
 def _run_label(run: Run) -> str:

@@ -161,7 +161,7 @@ def write_page(
     for folder in {(path.parent / page).parent for page in pages.values()}:
         _make_folder(folder)
     with run.held_open() as opened:
-        parts = parts_of(opened) if pages else {}
+        parts = parts_of(opened)
         for name, page in pages.items():
             target = path.parent / page
             title = f"{run.record.name}: {name}"

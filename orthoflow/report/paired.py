@@ -186,7 +186,7 @@ def _alike(called: Mapping[str, RecordedCell], reference: str, own: str) -> str:
         for variant, params in family.items()
         if all(params.get(name) == mine.params[name] for name in shared)
     ]
-    return found[0] if shared and len(found) == 1 else reference
+    return found[0] if len(found) == 1 else reference
 
 
 def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
@@ -302,7 +302,7 @@ def paired_differences(worse: Mapping[str, float], sense: Sense) -> Paired:
     largest = sorted(worse, key=lambda name: -abs(worse[name]))
     total = float(np.abs(differences).sum())
     deciding: dict[str, float] = {}
-    for name in largest[:_MOST_DECIDING] if total else ():
+    for name in largest[:_MOST_DECIDING]:
         if sum(map(abs, deciding.values())) >= _DECIDING_SHARE * total:
             break
         deciding[name] = sign * worse[name]

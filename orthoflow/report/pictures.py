@@ -128,7 +128,7 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
     """Give the first orthoimage of some cells as a small picture, a data URI; empty without any."""
     places = [place for place in embedded_products(run, "orthoimages") if place[0] in addresses]
     for (address, _), payload in zip(places[-1:], run.payloads(places[-1:]), strict=True):
-        for image in Orthoimages.from_payload(payload).images[:1]:
+        for image in Orthoimages.from_payload(payload).images:
             drawing = _orthoimage(run, address, image)
             return data_uri(drawing.draw(longest_side_px), "image/webp")
     return ""

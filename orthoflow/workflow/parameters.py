@@ -150,7 +150,7 @@ def resolve_params(
     except ValidationError as error:
         reports = {override.keys[0]: override.report for override in overrides}
         reporter = _Reporter(variant=variant, info=info, reports=reports, log=log, blame=blame)
-        for details in error.errors(include_url=False):
+        for details in error.errors():
             reporter.report(details)
         return ResolvedParams(as_set=as_set)
     except KeyboardInterrupt:

@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from orthoflow.catalog import loading
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.planes import Planes
+from orthoflow.sdk.methods import PortSpec
 from tests.laboratories import (
     LABORATORY,
     entry_points_in,
@@ -356,6 +358,11 @@ CHANGES = {
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
     "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
+    "no items to map over": (
+        "    Params",
+        "    maps_over = 'cloud'\n    Params",
+        "maps_over must name an input port that is always wired and whose product has items",
+    ),
     "name lacks": ("class Mine(", "class Yours(", "_class has no Mine"),
     "import fails": ("from orthoflow.sdk", "import no_such_library\nfrom orthoflow.sdk", "No mod"),
 }
@@ -384,6 +391,27 @@ def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
     source = CLASS.replace("cloud: PointCloud", "pass")
     catalog = with_plugin("kept", text, tmp_path, monkeypatch, kept_class=source)
     assert catalog.method("plane.mine").load().id == "plane.mine"
+
+
+def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = hooks(methods=method("plane.mine", "made_class:Mine"))
+    source = f"{CLASS.replace('class Mine', 'class Other')}\nglobals()['Mi' + 'ne'] = Other\n"
+    catalog = with_plugin("made", text, tmp_path, monkeypatch, made_class=source)
+    entry = catalog.method("plane.mine")
+    assert entry.looked_at() is entry
+
+
+def test_a_port_of_a_source_carries_what_somebody_announces() -> None:
+    ports = {
+        name: PortSpec(name=name, type_name=type_name, required=True)
+        for name, type_name in (("cloud", "cloud"), ("damp", "dampness"))
+    }
+    assert loading._unknown_type(ports, frozenset({"cloud", "dampness"})) == ""
+    assert loading._unknown_type(ports, frozenset({"cloud"})) == (
+        "port damp carries dampness, a product type that no plugin announces"
+    )
 
 
 def test_an_install_from_an_index_is_released_and_one_from_a_folder_is_not(

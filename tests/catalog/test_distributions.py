@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.metadata import EntryPoint
 from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog.distributions import may_define, package_path, source_files
+from orthoflow.catalog.distributions import (
+    DistributionInfo,
+    describe_distribution,
+    may_define,
+    package_path,
+    source_files,
+)
 
 
 @pytest.fixture
@@ -46,6 +53,20 @@ def test_the_outermost_regular_package_is_found_and_not_imported(
 @pytest.mark.parametrize("module", ["nowhere_to_be_found", "spaced", "spaced.missing", "", ".x"])
 def test_what_has_no_code_has_no_place(folder: Path, module: str) -> None:
     assert package_path(module) is None
+
+
+@pytest.mark.parametrize(("module", "source"), [("regular.hooks", "regular"), ("alone", None)])
+def test_an_entry_point_of_no_distribution_is_known_by_its_own_name(
+    folder: Path, module: str, source: str | None
+) -> None:
+    assert describe_distribution(EntryPoint(name="mine", value=module, group="any")) == (
+        DistributionInfo(
+            name="mine",
+            version="0",
+            is_released=False,
+            source_folder=None if source is None else folder / source,
+        )
+    )
 
 
 def test_modules_built_into_python_have_no_place() -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import platform
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -232,6 +233,16 @@ def test_a_library_that_crashes_or_says_nothing_is_told() -> None:
     assert diagnosis._import_problem("json") == ""
     assert diagnosis._import_problem("no_such_thing") == (
         "its import fails: ModuleNotFoundError: No module named 'no_such_thing'"
+    )
+
+
+def test_a_library_that_takes_too_long_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def waits(command: list[str], *, timeout: float, **_: object) -> None:
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(diagnosis.subprocess, "run", waits)
+    assert re.fullmatch(
+        r"its import takes longer than \d+(\.\d)? s", diagnosis._import_problem("x")
     )
 
 

@@ -9,6 +9,7 @@ import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -61,6 +62,18 @@ def test_a_store_begins_with_what_was_compiled_beforehand(
     began = {path.name: path.read_bytes() for path in kernels.rglob("*.nbi")}
     # An index that had got another kernel would differ.
     assert {path.name: path.read_bytes() for path in store.rglob("*.nbi")} == began
+
+
+def test_shipped_workflows_are_tried_with_what_makes_them_small() -> None:
+    recipes = warm._recipes()
+    assert {path.stem for path in recipes} >= {"direct", "quickstart", "plane-methods"}
+    assert all(path.is_file() and sets for path, sets in recipes.items())
+
+
+def test_where_nothing_is_to_be_compiled_nothing_runs(tmp_path: Path) -> None:
+    nothing: Any = SimpleNamespace(cells=())
+    assert warm._executed(nothing, tmp_path / "run", nothing) == []
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_of_kernels_is_copied_once_and_only_where_there_is_none(

@@ -6,10 +6,14 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
+from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from orthoflow.engine import keys, method_versions
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest
@@ -70,6 +74,58 @@ CELL = Cell(address="step", step="step", method="work.noise", params={"amount": 
 LEFT = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:" + "1" * 64)
 RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
 INPUTS = {"left": LEFT, "right": RIGHT}
+
+
+@pytest.mark.parametrize(
+    ("site", "direct_url", "is_released"),
+    [
+        (keys._ROOT.parent, None, True),
+        (keys._ROOT.parent, "{}", False),
+        (keys._ROOT.parent / "elsewhere", None, False),
+        (None, None, False),
+    ],
+    ids=["from an index", "from a folder", "in front of a release", "not installed"],
+)
+def test_a_release_stands_for_its_code_and_nothing_else_does(
+    monkeypatch: pytest.MonkeyPatch, site: Path | None, direct_url: str | None, is_released: bool
+) -> None:
+    def distribution(_name: str) -> SimpleNamespace:
+        if site is None:
+            raise metadata.PackageNotFoundError
+        return SimpleNamespace(read_text=lambda _: direct_url, locate_file=lambda _: site)
+
+    monkeypatch.setattr(keys.metadata, "distribution", distribution)
+    monkeypatch.setattr(keys.metadata, "version", lambda _: "1.2.3")
+    assert keys.is_framework_released.__wrapped__() is is_released
+    monkeypatch.setattr(keys, "is_framework_released", keys.is_framework_released.__wrapped__)
+    tag = keys.framework_tag()
+    assert tag == "1.2.3" if is_released else re.fullmatch(r"(sha256:)?[0-9a-f]{64}", tag)
+
+
+def test_code_that_changed_or_went_is_not_the_one_in_the_keys(tmp_path: Path) -> None:
+    file = tmp_path / "method.py"
+    file.write_text("one")
+    code = {"plugin": keys.files_digest([file])}
+    facts = dataclasses.replace(FACTS, code=code, sources={"plugin": (file,)})
+    assert facts.is_code_unchanged()
+    file.write_text("other")
+    assert not facts.is_code_unchanged()
+    file.unlink()
+    assert not facts.is_code_unchanged()
+
+
+def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    planned = method_versions.methods_text({"work.noise": FACTS})
+    here = dict.fromkeys(["work.noise"], "method work.noise is broken")
+    monkeypatch.setattr(method_versions, "_methods_here", lambda _: planned)
+    assert method_versions.misfit(planned) == ""
+    monkeypatch.setattr(method_versions, "_methods_here", lambda _: json.dumps(here))
+    assert method_versions.misfit(planned) == "method work.noise is broken"
+    monkeypatch.setattr(method_versions, "_methods_here", lambda _: "")
+    said = method_versions.misfit(planned)
+    assert said == "its methods cannot be loaded (JSONDecodeError)"
 
 
 def key_of(

@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from orthoflow.engine import splitting
 from orthoflow.engine.events import CellFinished, CellProgress, CellStarted, RunEvent
 from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.splitting import _parts, parts_folder
-from orthoflow.errors import CancelledStepError
+from orthoflow.engine.store import Store
+from orthoflow.errors import CancelledStepError, DamageError
 from tests.engine_world import World, toy_world
 
 STEPS = """
@@ -206,6 +210,20 @@ def test_garbage_collection_removes_parts(world: World) -> None:
     assert list(parts_folder(world.store).iterdir())
     collect_garbage(world.store)
     assert not list(parts_folder(world.store).iterdir())
+
+
+def test_a_step_of_one_item_or_of_a_damaged_input_is_computed_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(*_: object) -> list[str]:
+        raise DamageError("the input is damaged")
+
+    task: Any = SimpleNamespace(key="ab", address="step")
+    facts: Any = SimpleNamespace(maps_over="somewhere")
+    split = splitting.Splits(Store(tmp_path / "store"))
+    for names in (lambda *_: ["one"], damaged):
+        monkeypatch.setattr(splitting, "_item_names", names)
+        assert split.begin(task, facts, 4, is_forced=False) is False
 
 
 def test_parts_fill_what_is_missing() -> None:

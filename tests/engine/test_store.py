@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
+import json
 import os
 import resource
 import shutil
@@ -13,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.garbage import collect_garbage
+from orthoflow.engine.objects import files_of
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,
@@ -236,6 +240,41 @@ def test_an_unreadable_result_is_a_miss(store: Store, text: str) -> None:
     store.put_result(KEY, ok_result(store, heights()), "step")
     (store.results / f"{KEY}.json").write_text(text)
     assert store.result(KEY) is None
+
+
+def test_a_result_says_what_is_wrong_with_it() -> None:
+    for field, value in (("status", "great"), ("wall_s", "long")):
+        wrong = json.dumps({"format": "orthoflow/result/1", field: value})
+        with pytest.raises(StoreError, match=rf"^x\.json is damaged: {field}: Input should be "):
+            result_from_json(wrong, "x.json")
+
+
+def test_a_link_in_the_place_of_an_object_is_none(store: Store) -> None:
+    ref = store.put_product(heights())
+    folder = object_folder(store, ref)
+    assert "product.h5" in files_of(folder)
+    link = folder.with_name("0" * 64)
+    link.symlink_to(folder)
+    assert files_of(link) == {}
+
+
+def test_a_disk_that_cannot_be_read_is_no_damage(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ref = store.put_product(heights("low"))
+    assert store.product_metadata(ref.digest)["note"] == "low"
+
+    for error, told in (
+        (OSError(errno.EMFILE, "Too many open files"), StoreError),
+        (OSError(errno.EIO, "Input/output error"), DamageError),
+        (KeyError("metadata"), DamageError),
+    ):
+        monkeypatch.setattr(
+            "orthoflow_provenance.payloads.read_product_metadata", Mock(side_effect=error)
+        )
+        with pytest.raises(told) as caught:
+            store.product_metadata(ref.digest)
+        assert isinstance(caught.value, DamageError) is (told is DamageError)
 
 
 @pytest.mark.parametrize("damage", [truncate, Path.unlink], ids=lambda f: f.__name__)

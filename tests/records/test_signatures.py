@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -20,6 +23,8 @@ from cryptography.hazmat.primitives.serialization import (
     PublicFormat,
 )
 
+from orthoflow.cli import sign
+from orthoflow.records import signatures
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 
@@ -217,6 +222,30 @@ def test_the_password_of_a_key_is_asked_for(
     monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: PASSWORD)
     assert finished("sign", run, "--key", key).exit_code == 0
     assert finished("verify", run, "--signer", "jane.pub").exit_code == 0
+
+
+def test_on_a_terminal_the_password_is_asked_for_out_of_sight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[str, bool, bool]] = []
+
+    def prompt(text: str, *, hide_input: bool, err: bool) -> str:
+        asked.append((text, hide_input, err))
+        return PASSWORD
+
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("click.prompt", prompt)
+    assert sign._password(Path("jane")) == PASSWORD
+    # What is asked goes to where messages go: stdout may be a file.
+    assert asked == [("password of jane", True, True)]
+
+
+def test_a_public_key_of_no_form_has_no_fingerprint() -> None:
+    for key in ("", "alone", "ssh-ed25519 no*base64"):
+        assert signatures._fingerprint(key) == "of no known form"
+    digest = base64.b64encode(hashlib.sha256(b"key").digest()).decode().rstrip("=")
+    text = base64.b64encode(b"key").decode()
+    assert signatures._fingerprint(f"ssh-ed25519 {text} jane") == f"SHA256:{digest}"
 
 
 def test_without_the_library_the_commands_say_so_and_others_do_without(

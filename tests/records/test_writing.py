@@ -8,7 +8,8 @@ import shutil
 from dataclasses import dataclass
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Self
+from types import SimpleNamespace
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -19,11 +20,11 @@ from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.store import Store
-from orthoflow.errors import StoreError
+from orthoflow.errors import DamageError, StoreError
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import verify_run
-from orthoflow.records.writing import show_unfinished, write_run
+from orthoflow.records.writing import executed_and_written, show_unfinished, write_run
 from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.format import Workflow
@@ -65,6 +66,32 @@ def executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Executed:
     plan = plan_run(expand_cells(workflow, catalog), workflow, catalog, store, options)
     outcome = execute(plan, tmp_path / "run", store, run_id="20260102-abc")
     return Executed(outcome, plan, workflow, tmp_path / "run", store)
+
+
+@pytest.mark.parametrize(("n_lost", "n_executed"), [(0, 1), (1, 2), (3, 4), (4, 4)])
+def test_what_the_store_lost_is_computed_again_three_times(n_lost: int, n_executed: int) -> None:
+    executed: list[Any] = []
+
+    def execute() -> Any:
+        kept = {"scan", "plane"} if executed else {"scan", "wall"}
+        executed.append(SimpleNamespace(resumed=frozenset(kept)))
+        return executed[-1]
+
+    def write(outcome: Any) -> Any:
+        assert outcome is executed[-1]
+        if len(executed) <= n_lost:
+            raise DamageError("the store lost it")
+        return "the run"
+
+    if n_lost == 4:
+        with pytest.raises(DamageError):
+            executed_and_written(execute, write)
+    else:
+        written = executed_and_written(execute, write)
+        assert (written.run, written.outcome) == ("the run", executed[-1])
+        # What a later attempt finds was there before only where the first found it, too.
+        assert written.kept == ({"scan"} if n_lost else {"scan", "wall"})
+    assert len(executed) == n_executed
 
 
 def test_a_run_keeps_the_id_it_was_given(executed: Executed) -> None:

@@ -18,6 +18,7 @@ from orthoflow.report.browsing import (
     key_metrics,
     run_folders,
     summaries,
+    told_apart,
 )
 from tests.report_runs import HeldRun, cell, metrics, record
 
@@ -86,6 +87,20 @@ def test_the_numbers_that_most_runs_have_come_first_in_the_order_of_quality(
     assert key_metrics([], most=2) == []
 
 
+def test_a_name_that_is_not_the_same_thing_in_all_runs_is_told_with_its_step() -> None:
+    def labelled(**labels: str) -> RunSummary:
+        return replace(summary("x"), labels={k.replace("__", "."): v for k, v in labels.items()})
+
+    runs = [
+        labelled(rms_mm="of the plane", plane__rms_mm="of the plane", n="points"),
+        labelled(rms_mm="of the check", check__rms_mm="of the check", plane__rms_mm="of the plane"),
+        labelled(other__rms_mm="of something that nobody shows", n="points"),
+    ]
+    assert list(told_apart(["n", "rms_mm", "unknown"], runs)) == [
+        *("n", "plane.rms_mm", "check.rms_mm", "unknown"),
+    ]
+
+
 def written(folder: Path, *cells: object, **more: object) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     write_record(folder / "run.h5", record(cells, **more), lambda _digest: None)  # type: ignore[arg-type]
@@ -112,6 +127,8 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     # A later step has the plain name.
     wanted = {"plane.rms_mm": 3.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
     assert {name: told.metrics[name] for name in wanted} == wanted
+    assert told.labels["check.rms_mm"] == told.labels["rms_mm"] == "check points, RMS"
+    assert told.n_datasets == 0
     assert told.facts == {
         "seed": 1,
         "orthoflow": "orthoflow 0.1.0",
@@ -127,14 +144,24 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
 
 def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     cells = [
-        cell(f"check@data={name}", metrics=metrics(rms_mm=value), params={"tries": k})
-        for k, (name, value) in enumerate({"hall": 1.0, "stairs": 5.0, "court": 2.0}.items())
+        cell(
+            f"check@data={name}",
+            metrics=metrics(rms_mm=value, plane_offset_mm=(-1) ** k * value, omega_deg=-value),
+            params={"tries": k},
+        )
+        for k, (name, value) in enumerate({"hall": 1.0, "stairs": 2.0, "court": 5.0}.items())
     ]
     rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
     told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
     run = HeldRun(path=tmp_path / "run.h5", record=told)
     assert module._metrics(run)["rms_mm"] == module._metrics(run)["check.rms_mm"] == 2.0
+    # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
+    assert module._metrics(run)["plane_offset_mm"] == 2.0
+    assert module._metrics(run)["omega_deg"] == -2.0
+    alone = record(cells[1:2], workflow_resolved=json.dumps({"datasets": {"stairs": {}}}))
+    assert module._metrics(replace(run, record=alone))["plane_offset_mm"] == -2.0
     summary = module._of_run(tmp_path, run)
+    assert summary.n_datasets == 3
     facts, labels = summary.facts, summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "check points, RMS"
     assert {name: facts[name] for name in facts if name.endswith("tries")} == {
@@ -190,7 +217,12 @@ def test_a_record_that_nobody_foresaw_is_damaged(
         raise RecursionError("too deep")
 
     monkeypatch.setattr(module, "_of_run", fails)
-    (told,) = summaries([written(tmp_path / "odd", cell("plane"))])
+    folder = written(tmp_path / "odd", cell("plane"))
+    (told,) = summaries([folder])
     assert (told.state, told.reason) == (
         *("damaged", "the record is not as one was written: RecursionError: too deep"),
     )
+    monkeypatch.setattr(module, "broken_seal", lambda _run: "its seal does not hold")
+    (told,) = summaries([folder])
+    assert told == RunSummary(folder=folder, state="damaged", reason="its seal does not hold")
+    assert told.n_datasets == 0

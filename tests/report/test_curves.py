@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthoflow.report import curves as module
 from orthoflow.report.curves import curves, curves_over, sweeps
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
@@ -284,7 +285,7 @@ def test_values_twenty_times_apart_stand_on_a_logarithmic_axis(
 def test_numbers_under_the_axis_do_not_lie_on_each_other(tmp_path: Path) -> None:
     svg = measured(tmp_path, {1000.0 + 0.5 * k: 1.0 + k for k in range(30)})
     places = steps_across(svg)
-    assert 2 < len(places) < 15
+    assert 6 <= len(places) < 15
     assert len(dots(svg)) == 30
     # About six units per letter.
     for (left, one), (right, other) in itertools.pairwise(places):
@@ -339,3 +340,31 @@ def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
         assert [name for _, name in names] == [f"m{k}" for k in range(n_drawn)]
         tops = [float(top) for top, _ in names]
         assert min(np.diff(tops)) >= 12.0
+        # The drawing stands below all of them.
+        ((down,),) = numbers_of(r"translate\(0 ([\d.]+)\)", curve.svg)
+        assert down == pytest.approx(n_drawn * np.diff(tops)[0])
+
+
+def test_bars_of_errors_end_at_zero(tmp_path: Path) -> None:
+    cells = [
+        cell(
+            f"plane@plane=v{index}" + (f"#{repeat}" if repeat else ""),
+            params={"tolerance_m": float(index)},
+            # 1 on average, with a deviation of 1.7.
+            metrics=metrics(plane_offset_mm=(0.0, 0.0, 3.0)[repeat]),
+        )
+        for index in range(1, 4)
+        for repeat in range(3)
+    ]
+    svg = drawn(tmp_path, cells)
+    ((floor,),) = numbers_of(r'class="axis" d="M[\d.]+ [\d.]+V([\d.]+)H', svg)
+    assert min(value for _, value in ticks(svg)) == 0.0
+    lows = numbers_of(r"M[\d.]+ ([\d.]+)V", "".join(re.findall(r'class="bar[^>]*', svg)))
+    assert lows == [(floor,)] * 3
+
+
+@pytest.mark.parametrize(("is_error", "y"), [(True, 3.0), (False, -2.0)])
+def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
+    found = [module._Value(value, math.nan, False) for value in (-4.0, 3.0, -2.0)]
+    point = module._point(1.0, found, is_over=True, is_error=is_error)
+    assert (point.y, point.n) == (y, 3)

@@ -15,11 +15,12 @@ def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
     pairs = [
         Pair(cell="a", name="x", left=1, right=1),
         Pair(cell="a", name="y", left=1, right=2),
+        Pair(cell="a", name="z", left=1, right=1),
         Pair(cell="b", name="x", left=None, right=2),
         Pair(cell="c", name="x", left=3, right=None),
     ]
     table = differences._table("Things", pairs, str)
-    assert (table.title, table.n_compared, table.n_alone) == ("Things", 2, 2)
+    assert (table.title, table.n_compared, table.n_alone) == ("Things", 3, 2)
     assert table.rows == (
         Difference(cell="a", name="y", left="1", right="2"),
         Difference(cell="b", name="x", left="-", right="2"),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from orthoflow.products import Orthoimages
 from orthoflow.report.notebooks import Figures, OpenedRun
 from orthoflow.report.tidy_tables import combination_rows
 from tests.provenance_records import write_sample
-from tests.report_runs import cell, compared_resolved, metrics, record
+from tests.report_runs import cell, compared_resolved, given, metrics, record
 from tests.report_runs import orthoimages_product as images_of
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(200_000)
@@ -59,6 +61,7 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     assert len(html) < 5_000
     assert "points to their plane, RMS" in html
     assert "steps: 4 ok" in html
+    assert "<img" not in html
     assert "&lt;Run" not in html
     assert "\x1b" not in html
 
@@ -116,6 +119,31 @@ def test_the_rows_of_the_report_are_a_table_of_their_own(tmp_path: Path) -> None
     assert [row["plane.wall_s"] for row in named] == [1.0] * 4
 
 
+def test_rows_say_what_failed_and_which_of_several_swept_methods_they_are_of(
+    tmp_path: Path,
+) -> None:
+    cells = [
+        cell(
+            f"plane@plane={kind}-{value}",
+            method=f"plane.{kind}",
+            params={"tolerance_m": value},
+            status="failed" if (kind, value) == ("hough", 3) else "ok",
+        )
+        for kind in ("hough", "region")
+        for value in (1, 2, 3)
+    ]
+    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells))
+    header, *rows = combination_rows(run)
+    named = [dict(zip(header, row, strict=True)) for row in rows]
+    assert [(row["plane.use"], row["plane.tolerance_m"], row["status"]) for row in named] == [
+        *(("plane.hough", 1.0, "ok"), ("plane.hough", 2.0, "ok"), ("plane.hough", 3.0, "failed")),
+        *(("plane.region", 1.0, "ok"), ("plane.region", 2.0, "ok"), ("plane.region", 3.0, "ok")),
+    ]
+    alike = OpenedRun(path=tmp_path / "run.h5", record=record(cells[:3]))
+    header, *_ = combination_rows(alike)
+    assert "plane.use" not in header
+
+
 def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
     figures = opened(tmp_path).figures
     assert list(figures) == ["scan/plan"]
@@ -134,11 +162,10 @@ def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
 
 
 def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
-    from tests.report_runs import given
-
     made = cell("mosaic", outputs={"orthoimages": given("", "7", "orthoimages")})
     run = Painted(path=tmp_path / "run.h5", record=record([made]))
     (expected,) = images_of(0).images
+    assert '<img alt="first orthoimage" src="data:image/webp;base64,' in run._repr_html_()
     image = run.orthoimage(8)
     np.testing.assert_array_equal(np.asarray(image), expected.rgb)
     np.testing.assert_array_equal(image.is_shown, np.isin(expected.mask, (1, 2)))
@@ -153,9 +180,29 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
         run.orthoimage(cell="first")
 
 
-def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
-    from tests.report_runs import given
+def test_an_orthoimage_is_handed_on_with_metres_along_its_wall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def keep(data: object, **told: object) -> SimpleNamespace:
+        return SimpleNamespace(data=data, **told)
 
+    monkeypatch.setitem(sys.modules, "xarray", SimpleNamespace(DataArray=keep))
+    made = cell("mosaic", outputs={"orthoimages": given("", "7", "orthoimages")})
+    image = Painted(path=tmp_path / "run.h5", record=record([made])).orthoimage(8)
+    array = image.to_xarray()
+    rows, columns = image.frame.shape
+    assert array.data is image.rgb
+    assert array.dims == ("y", "x", "band")
+    left, top = image.frame.raster_corner_m
+    # The middles of the cells, the first row on top.
+    step = image.frame.gsd_m
+    x, y = array.coords["x"], array.coords["y"]
+    np.testing.assert_allclose(x, np.linspace(left, left + columns * step, 2 * columns + 1)[1::2])
+    np.testing.assert_allclose(y, np.linspace(top, top - rows * step, 2 * rows + 1)[1::2])
+    assert array.attrs == {"unit": "m", "gsd_m": step}
+
+
+def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
     made = [
         cell(f"mosaic@data={name}", outputs={"orthoimages": given("", "7", "orthoimages")})
         for name in ("calm", "noisy")

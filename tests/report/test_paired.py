@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.stats import wilcoxon
 from orthoflow.report import paired as module
 from orthoflow.report.paired import paired_differences
 from orthoflow.report.rankings import Sense
+from tests.report_runs import HeldRun, cell, record
 
 
 def worse(*values: float) -> dict[str, float]:
@@ -63,6 +65,75 @@ def test_five_differences_are_tested_and_four_are_not() -> None:
     assert every.effect == -1.0
     assert every.p == pytest.approx(0.0625)
     assert every.wins == 0
+
+
+def called(**values: float) -> Any:
+    return SimpleNamespace(method=values.pop("method", "a"), params=values)
+
+
+@pytest.mark.parametrize(
+    ("own", "partner"),
+    [
+        # At the same value of what both sweep, whatever else it sets.
+        ({"method": "b", "tolerance_m": 2.0, "extra": 1.0}, "second"),
+        ({"method": "b", "tolerance_m": 1.0}, "first"),
+        # At a value that the other was not given, or without the parameter.
+        ({"method": "b", "tolerance_m": 3.0}, "first"),
+        ({"method": "b", "extra": 2.0}, "first"),
+        # Variants of one method are all held against the reference.
+        ({"tolerance_m": 2.0}, "first"),
+    ],
+)
+def test_methods_are_paired_at_the_value_that_both_sweep(
+    own: dict[str, float], partner: str
+) -> None:
+    known = {
+        "first": called(tolerance_m=1.0, seed=5.0),
+        "second": called(tolerance_m=2.0, seed=5.0),
+        "own": called(**own),
+    }
+    assert module._alike(known, "first", "own") == partner
+    assert module._alike(known, "first", "unheard-of") == "first"
+    assert module._alike({"own": known["own"]}, "first", "own") == "first"
+
+
+def test_one_dataset_compares_nothing() -> None:
+    assert module.over_datasets({}) == ()
+    (cell_,) = swept_cells = [cell("plane@data=hall,plane=a")]
+    assert cell_.assignment["data"] == "hall"
+    alone = HeldRun(path=Path("run.h5"), record=record(swept_cells))
+    assert module.over_datasets({"hall": alone}) == ()
+
+
+def leading(n_methods: int, p: float) -> Any:
+    """A number in which every other method is better and the rest is worse than the reference."""
+    methods = [
+        SimpleNamespace(
+            name=f"m{k}",
+            against="m0" if k else "",
+            paired=SimpleNamespace(p=p, effect=0.5 if k % 2 else -0.5),
+        )
+        for k in range(n_methods + 1)
+    ]
+    return SimpleNamespace(sense=Sense.LESS, methods=methods)
+
+
+def test_who_leads_is_said_of_six_at_most() -> None:
+    judged_not = SimpleNamespace(sense=Sense.NEITHER, methods=leading(2, 0.01).methods)
+    assert module.who_leads([judged_not], 9) == ""
+    assert module.who_leads([leading(0, 0.01)], 9) == ""
+    few = module.who_leads([leading(2, math.nan)], 5)
+    assert "5 datasets are too few for a test" in few
+    assert "too few of the datasets differ" in module.who_leads([leading(2, math.nan)], 6)
+    assert module.who_leads([leading(2, 0.051)] * 3, 9) == (
+        "Nobody is shown to lead in any of 3 numbers (p below 0.05)"
+    )
+    said = module.who_leads([leading(2, 0.049), leading(2, 0.5)], 9)
+    assert "m1 against m0: better in 1, worse in 0 of 2 numbers" in said
+    assert "m2 against m0: better in 0, worse in 1 of 2 numbers" in said
+    six, seven = (module.who_leads([leading(n, 0.01)], 9) for n in (6, 7))
+    assert (six.count(" against "), "more" in six) == (6, False)
+    assert (seven.count(" against "), seven.endswith("; and 1 more")) == (6, True)
 
 
 def measured(value: float, environment: str = "one") -> Any:

@@ -14,7 +14,8 @@ from orthoflow_provenance.model import Metric, PublishedFile
 from orthoflow.errors import StoreError
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
-from orthoflow.report import write_figures, write_page, write_report
+from orthoflow.report import comparisons, write_figures, write_page, write_report
+from orthoflow.report.combinations import Measured
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
@@ -23,7 +24,7 @@ from orthoflow.report.overlays import magnification_for, residuals_on_wall
 from orthoflow.report.pages import cited
 from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
-from orthoflow.report.summaries import answers, limits
+from orthoflow.report.summaries import answers, citations, limits
 from tests.report_runs import (
     FOCAL_PX,
     FRAME,
@@ -108,6 +109,25 @@ def test_figures_lie_beside_the_page_as_png_and_svg(compared: Run, tmp_path: Pat
     for path in tmp_path.rglob("figures/**/*.png"):
         assert path.read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "figures" / "graph.svg").read_text().startswith("<svg xmlns=")
+
+
+def test_only_a_page_beside_its_figures_leads_to_their_files(compared: Run, tmp_path: Path) -> None:
+    write_page(compared, tmp_path / "report.html")
+    assert 'href="figures/' in (tmp_path / "report.html").read_text()
+    write_report([compared], tmp_path / "other.html")
+    assert 'href="figures/' not in (tmp_path / "other.html").read_text()
+
+
+def test_what_was_skipped_asks_for_no_citation() -> None:
+    cells = [
+        cell("plane", citations=("Planes, 2015",)),
+        cell("wall", citations=("Planes, 2015", "Walls, 2016")),
+        cell("photo", status="skipped", citations=("Photos, 2017",)),
+    ]
+    assert citations(run(*cells)) == {
+        "Planes, 2015": ("plane.toy", "wall.toy"),
+        "Walls, 2016": ("wall.toy",),
+    }
 
 
 def test_figures_beyond_the_budget_are_drawn_smaller(
@@ -294,10 +314,53 @@ def test_a_busy_machine_ranks_no_times() -> None:
         ("0.08", Mark.NONE),
         ("0.11", Mark.NONE),
     ]
+    # Five seconds more than those of the processor, and three times as many, are of others.
+    for wall_s, cpu_s, is_busy in (
+        *((5.9, 1.0, False), (6.1, 1.0, True), (8.9, 3.0, False), (9.1, 3.0, True)),
+        *((9.1, 0.0, False),),
+    ):
+        table = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", wall_s, cpu_s))])
+        assert table is not None
+        assert [one.is_busy for one in table.rows] == [False, is_busy]
+    # What ran for a second and longer is told to a tenth; the largest memory counts.
+    cells = [
+        cell("plane@plane=hough", wall_s=0.75, peak_rss_mib=1234.6),
+        cell("wall@plane=hough", wall_s=0.75, peak_rss_mib=99.0),
+        cell("plane@plane=ransac", wall_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("wall@plane=ransac", status="failed", error_message="no wall"),
+        cell("plane@plane=region", wall_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("wall@plane=region", wall_s=0.0),
+    ]
+    table = comparison_table([run(*cells)])
+    assert table is not None
+    assert [(one.time.text, one.memory.text) for one in table.rows] == [
+        *(("1.5", "1235"), ("", ""), ("1.00", "50")),
+    ]
+    assert [one.remark for one in table.rows][::2] == [
+        "",
+        "1 of 2 steps with loading and compiling in their time",
+    ]
+    # By how much the clock may be wrong: a tenth of a second for either.
+    for wall_s, marks in ((0.6, [Mark.NONE, Mark.NONE]), (0.7, [Mark.BEST, Mark.WORST])):
+        told = comparison_table([run(row("hough", 0.5, 0.5), row("ransac", wall_s, 0.5))])
+        assert told is not None
+        assert [one.time.mark for one in told.rows] == marks
     assert [one.remark for one in busy.rows] == [
         "",
         "1.6 s of processor in 22.0 s: the machine was busy, so that no time is ranked",
     ]
+
+
+@pytest.mark.parametrize(
+    ("n_repeats", "text", "note"),
+    [(1, "2", ""), (2, "2.00 ± 0.50", "mean and standard deviation of 2 repeats")],
+)
+def test_a_value_says_what_it_is_the_mean_of(n_repeats: int, text: str, note: str) -> None:
+    told = run(cell("plane"))
+    measured = Measured(value=2.0, spread=0.5, n_repeats=n_repeats, unit="", environment="e1")
+    value = comparisons._value(measured, told, comparisons.Origins.of([told]))
+    assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
+    assert comparisons._value(None, told, comparisons.Origins.of([told])) == Value()
 
 
 def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
@@ -562,6 +625,17 @@ def test_a_glance_says_who_leads_and_what_is_shared_leads_nobody(compared: Run) 
     assert second.n_worst >= 2
     assert (last.name, last.shortfall, last.n_best) == ("plane=broken", "failed", 0)
     row, *others = table.rows
+    # At most three are named.
+    for n_best, named in ((3, 3), (4, 4)):
+        values = [
+            Value(mark=Mark.BEST if index < n_best else Mark.NONE)
+            for index in range(len(table.columns))
+        ]
+        (leader,) = replace(
+            table, rows=(replace(row, values=tuple(values), time=Value(), memory=Value()),)
+        ).glance
+        assert (leader.n_best, len(leader.best_in)) == (n_best, named)
+        assert (leader.best_in[-1] == "...") is (n_best == 4)
     best = tuple(replace(value, mark=Mark.BEST) for value in row.values)
     alike = [replace(one, values=best) for one in (row, *others[:1])]
     shared = replace(table, rows=tuple(alike)).glance

@@ -204,6 +204,12 @@ def test_a_sample_tells_a_picture_that_moved_from_noise(
     assert bool(problem) == is_noticed, problem
 
 
+def test_an_array_that_only_one_of_two_samples_has_is_named() -> None:
+    one = Sample(shape=[1], values=[2.0])
+    for pair in (({"a": one}, {"a": one, "b": one}), ({"b": one, "a": one}, {"a": one})):
+        assert sample_problem(*pair, {}) == "only one of them has b"
+
+
 @pytest.mark.parametrize(
     ("after", "is_noticed"), [(0.0758759669, False), (0.0789, True), (-0.0759018587, True)]
 )

@@ -14,6 +14,7 @@ import pytest
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
+from orthoflow.workflow import drafting as module
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.drafting import draft_workflow
 from orthoflow.workflow.inputs import resolve_input_files
@@ -245,6 +246,15 @@ def test_what_is_wrong_in_the_same_way_is_said_once() -> None:
     others = [found("unknown", f"f{k}.doc", "no format of ours") for k in range(6)]
     told = draft_workflow([found("scan", "hall.laz"), *others], Path("flow.yaml"), None)
     assert told.left_out == ["f0.doc, f1.doc, f2.doc, f3.doc and 2 more: no format of ours"]
+
+
+def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None:
+    drafting = module._Drafting(by_kind={}, target=tmp_path / "w.yaml", recipe="direct")
+    image = Recognised(kind="other", path=tmp_path / "wall.tif", said="an orthoimage")
+    assert drafting._input_line("other", [image]).splitlines()[1:] == [
+        *("    files:", "      - wall.tif", "      - wall.json"),
+    ]
+    assert "{files: wall.tif}" in drafting._input_line("scan", [image])
 
 
 def test_a_recipe_of_photos_needs_some() -> None:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from pydantic import Field, ValidationError, field_validator
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, PluginError
+from orthoflow.files.yaml_positions import Position
+from orthoflow.sdk import MethodParams
+from orthoflow.workflow import parameters as module
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import InvalidArgumentsError
+from orthoflow.workflow.problems import InvalidArgumentsError, InvalidWorkflowError, ProblemLog
 from tests.laboratories import (
     GOOD,
     load,
@@ -24,6 +30,13 @@ SETS = {
     "text that YAML 1.1 takes for a flag": ("cloud.up=y", "cloud", "", "up", "y"),
     "inside a mapping": (
         "plane.hough2d.limits.low_m=0.5",
+        "plane",
+        "hough2d",
+        "limits",
+        {"low_m": 0.5, "high_m": 1.0},
+    ),
+    "inside a mapping of whoever has it": (
+        "plane.limits.low_m=0.5",
         "plane",
         "hough2d",
         "limits",
@@ -49,6 +62,55 @@ def test_set_without_variant_reaches_every_variant_that_has_the_parameter(
     plane = load(GOOD, write, catalog, "plane.iterations=5").steps["plane"]
     assert plane.variant("ransac").params["iterations"] == 5
     assert "iterations" not in plane.variant("hough2d").params_set
+
+
+def test_parameters_that_disagree_are_told_where_the_method_stands(
+    catalog: Catalog, write: Path
+) -> None:
+    text = GOOD.replace("use: plane.hough2d, params: {cell_m: 0.02}", "use: plane.hough2d")
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load(text, write, catalog, "plane.hough2d.cell_m=0.06")
+    (problem,) = caught.value.problems
+    line = 1 + text.splitlines().index("      hough2d: {use: plane.hough2d}")
+    assert (problem.line, problem.path) == (line, "steps.plane.variants.hough2d.params")
+    assert problem.message.endswith("cell_m 0.06 must not exceed tolerance_m")
+
+
+def test_a_parameter_without_a_default_is_asked_for() -> None:
+    class Params(MethodParams):
+        height_m: float = Field(description="Height.")
+
+    with pytest.raises(ValidationError) as caught:
+        Params.model_validate({})
+    told: Any = SimpleNamespace(id="plane.level")
+    reporter = module._Reporter(variant=told, info=told, reports={}, log=told, blame=None)
+    (details,) = caught.value.errors()
+    assert reporter._message(details) == "plane.level needs parameter height_m"
+
+
+def test_a_validator_that_fails_is_a_fault_of_its_plugin() -> None:
+    class Params(MethodParams):
+        height_m: float = Field(1.0, description="Height.")
+
+        @field_validator("height_m")
+        @classmethod
+        def _fails(cls, _value: float) -> float:
+            raise RuntimeError("the moon is full")
+
+    log = ProblemLog(file="flow.yaml", lines=("x",))
+    draft: Any = SimpleNamespace(
+        params=None,
+        info=SimpleNamespace(id="plane.level", method=SimpleNamespace(Params=Params)),
+        position=Position(line=1, column=1),
+        path="steps.x",
+    )
+    override = module.Override(report=lambda _: None, keys=("height_m",), value=2.0)
+    found = module.resolve_params(draft, [override], log)
+    assert (found.resolved, found.as_set) == ({}, {"height_m": 2.0})
+    with pytest.raises(
+        PluginError, match=r"checking the parameters of plane\.level failed: .*moon"
+    ):
+        log.raise_any()
 
 
 def test_the_last_of_two_sets_wins_and_can_mend_a_value_of_the_file(
