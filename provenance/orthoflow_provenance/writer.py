@@ -6,7 +6,7 @@ import dataclasses
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -121,11 +121,9 @@ def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
 
 def _own_folders() -> set[str]:
     folders = {str(Path.cwd())}
-    try:
+    # Where no home directory is known no text can name it.
+    with suppress(RuntimeError):
         folders.add(str(Path.home()))
-    except RuntimeError:
-        # No home directory is known, so no text can name it.
-        return folders
     return folders
 
 

@@ -43,8 +43,6 @@ from orthoflow_plugins.read.cameras import GivenByName
 from orthoflow_plugins.read.figures import ContactSheet
 from orthoflow_plugins.read.masks import Masks, beside_photos
 
-# Bits per channel that orthoimages can have.
-_BITS: Final = 16
 _PLAIN_BITS: Final = 8
 _NAMED: Final = 3
 
@@ -274,7 +272,7 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
         if mask is not None:
             of_face = of_face & decode_mask(mask, f"the mask of {photo.name}")
         mask = encode_png(np.where(of_face, np.uint8(255), np.uint8(0)))
-    return read if mask is None else replace(read, photo=replace(photo, mask=mask))
+    return replace(read, photo=replace(photo, mask=mask))
 
 
 def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
@@ -430,11 +428,6 @@ def _described(read: _ReadPhoto) -> str:
 def _warn(
     ctx: StepContext, read: Sequence[_ReadPhoto], calibration: CalibratedLenses | None
 ) -> None:
-    deep = [item.photo.name for item in read if (stated_bits(item.photo.encoded) or 0) > _BITS]
-    if deep:
-        ctx.warn(
-            f"{_counted(deep)}: more than {_BITS} bits per channel, of which {_PLAIN_BITS} are used"
-        )
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
         ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")

@@ -154,7 +154,7 @@ class ReadScan(Method):
         if columns is not None and not any(file.format_name == "text" for file in files):
             ctx.warn("columns only speaks of text files, and none was read; it has no effect")
         assembly = CloudAssembly(ctx, files, unit_m, box_m)
-        _warn_of_missing_fields(ctx, files, assembly)
+        _warn_of_missing_fields(ctx, files)
         with read_ahead(files, inputs.files.paths, columns, cores=ctx.cores) as read:
             for file in read:
                 # Damaged numbers overflow on their way; what is not finite is dropped and counted.
@@ -284,12 +284,10 @@ def _judged_intensity(
     return None, "luminance"
 
 
-def _warn_of_missing_fields(
-    ctx: StepContext, files: list[ScanFile], assembly: CloudAssembly
-) -> None:
+def _warn_of_missing_fields(ctx: StepContext, files: list[ScanFile]) -> None:
     for name, title in (("intensity", "intensity"), ("rgb", "colours")):
         without = [file.name for file in files if name not in file.fields]
-        if without and len(without) < len(files) and name not in assembly.fields:
+        if 0 < len(without) < len(files):
             ctx.warn(
                 f"{', '.join(without[:3])}{' ...' if len(without) > 3 else ''} has no {title}, "
                 f"the other files have: the cloud goes without {title}"

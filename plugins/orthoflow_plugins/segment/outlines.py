@@ -115,7 +115,7 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Middles (n, 2) of the cells' sides along the border, counter-clockwise for the viewer."""
     from orthoflow.files.polygons import outlines
 
-    found = outlines(np.where(cells, 0, -1).astype(np.int16))
+    found = outlines(cells.astype(np.int16) - 1)
     if len(found) != 1:
         raise MethodError(f"an area of cells must hang together, got {len(found)} parts")
     ring = found[0][1][0][:-1]

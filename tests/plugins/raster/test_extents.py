@@ -324,6 +324,9 @@ def test_a_fifth_of_a_line_of_cells_must_be_covered(high_m: float, grows: bool) 
     ("depths_m", "front_m"),
     [
         ((0.12,), 0.14),
+        # Of 2.5 cm each, five steps hang together and six do not.
+        ((0.14,), 0.17),
+        ((0.16,), 0.1),
         ((0.1, 0.2, 0.3, 0.4), 0.42),
         # Where a column ends beyond reach, nothing of it is relief.
         ((0.1, 0.2, 0.3, 0.4, 0.5, 0.58), 0.1),
@@ -339,6 +342,7 @@ def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
     found = extent(wall(), *steps, least_m=0.1)
     # A step in depth of 2.5 cm, and 2 cm beyond the relief.
     assert found.front_m == pytest.approx(front_m, abs=0.03)
+    assert found.front_m == round(found.front_m, 3)
     assert found.behind_m == 0.1
 
 
@@ -352,6 +356,13 @@ def test_what_is_set_is_not_looked_for() -> None:
     step = part((1.0, 2.0), 0.12, (1.0, 2.0))
     found = extent(wall(), step, front_m=0.07)
     assert (found.front_m, found.behind_m) == (0.07, 0.15)
+    back = part((1.0, 2.0), -0.11, (1.0, 2.0))
+    found = extent(wall(), back, behind_m=0.05)
+    assert (found.front_m, found.behind_m) == (0.15, 0.05)
+    # Of steps of 2.5 cm the farther end, and 2 cm beyond.
+    found = extent(wall(), back, least_m=0.06)
+    assert found.buffer_m == (0.06, pytest.approx(0.14, abs=0.03))
+    assert found.behind_m == round(found.behind_m, 3)
     both = Reach(front_m=0.07, behind_m=0.3, least_m=0.15)
     assert both.is_set
     assert both.as_set.buffer_m == (0.07, 0.3)
@@ -466,6 +477,18 @@ def test_of_several_planes_beside_one_side_the_innermost_bounds(
     # That of 0.1 does not stand there.
     sides = {bound.side: bound.beyond_m for bound in found}
     assert sides == {"left": pytest.approx(0.3), "top": pytest.approx(0.2)}
+
+
+def test_what_lies_well_before_or_behind_a_wall_and_no_farther_than_a_metre_stands_there() -> None:
+    depths_m = np.array([0.34, 0.36, 0.99, 1.01, -0.34, -0.36, -0.99, -1.01])
+    points = np.column_stack([np.full(8, 0.25), -depths_m, np.full(8, 0.5)])
+    cloud = scenes.cloud_of(np.vstack([points, points + np.array([0.0, 0.0, HEIGHT_M + 1.0])]))
+    rectangle = rectangle_of(planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)))
+    around = extents._Around.of(sampled(cloud), rectangle, (WIDTH_M, HEIGHT_M))
+    # The second of each lies too far above the wall.
+    expected = [[0.25, HEIGHT_M - 0.5, depth] for depth in (-0.99, -0.36, 0.36, 0.99)]
+    found = around.places_m.T[np.argsort(around.places_m[2])]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("side", ["left", "top"])

@@ -281,6 +281,41 @@ def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:
     assert "the EXIF data of photo a.jpg are damaged; what is readable was taken" in read.warnings
 
 
+def test_a_line_of_the_log_tells_what_is_known_of_each_photo(tmp_path: Path) -> None:
+    exif = made.exif_block({made.MODEL: "Pen", made.ORIENTATION: 6}, {made.FOCAL_35MM: 36})
+    files = {
+        "a.png": encode_png(made.picture(32, 16)),
+        "b.png": cv2.imencode(".png", made.picture().astype(np.uint16))[1].tobytes(),
+        "c.jpg": made.jpeg(made.picture(), exif),
+        "d.jpg": encode_jpeg(made.picture()),
+        "d_mask.png": encode_png(np.eye(48, 64, dtype=np.uint8) * 255),
+    }
+    paths = made.write(tmp_path, files)
+    calibration = tmp_path / "calibration.yaml"
+    calibration.write_text(f"cameras: {{d.jpg: {CAMERA}}}")
+    said: list[str] = []
+    ctx = StepContext(
+        rng=np.random.default_rng(0),
+        cores=1,
+        scratch=tmp_path,
+        listen=lambda event: said.append(event.text) if event.kind == "log" else None,
+    )
+    inputs = ReadPhotos.In(
+        files=InputFiles(name="photos", paths=paths),
+        calibration=InputFiles(name="calibration", paths=(calibration,)),
+    )
+    ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
+    diagonal_px = 36 / np.hypot(36, 24) * np.hypot(64, 48)
+    held = "EXIF orientation 6 (not applied)"
+    lens = f"focal length {diagonal_px:.1f} px from the 35 mm equivalent over the diagonal"
+    assert said == [
+        "a.png: 32 x 16, no EXIF focal length",
+        "b.png: 64 x 48, 16 bits per channel, no EXIF focal length",
+        f"c.jpg: 64 x 48, Pen, {held}, {lens}",
+        "d.jpg: 64 x 48, calibrated, focal length 60.0 px, masked",
+    ]
+
+
 # Other files in the folder
 
 

@@ -97,6 +97,128 @@ def test_coarse_clouds_are_judged_on_larger_pieces_and_few_points_not_at_all() -
     assert judge_quality(offsets(room), None) is None
 
 
+def test_the_largest_pieces_are_a_metre_wide() -> None:
+    rng = np.random.default_rng(5)
+    u, v = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(0.0, 9.0, 0.12)]))
+    thin = judge_quality(offsets(np.column_stack([u, v, rng.normal(0.0, 0.01, u.size)])), None)
+    assert thin is not None
+    assert thin.side_m == 1.0
+    assert thin.sigma_m == pytest.approx(0.01, rel=0.15)
+
+
+def test_pieces_of_thirty_points_are_looked_at_and_three_hundred_at_most() -> None:
+    rng = np.random.default_rng(6)
+    cubes = [(i, j, k) for i in range(10) for j in range(10) for k in range(7)]
+    counts = np.where(np.arange(len(cubes)) % 7 == 0, 29, 30)
+    counts[0] = 29
+    corners = np.repeat(np.array(cubes) * 1.0, counts, axis=0)
+    points = corners + rng.uniform(0.01, 0.99, corners.shape)
+    points[0] = 0.0
+    found = list(quality_module._indices_of_pieces(offsets(points), 1.0))
+    # One cube in three, of which six in seven have points enough.
+    assert 700 / 3 * 0.7 < len(found) < 300
+    for piece in found:
+        assert len(piece) == 30
+        assert len(np.unique(np.floor(points[piece]), axis=0)) == 1
+
+
+def square(across: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+    """Points (1600, 3) of a square of 10 cm, so far before it in turn."""
+    u, v = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(40) * 0.0025]))
+    return np.column_stack([u, np.broadcast_to(across, u.shape), v])
+
+
+def shuffled(*values: float) -> NDArray[np.float64]:
+    return np.random.default_rng(1).permutation(np.resize(values, 1600))
+
+
+def test_a_piece_is_as_thick_as_its_points_lie_apart() -> None:
+    even = shuffled(*np.linspace(-0.002, 0.002, 1600))
+    scan = np.zeros(1600, dtype=np.uint16)
+    piece = quality_module._measured(square(even), scan, 0.1)
+    assert piece is not None
+    assert piece.sigma_m == pytest.approx(1.4826 * 0.001, rel=0.01)
+    assert piece.width_95_m == pytest.approx(0.95 * 0.004, rel=0.005)
+    assert piece.scan_step_m == pytest.approx(0.0025, rel=0.01)
+    assert np.isnan([piece.apart_m, piece.sigma_apart_m]).all()
+    # No more than 4000 points of a scan count, from its first on.
+    several = np.concatenate([square(even), square(even), square(even)[:800], square(5.0 * even)])
+    several[:, 0] += 0.0005 * np.repeat(np.arange(4), [1600, 1600, 800, 1600])
+    many = quality_module._measured(several, np.zeros(len(several), dtype=np.uint16), 0.1)
+    assert many is not None
+    assert many.sigma_m == pytest.approx(piece.sigma_m, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("points", "is_surface"),
+    [
+        (square()[::54], True),
+        (square()[::56], False),
+        # Scattered by 9 and by 11 mm, in a square of 10 cm.
+        (square(shuffled(0.009 / 1.4826, -0.009 / 1.4826)), True),
+        (square(shuffled(0.011, -0.011)), False),
+        # A strip as wide as half of the square, and one as a quarter.
+        (square()[square()[:, 0] < 0.055], True),
+        (square()[square()[:, 0] < 0.025], False),
+        # A fifth of the points six times as far off as the others scatter, and three times.
+        (square(shuffled(*4 * [0.001, -0.001], 0.006 * 1.4826, -0.006 * 1.4826)), False),
+        (square(shuffled(*4 * [0.001, -0.001], 0.003 * 1.4826, -0.003 * 1.4826)), True),
+    ],
+    ids=["30 points", "29", "scatter", "more", "strip", "narrow", "edge of another", "noise"],
+)
+def test_a_piece_is_one_surface_that_its_points_cover(
+    points: NDArray[np.float64], is_surface: bool
+) -> None:
+    scan = np.zeros(len(points), dtype=np.uint16)
+    assert (quality_module._measured(points, scan, 0.1) is not None) is is_surface
+
+
+def test_the_scan_farthest_from_the_fullest_one_tells_how_far_scans_lie_apart() -> None:
+    fine = shuffled(0.001, -0.001, 0.0)
+    points = [square(fine), square(0.004 + 2.0 * fine)[::2], square(0.002)[1::2]]
+    scan = np.repeat(np.array([7, 2, 5], dtype=np.uint16), [1600, 800, 800])
+    across = np.concatenate([part[:, 1] for part in points])
+    middles = {one: float(np.median(across[scan == one])) for one in (7, 2, 5)}
+    apart, sigma = quality_module._farthest(across, scan, middles, 7)  # type: ignore[arg-type]
+    assert apart == pytest.approx(0.004)
+    # A median of n values is 1.2533 / sqrt(n) times as sure as one of them.
+    one, other = 1.4826 * 0.001 / np.sqrt(1600), 1.4826 * 0.002 / np.sqrt(800)
+    assert sigma == pytest.approx(1.2533 * np.hypot(one, other))
+    piece = quality_module._measured(np.concatenate(points), scan, 0.1)
+    assert piece is not None
+    assert piece.apart_m == pytest.approx(0.004, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_apart_m", "apart_m", "disagrees"),
+    [
+        (0.0002, 0.0001, 0.0009, False),
+        (0.0002, 0.0001, 0.0011, True),
+        (0.003, 0.0001, 0.0029, False),
+        (0.003, 0.0001, 0.0031, True),
+        (0.0002, 0.001, 0.0029, False),
+        (0.0002, 0.001, 0.0031, True),
+    ],
+)
+def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
+    sigma_m: float, sigma_apart_m: float, apart_m: float, disagrees: bool
+) -> None:
+    piece = quality_module._Piece(
+        sigma_m=sigma_m,
+        width_95_m=0.01,
+        scan_step_m=0.002,
+        apart_m=apart_m,
+        sigma_apart_m=sigma_apart_m,
+    )
+    found = quality_module._summed_up([piece] * 20, 0.1)
+    assert (found.scans_apart_m, found.sigma_apart_m) == (apart_m, sigma_apart_m)
+    assert found.disagrees == disagrees
+    # Nineteen pieces that two scans show say nothing.
+    few = quality_module._summed_up([piece] * 19, 0.1)
+    assert (few.scans_apart_m, few.sigma_apart_m, few.disagrees) == (None, 0.0, False)
+    assert few.n_pieces == 19
+
+
 def test_dense_clouds_are_judged_on_a_part_of_their_pieces() -> None:
     dense = judge_quality(offsets(wall(step_m=0.0015, noise_m=0.001)), None)
     assert dense is not None

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import assembly
+from orthoflow_plugins.read import scan as module
 from orthoflow_plugins.read.assembly import rounding_m
 from orthoflow_plugins.read.figures import polar_view_png
 from orthoflow_plugins.read.scales import ColourScale, choose_scale, normalise
@@ -21,6 +22,7 @@ from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 from orthoflow.errors import CancelledStepError, InputError, StoreError
 from orthoflow.files.images import decode_image
+from orthoflow.files.points.copc import Wish
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import StepContext
 from tests import scan_files
@@ -96,6 +98,11 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     assert np.abs(cloud.origin - shift).max() < 5.0
     assert cloud.source["unit"] == unit
     assert cloud.x.dtype == np.float32
+    sides_m = np.ptp(world_m, axis=0)
+    assert [read.metrics[f"extent_{axis}_m"] for axis in "xyz"] == pytest.approx(sides_m, abs=1e-5)
+    assert not any(said in read.warnings for said in ("are rounded to", "are kept to"))
+    # Offsets of five to eight metres.
+    assert cloud.source["resolution_m"] == 2.0**-21
 
 
 def test_a_box_keeps_the_points_in_it_and_on_its_faces(
@@ -201,6 +208,16 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
     cloud = read(write_text(tmp_path / "a.xyz", world))
     np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
     assert "coordinates are kept to 62.50 mm only" in read.warnings
+
+
+@pytest.mark.parametrize(("wide_m", "is_coarse"), [(1000.0, False), (1030.0, True)])
+def test_beyond_five_hundred_metres_offsets_are_coarser_than_half_a_tenth_of_a_millimetre(
+    tmp_path: Path, read: Reader, wide_m: float, is_coarse: bool
+) -> None:
+    steps = np.linspace(0.0, wide_m, 21)[:, None] * [1.0, 0.0, 0.0]
+    read(write_text(tmp_path / "a.xyz", steps))
+    said = f"reach {wide_m / 2:.0f} m from the origin of the cloud, where coordinates are kept to "
+    assert (f"{said}0.06 mm only" in read.warnings) == is_coarse
 
 
 @pytest.mark.parametrize("up", ["z", "x", "-x", "y", "-y", "-z"])
@@ -327,6 +344,7 @@ def test_stations_belong_to_scans_in_their_order(
     assert cloud.scan is not None
     np.testing.assert_array_equal(cloud.scan, np.repeat([0, 1], 400))
     assert read.metrics["n_scans"] == 2
+    assert read.metrics["n_stations"] == 2
 
 
 def test_fields_that_only_some_files_have_are_left_out_with_a_word(
@@ -337,6 +355,7 @@ def test_fields_that_only_some_files_have_are_left_out_with_a_word(
     cloud = read(first, second)
     assert cloud.intensity is None
     assert "a.xyz has no intensity, the other files have" in read.warnings
+    assert "has no colours" not in read.warnings
 
 
 # Stations
@@ -455,6 +474,9 @@ def test_the_user_can_set_full_intensity(
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
     np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
     assert "199 intensities lie beyond 0..200 (intensity_max) and were clipped" in read.warnings
+    cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=399.0)
+    np.testing.assert_allclose(cloud.intensity, np.arange(400) / 399, atol=1e-6)
+    assert "were clipped" not in read.warnings
 
 
 def test_zero_intensity_and_zero_colours_are_absent_not_black(
@@ -601,6 +623,11 @@ def test_a_picture_from_above_is_drawn(
     read(write_text(tmp_path / "a.xyz", points))
     (figure,) = read.ctx.figures
     assert figure.path.read_bytes().startswith(b"\x89PNG")
+    # Of a scan with rows and columns, what the scanner saw as well.
+    places = np.indices((8, 10)).reshape(2, -1).T * 0.1
+    table = np.column_stack([places, np.ones(80), np.linspace(0.0, 1.0, 80)])
+    read(scan_files.write_ptx(tmp_path / "a.ptx", [(table, 10, np.eye(4))]))
+    assert [figure.name for figure in read.ctx.figures] == ["plan", "polar", "scan-lines"]
 
 
 @pytest.mark.parametrize(
@@ -644,6 +671,32 @@ def test_columns_without_a_text_file_are_said_to_do_nothing(
 ) -> None:
     read(scan_files.write_las(tmp_path / "a.laz", points), columns="x y z")
     assert "columns only speaks of text files" in read.warnings
+    text = write_text(tmp_path / "a.xyz", points)
+    for columns in ("x y z", None):
+        read(text, columns=columns)
+        assert "columns only speaks" not in read.warnings
+
+
+@pytest.mark.parametrize(("unit", "unit_m"), [("m", 1.0), ("mm", 0.001)])
+def test_readers_are_told_box_and_spacing_in_the_unit_of_the_file(
+    read: Reader, unit: str, unit_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class AskedError(Exception):
+        pass
+
+    def asked(*_: object, wish: Wish, **__: object) -> None:
+        raise AskedError(wish)
+
+    monkeypatch.setattr(module, "open_scan", asked)
+    box = [[0.5, 0.0, -2.0], [1.0, 3.0, 4.0]]
+    with pytest.raises(AskedError) as caught:
+        read(Path("a.laz"), unit=unit, gsd_m=0.02, box=box)
+    (wish,) = caught.value.args
+    np.testing.assert_allclose(wish.box, np.array(box) / unit_m)
+    assert wish.spacing == pytest.approx(0.02 / unit_m)
+    with pytest.raises(AskedError) as caught:
+        read(Path("a.laz"), unit=unit)
+    assert caught.value.args == (Wish(box=None, spacing=None),)
 
 
 def test_too_little_scratch_space_is_said_before_anything_is_written(

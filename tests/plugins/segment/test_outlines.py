@@ -288,3 +288,84 @@ def test_a_side_shorter_than_a_cell_is_seen_too(length: float) -> None:
     corners = np.array([[30.5, 20.5], [30.5, 20.5 + length], [30.5, 20.5 + length]])
     shares = module._seen_shares(corners, np.ones(SHAPE, dtype=np.bool_))
     np.testing.assert_array_equal(shares, [1.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(("off_cells", "n_sides"), [(0.9, 4), (1.1, 5)])
+def test_sides_between_which_a_corner_stands_out_by_a_cell_at_most_are_one(
+    off_cells: float, n_sides: int
+) -> None:
+    ring = np.insert(CORNERS, 2, [80.0, BOTTOM + off_cells], axis=0)
+    sides = [
+        module._Side(first=k, last=(k + 1) % 5, begin=begin, end=end, scatter=2.0)
+        for k, (begin, end) in enumerate(zip(ring, np.roll(ring, -1, axis=0), strict=True))
+    ]
+    found = module._joined(ring, sides)
+    np.testing.assert_array_equal([side.begin for side in found], CORNERS if n_sides == 4 else ring)
+    np.testing.assert_array_equal([side.end for side in found[-2:]], CORNERS[[3, 0]])
+
+
+def test_where_the_search_for_corners_began_none_is_left() -> None:
+    # Of a step of one cell OpenCV leaves the end that it began with.
+    for width in (31, 34, 37):
+        cells = block(10, 10, 60, 40)
+        cells[9, 28 : 28 + width] = True
+        ring = module._ring(cells)
+        found = ring[module._corner_places(ring)]
+        assert len(found) == 4
+        for corner in ((10, 10), (10, 40), (60, 40), (60, 10)):
+            assert np.linalg.norm(found - corner, axis=1).min() < 2.0
+
+
+@pytest.mark.parametrize(
+    ("n_others", "cut", "is_cut"), [(1, 7.9, True), (1, 8.1, False), (0, 3.0, False)]
+)
+def test_a_short_side_that_cuts_a_corner_goes_unless_only_three_are_left(
+    n_others: int, cut: float, is_cut: bool
+) -> None:
+    # Two sides that meet in the origin, and a short one that ends on them.
+    for ends in ([[-cut, 0.0], [0.0, 1.0]], [[-1.0, 0.0], [0.0, cut]]):
+        begin, end = np.array(ends)
+        short = module._Side(first=0, last=1, begin=begin, end=end, scatter=2.0)
+        far = [side_at(30.0, (99.0, 50.0))] * n_others
+        sides = [side_at(0.0, (-20.0, 0.0)), short, side_at(90.0, (0.0, 20.0)), *far]
+        assert (short not in module._without_short_cuts(sides)) == is_cut
+
+
+def test_the_line_of_a_side_goes_through_what_lies_between_its_ends() -> None:
+    def lifted(*columns: int) -> NDArray[np.float64]:
+        ring = np.column_stack([np.arange(60.0), np.zeros(60)])
+        ring[list(columns), 1] = 0.7
+        return ring
+
+    # Three cells at either end belong to the corners.
+    ends = lifted(10, 11, 12, 48, 49, 50)
+    side = module._side(ends, 10, 50)
+    np.testing.assert_array_equal([side.begin, side.end], ends[[10, 50]])
+    assert side.middle is not None
+    assert side.direction is not None
+    np.testing.assert_allclose([side.scatter, side.middle[1], side.direction[1]], 0.0, atol=1e-9)
+    assert side.middle[0] == pytest.approx(30.0)
+    # Six inner middles of 35 that lie 0.7 higher.
+    side = module._side(lifted(13, 14, 15, 45, 46, 47), 10, 50)
+    share = 6 / 35
+    assert side.middle is not None
+    assert side.middle[1] == pytest.approx(0.7 * share)
+    assert side.scatter == pytest.approx(0.7 * np.sqrt(share * (1.0 - share)), rel=1e-6)
+    # A quarter of a short side, and a side over the place where the ring begins.
+    side = module._side(np.roll(lifted(20, 22, 28, 30), -25, axis=0), 55, 5)
+    assert side.middle is not None
+    np.testing.assert_allclose([side.middle, [0.0, 0.7]], [[25.0, 0.0], [0.0, 0.7]], atol=1e-9)
+    np.testing.assert_array_equal([side.begin, side.end], [[20.0, 0.7], [30.0, 0.7]])
+
+
+def test_a_side_is_placed_by_as_many_points_as_fit_on_it() -> None:
+    ends = {"begin": np.array([90.0, 40.0]), "end": np.array([90.0, 20.0])}
+    known = {"middle": np.array([90.0, 30.0]), "direction": np.array([0.0, -1.0])}
+    places = {"first": 0, "last": 20, "scatter": 3.0}
+    for spacing, scatter in ((5.0, 1.5), (40.0, 3.0)):
+        border = (2.0**2 + spacing**2) / 12.0
+        side = module._Side(**places, **ends, **known)
+        assert module._sigma(side, spacing) ** 2 == pytest.approx(border + scatter**2)
+        # A side without a line of its own has its corners alone.
+        side = module._Side(**places, **ends)
+        assert module._sigma(side, spacing) ** 2 == pytest.approx(border + 9.0)

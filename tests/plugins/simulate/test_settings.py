@@ -70,8 +70,11 @@ def test_a_gap_says_how_much_of_what_the_laser_sees_is_its_own(
     # As it is designed.
     assert rng is None
     errors = room._errors(Params.model_validate(params), 4)
-    assert (errors.inversion > 0.0) == (inversion > 0.0)
+    assert errors.inversion == inversion
     assert errors.band_seed == 4
+    # What is asked for stands whatever the gap.
+    asked = Params.model_validate({**params, "spectral_inversion_share": 0.25})
+    assert room._errors(asked, 4).inversion == 0.25
 
 
 def test_records_of_rooms_as_they_always_were_do_not_change(
