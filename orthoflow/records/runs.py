@@ -16,6 +16,8 @@ from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord, 
 from orthoflow_provenance.payloads import StoredPayload
 from orthoflow_provenance.reader import open_outputs, read_record
 
+from orthoflow.alike import first_few
+from orthoflow.catalog.wording import did_you_mean
 from orthoflow.engine.run_folder import RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
 from orthoflow.foreign_text import shown
@@ -30,6 +32,7 @@ FIGURES_FOLDER: Final = "figures"
 GRAPH_FILE: Final = "graph.svg"
 # Of a run on several datasets, a page for each.
 PAGES_FOLDER: Final = "pages"
+_MOST_NAMED: Final = 12
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -80,9 +83,12 @@ class Run:
             ArgumentError: the run has no such cell.
         """
         if address not in self.cells:
+            steps = dict.fromkeys(cell.step for cell in self.record.cells)
+            own = [cell.address for cell in self.record.cells if cell.step == address]
+            known = first_few(own or [*steps], most=_MOST_NAMED)
+            instead = " alone, but" if own else f"{did_you_mean(address, steps)}; it has"
             raise ArgumentError(
-                f"the run {self.record.run_id} has no step {address!r}; it has "
-                f"{', '.join(self.cells)}"
+                f"the run {self.record.run_id} has no step {address!r}{instead} {known}"
             )
         return self.cells[address]
 
