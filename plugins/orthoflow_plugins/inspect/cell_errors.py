@@ -307,12 +307,12 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
-    greys = np.zeros((2, *known.shape))
-    greys[0][known] = eight_bits(image.rgb[known]) @ REC_601
-    greys[1][known] = true.rgb[known].astype(np.float64) @ REC_601
+    grey, true_grey = np.zeros(known.shape), np.zeros(known.shape)
+    grey[known] = eight_bits(image.rgb[known]) @ REC_601
+    true_grey[known] = true.rgb[known].astype(np.float64) @ REC_601
     return measure_shifts(
-        GreyImage(grey=greys[0], valid=painted & known, region=(painted | filled) & known),
-        GreyImage(grey=greys[1], valid=known, region=known),
+        GreyImage(grey=grey, valid=painted & known, region=(painted | filled) & known),
+        GreyImage(grey=true_grey, valid=known, region=known),
         reach_cells=reach,
     )
 

@@ -26,6 +26,7 @@ from orthoflow_plugins.inspect.patches import (
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
+_PAIRS_AT_ONCE: Final = 1 << 16
 _RATIO_MOST: Final = 0.9
 # Half of the box that levels contrast, which passes twice.
 _LEVEL_REACH: Final = 12
@@ -216,7 +217,7 @@ class _Levelled(GreyCells):
 def _levelled(image: GreyImage) -> GreyImage:
     valid = image.valid.astype(np.float32)
     grey = np.where(image.valid, image.grey, 0.0).astype(np.float32)
-    weight = np.maximum(_smooth(valid), np.float32(1e-3))
+    weight = np.maximum(_smooth(valid), np.float32(1e-6))
     mean = _smooth(grey) / weight
     variance = np.maximum(_smooth(grey * grey) / weight - mean * mean, 0.0)
     spread = np.maximum(np.sqrt(variance), np.float32(_LEAST_CONTRAST_GREY))
@@ -338,8 +339,8 @@ def _descriptor_distances(
 ) -> NDArray[np.float64]:
     """Distances of pairs, a part at a time, so that many pairs need little room."""
     apart = np.empty(len(one))
-    for start in range(0, len(one), 1 << 16):
-        part = slice(start, start + (1 << 16))
+    for start in range(0, len(one), _PAIRS_AT_ONCE):
+        part = slice(start, start + _PAIRS_AT_ONCE)
         apart[part] = np.linalg.norm(first[one[part]] - second[other[part]], axis=1)
     return apart
 

@@ -22,7 +22,6 @@ from orthoflow_plugins.inspect.findings import rms
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-_NOTHING: Final = 255
 # Larger walls are looked at in coarser cells; rays to the borders of openings are as fine as ever.
 _CELLS_TOLD: Final = 1 << 24
 # Recesses of the scene may be so deep.
@@ -202,7 +201,8 @@ def _true_wall(
         cores=cores,
     )
     true = render(scene, told, rendering)
-    role = np.where(true.rectangle >= 0, scene.role[true.rectangle], _NOTHING)
+    # Where there is no surface there is no depth either.
+    role = scene.role[true.rectangle]
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
     face_m = float(np.median(of_face)) if of_face.size else 0.0
     deep_m = face_m - params.behind_m

@@ -47,13 +47,11 @@ class GreyCells(ABC):
 
     def fullest_part(self, side: int) -> GreyImage:
         """The tile of at most so many rows and columns with most cells that count."""
-        best, most = None, -1
-        for tile in tiles(self.shape, side):
-            part = self.cut(tile)
-            n_valid = int(np.count_nonzero(part.valid))
-            if n_valid > most:
-                best, most = part, n_valid
-        return self.whole() if best is None else best
+
+        def n_valid(tile: tuple[slice, slice]) -> int:
+            return int(np.count_nonzero(self.cut(tile).valid))
+
+        return self.cut(max(tiles(self.shape, side), key=n_valid))
 
     def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
         """A square from a corner (2,) = column, row on; beyond the border 0 and not valid."""

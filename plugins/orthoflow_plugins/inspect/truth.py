@@ -56,7 +56,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     pose_findings,
     tie_findings,
 )
-from orthoflow_plugins.inspect.patches import PatchShifts
+from orthoflow_plugins.inspect.patches import PATCH_CELLS, PatchShifts
 from orthoflow_plugins.inspect.placing import in_files, on_walls, rows_of, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     found_planes,
@@ -219,7 +219,7 @@ class InspectTruth(Method):
         numbers = {image.wall: image.number for image in orthoimages.images}
         report(findings, orthoimages.images[0].wall, numbers, ctx)
         details: dict[str, JsonValue] = {
-            "patch_cells": 32,
+            "patch_cells": PATCH_CELLS,
             "colour_share_compared": rule.colour_share,
             "seen_lattice_cells": rule.lattice_step,
         }

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect import cell_errors
 from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
     WallSamples,
+    _gross_colours,
+    _inner,
     _shifts,
     depth_step_band,
     pooled,
@@ -283,3 +286,58 @@ def test_a_joint_is_no_step_and_a_ledge_of_half_a_centimetre_is(
     band[:, 4:8] = is_step
     np.testing.assert_array_equal(depth_step_band(depth_m), band)
     np.testing.assert_array_equal(depth_step_band(depth_m.T), band.T)
+
+
+def test_one_cell_is_enough_for_one_that_is_asked_for() -> None:
+    mask = np.full((8, 8), OrthoMask.NONE)
+    mask[2, 3] = OrthoMask.PAINTED
+    rule = sampling_rule([image(mask)], colour_cells_most=1, seen_cells_most=16)
+    assert (rule.colour_share, rule.lattice_step) == (1.0, 2)
+
+
+@pytest.mark.parametrize(("gsd_m", "reach"), [(0.01, 3), (0.0041, 5), (0.002, 8)])
+def test_patches_are_looked_for_two_centimetres_off_within_three_to_eight_cells(
+    gsd_m: float, reach: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def measure(*_images: object, reach_cells: int) -> None:
+        asked.append(reach_cells)
+
+    monkeypatch.setattr(cell_errors, "measure_shifts", measure)
+    image_, _, true = scene()
+    true.frame = SimpleNamespace(gsd_m=gsd_m)
+    _shifts(image_, true, true.rectangle >= 0)
+    assert asked == [reach]
+
+
+def test_colours_are_gross_that_no_true_colour_within_a_cell_is_near() -> None:
+    rgb = np.zeros((5, 20, 3), dtype=np.float32)
+    rgb[:, 10:] = 200.0
+    rgb[:, 18:] = np.nan
+    true: Any = SimpleNamespace(rgb=rgb)
+    for value, on_dark, on_bright in (
+        (0, False, True), (40, False, True), (41, True, True),
+        (159, True, True), (160, True, False), (200, True, False),
+    ):  # fmt: skip
+        shown: Any = SimpleNamespace(rgb=np.full((5, 20, 3), value, dtype=np.uint8))
+        expected = np.zeros((5, 18), dtype=np.bool_)
+        # Beside the edge both are near.
+        expected[:, :9], expected[:, 11:] = on_dark, on_bright
+        np.testing.assert_array_equal(_gross_colours(shown, true)[:, :18], expected)
+
+
+def test_colours_are_judged_where_those_about_them_are_known_too() -> None:
+    coloured = np.zeros((6, 10), dtype=np.bool_)
+    coloured[:, :5] = True
+    known = np.ones((6, 10), dtype=np.bool_)
+    known[3:, 5:] = False
+    expected = coloured.copy()
+    # Beside the fifth column lies what is known and was not asked for, in the first three rows.
+    expected[:4, 4] = False
+    np.testing.assert_array_equal(_inner(coloured, known), expected)
+
+
+def test_a_deviation_of_nothing_states_nothing() -> None:
+    samples = samples_of(depth_m=np.array([0.001, 0.0]), sigma_m=np.array([0.0, 0.001]))
+    assert numbers_of(samples)["depth_within_3sigma"] == 1.0

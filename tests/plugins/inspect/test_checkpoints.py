@@ -6,6 +6,7 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from scipy.ndimage import gaussian_filter
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import encode_webp
 from orthoflow.geometry import bands, frame_over
 from orthoflow.geometry.scene_views import render_frame
 from orthoflow.products import (
@@ -411,3 +413,92 @@ def test_a_point_that_is_not_found_has_no_place_in_the_table() -> None:
             "y_mm": -2.0,
         },
     ]
+
+
+def test_classes_are_told_apart_where_there_is_more_than_one() -> None:
+    shift_m = np.array([[0.001, 0.0], [0.003, 0.0]])
+
+    def prefixes(*classes: str) -> set[str]:
+        names = [item.name for item in checkpoints._findings(shift_m, classes, 0.004)]
+        return {name.removesuffix("n_found") for name in names if name.endswith("n_found")}
+
+    assert prefixes("", "") == prefixes("a", "a") == {""}
+    assert prefixes("a", "") == {"", "a_"}
+    assert prefixes("A (high)", "b") == {"", "a_high_", "b_"}
+    found = {item.name: item.value for item in checkpoints._findings(shift_m, ("a", "b"), 0.004)}
+    assert (found["a_rms_mm"], found["b_rms_mm"]) == (pytest.approx(1.0), pytest.approx(3.0))
+
+
+def shown_at(wall: int, place: list[float], point_world: list[float]) -> ShownPoint:
+    return ShownPoint(
+        how="target",
+        wall=wall,
+        expected=np.array([10.0, 20.0]),
+        place=np.array(place),
+        point_world=np.array(point_world),
+    )
+
+
+def test_points_that_are_carried_back_into_space_are_off_by_their_distance() -> None:
+    nowhere = [np.nan] * 3
+    points = [
+        shown_at(0, [0.0, 0.0], [1.0, 2.0, 3.0]),
+        shown_at(0, [0.0, 0.0], nowhere),
+        shown_at(0, [0.0, 0.0], [5.003, 6.0, 7.004]),
+    ]
+    surveyed = points_at(np.array([[9.0, 9, 9], [1, 2, 3], [1, 1, 1], [5, 6, 7]]))
+    found = checkpoints._findings_in_space(points, surveyed, [1, 2, 3])
+    assert {item.name: (item.value, item.unit) for item in found} == {
+        "n_3d": (2.0, "1"),
+        "rms_3d_mm": (pytest.approx(np.sqrt(12.5)), "mm"),
+        "max_3d_mm": (pytest.approx(5.0), "mm"),
+    }
+    assert checkpoints._findings_in_space(points[1:2], surveyed, [2]) == []
+
+
+def test_each_picture_is_drawn_with_the_residuals_of_its_own_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+
+    def draw(*asked: object) -> bytes:
+        drawn.append(asked)
+        return encode_webp(np.zeros((1, 1, 3), dtype=np.uint8))
+
+    monkeypatch.setattr(checkpoints, "vector_map", draw)
+    images = [
+        replace(inspect_scenes.displaced(0, 0), wall=place, plane_index=number)
+        for place, number in ((0, 7), (1, 9), (2, 4))
+    ]
+    pictures = [SimpleNamespace(wall=image.wall, image=image) for image in images]
+    nowhere = [np.nan] * 3
+    points = [
+        shown_at(wall, place, nowhere)
+        for wall, place in ((2, [11.0, 18.0]), (0, [10.0, 25.0]), (2, [13.0, 20.0]))
+    ]
+    ctx = context(tmp_path)
+    checkpoints._draw(pictures, points, ["a", "b", "c"], ctx)  # type: ignore[arg-type]
+    assert [figure.name for figure in ctx.figures] == ["wall_7_residuals", "wall_4_residuals"]
+    for asked, image, places, shifts, names in zip(
+        drawn,
+        images[::2],
+        ([[10.0, 25.0]], [[11.0, 18.0], [13.0, 20.0]]),
+        ([[0.0, 5.0]], [[1.0, -2.0], [3.0, 0.0]]),
+        (["b"], ["a", "c"]),
+        strict=True,
+    ):
+        assert asked[0] is image
+        np.testing.assert_array_equal(asked[1], places)
+        np.testing.assert_array_equal(asked[2], shifts)
+        assert asked[3] == names
+
+
+def test_points_without_a_class_are_check_points(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0]])
+    points = points_at(
+        walls.walls[0].frame.world_from_wall(places), classes=("", "flat", ""), pixels=places
+    )
+    _, found, _ = inspect(tmp_path, points, walls)
+    assert found.kinds == ("check point", "flat")
+    assert found.kind.tolist() == [0, 1, 0]

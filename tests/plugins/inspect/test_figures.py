@@ -104,6 +104,8 @@ def test_names_stand_beside_their_arrows_unless_there_are_many() -> None:
         assert (columns[own] - x).min() > 0
         assert (columns[own] - x).max() < 30
         assert np.abs(rows[own] - y).max() < 20
+    some = np.tile(places[:1], (60, 1)), np.tile(shift_cells[:1], (60, 1))
+    assert (vector_map(image, *some) != np.array(vector_map(image, *some, ["P"] * 60))).any()
     many = 61
     crowd = np.tile(places[:1], (many, 1)), np.tile(shift_cells[:1], (many, 1))
     np.testing.assert_array_equal(

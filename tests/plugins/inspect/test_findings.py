@@ -137,3 +137,13 @@ def test_of_very_many_points_of_a_wall_an_even_part_says_all_about_lengths() -> 
     assert found["length_error_rms_share"] == pytest.approx(0.002)
     # Of three million pairs.
     assert found["n_lengths"] < 1_000_000
+
+
+def test_lengths_of_centimetres_are_judged_as_those_of_metres() -> None:
+    places_m = np.random.default_rng(4).uniform(0.0, 5.0, (20, 2))
+    wall = np.zeros(20, dtype=np.int32)
+    large, small = (
+        {item.name: item.value for item in length_findings(places, 0.002 * places, wall)}
+        for places in (places_m, 0.01 * places_m)
+    )
+    assert small == pytest.approx(large)

@@ -174,3 +174,38 @@ def test_only_cells_that_a_photo_painted_are_asked() -> None:
 def test_an_edge_is_looked_at_as_far_on_either_side_of_it() -> None:
     np.testing.assert_allclose(image_quality._ALONG, -image_quality._ALONG[::-1], atol=1e-12)
     np.testing.assert_allclose(np.diff(image_quality._ALONG), np.diff(image_quality._ALONG)[0])
+
+
+def test_shares_of_a_single_cell_are_whole() -> None:
+    mask = np.full(FRAME.shape, OrthoMask.NO_SURFACE, dtype=np.uint8)
+    mask[3, 4] = OrthoMask.FILLED
+    depth = np.full(FRAME.shape, np.nan, dtype=np.float32)
+    depth[3, 4] = 0.0
+    found = {f.name: f.value for f in quality_findings(image(mask), wall(depth), None)}
+    assert found == {"filled_share": 1.0}
+    assert completeness(image(mask), wall(depth)).value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "is_told"), [(0.09, 0.91, True), (0.11, 0.91, False), (0.09, 0.89, False)]
+)
+def test_a_spread_that_begins_or_ends_grey_tells_nothing(
+    first: float, last: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ramp = np.linspace(0.0, 1.0, image_quality._ALONG.size)
+    ramp[0], ramp[-1] = first, last
+    monkeypatch.setattr(image_quality, "_edge_profiles", lambda _: np.tile(ramp, (20, 1)))
+    assert bool(numbers(edge())) == is_told
+
+
+def test_four_hundred_edges_are_enough() -> None:
+    assert numbers(edge(430))["n_edges"] == 400
+
+
+def test_depths_beyond_the_wall_are_not_known() -> None:
+    frame = samples.facing_south(GSD_M, 4, 3)
+    depth = np.arange(12, dtype=np.float32).reshape(3, 4)
+    rows, columns = (axis.ravel() for axis in np.mgrid[-1:4, -1:5])
+    found = image_quality._depth_at(samples.wall(frame, depth_m=depth), rows, columns)
+    padded = np.pad(depth.astype(np.float64), 1, constant_values=np.nan)
+    np.testing.assert_array_equal(found.reshape(5, 6), padded)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -201,3 +202,53 @@ def test_large_pictures_take_the_memory_of_a_tile(monkeypatch: pytest.MonkeyPatc
         tracemalloc.stop()
     assert len(pairs) > 300
     np.testing.assert_allclose(pairs.shift, 0.0, atol=1e-3)
+
+
+def test_a_quarter_of_the_sixteen_nearest_must_agree() -> None:
+    # In the corner of a lattice the four along one side are the 1st to the 16th nearest.
+    shift = 10.0 * np.arange(60.0).reshape(30, 2)
+    shift[:5] = [1.0, 1.0]
+    agreed = key_pairs._agreed(lattice(30, 10.0), shift)
+    assert agreed[0]
+    assert not agreed[5:].any()
+
+
+def test_single_bright_and_dark_cells_are_as_bright_and_dark_as_can_be() -> None:
+    grey = 100.0 + 3.0 * np.random.default_rng(6).normal(size=(80, 80))
+    grey[30, 30], grey[50, 50] = 250.0, 0.0
+    everywhere = np.ones(grey.shape, dtype=np.bool_)
+    level = key_pairs._levelled(GreyImage(grey=grey, valid=everywhere, region=everywhere))
+    assert (level.grey[30, 30], level.grey[50, 50]) == (255.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "n_most"), [((100, 120), 500), ((400, 500), 1000), ((4000, 4000), 40_000)]
+)
+def test_large_pictures_have_more_key_points_up_to_a_limit(
+    shape: tuple[int, int], n_most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mahotas.features import surf
+
+    asked = []
+
+    def find(_grey: object, *, max_points: int, **_: object) -> NDArray[np.float64]:
+        asked.append(max_points)
+        return np.zeros((0, 70))
+
+    monkeypatch.setattr(surf, "surf", find)
+    small = np.zeros((40, 40))
+    cells = SimpleNamespace(shape=shape, whole=lambda: SimpleNamespace(grey=small, valid=small))
+    key_pairs._key_points(cells)  # type: ignore[arg-type]
+    assert asked == [n_most]
+
+
+def test_tiles_take_no_more_with_what_is_about_them_than_what_is_taken_whole() -> None:
+    shape = (10_000, 7_000)
+    cut = [*key_pairs._tiles(shape)]
+    assert len(cut) > 1
+    for tile in cut:
+        rows, columns = key_pairs._widened(tile, key_pairs._SURF_RIM_CELLS, shape)
+        around = (rows.stop - rows.start, columns.stop - columns.start)
+        assert len([*key_pairs._tiles(around)]) == 1
+    assert len([*key_pairs._tiles((4096, 4096))]) == 1
+    assert len([*key_pairs._tiles((4097, 4096))]) > 1

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect import openings as inspected
 from orthoflow_plugins.inspect.openings import InspectOpenings
+from scipy.ndimage import maximum_filter
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Inspection, Opening, Openings
@@ -217,3 +221,64 @@ def test_an_arrow_stands_in_the_middle_of_its_side_and_points_outwards(tmp_path:
     # u to the right and v downwards; from the top left corner down, and so on.
     outwards = np.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, -1.0]])
     np.testing.assert_allclose(inspection.displacement_m, 0.05 * outwards, atol=1e-3)
+
+
+def areas(*blocks: tuple[slice, slice], n_face: int = 96, n_least: float = 0.0) -> Any:
+    """Numbers of open areas of a wall whose face is so many of the cells within two of them."""
+    is_open = np.zeros((40, 50), dtype=np.bool_)
+    for block in blocks:
+        is_open[block] = True
+    near = np.asarray(maximum_filter(is_open, size=5)) & ~is_open
+    is_face = np.zeros_like(is_open)
+    is_face.flat[np.flatnonzero(near)[:n_face]] = True
+    return inspected._labelled(is_open, is_face, n_least)
+
+
+TEN_BY_TEN = np.s_[12:22, 20:30]
+
+
+@pytest.mark.parametrize(("n_face", "is_opening"), [(49, True), (47, False)])
+def test_half_of_what_is_about_an_opening_is_the_face_of_its_wall(
+    n_face: int, is_opening: bool
+) -> None:
+    assert areas(TEN_BY_TEN, n_face=n_face).max() == is_opening
+
+
+def test_openings_are_numbered_and_small_areas_are_none() -> None:
+    other = np.s_[0:5, 0:20]
+    labels = areas(TEN_BY_TEN, other, np.s_[30:33, 40:43], n_face=2000, n_least=100.0)
+    assert np.unique(labels).tolist() == [0, 1, 2]
+    assert len(np.unique(labels[TEN_BY_TEN])) == len(np.unique(labels[other])) == 1
+    assert np.count_nonzero(labels) == 200
+
+
+def side_error(is_open: Callable[[Any, Any], Any]) -> float | None:
+    """Error in cells of a level side of a hundred, by what is open at a column and a row."""
+    wall: Any = SimpleNamespace(
+        frame=scene()[1].walls[0].frame,
+        depths_m=lambda places: np.where(is_open(*places.T), -0.2, np.nan),
+    )
+    found = inspected._side_error(wall, np.array([0.0, 0.0]), np.array([100.0, 0.0]))
+    return None if found is None else found[2] / GSD_M
+
+
+def test_the_border_nearest_to_a_side_is_its_own_to_half_a_step() -> None:
+    border = 3.0 + 1.0 / 32.0
+    assert side_error(lambda _, row: row < border) == pytest.approx(-border, abs=1e-9)
+    twice = side_error(lambda _, row: (row < -border) | ((row > 0.0) & (row < 5.0)))
+    assert twice == pytest.approx(border, abs=1e-9)
+
+
+@pytest.mark.parametrize(("end", "is_judged"), [(70.0, True), (60.0, False)])
+def test_a_border_lies_along_half_of_a_side_without_its_ends(end: float, is_judged: bool) -> None:
+    # A tenth at either end does not count; of the rest 0.56 or 0.44 have a border.
+    found = side_error(
+        lambda column, row: (row < 2.0) & ((np.abs(column - 50.0) > 30.0) | (column > 45.0))
+        & ((column < end) | (column > 80.0))
+    )  # fmt: skip
+    assert (found is not None) == is_judged
+
+
+def test_a_side_without_length_has_no_error() -> None:
+    wall: Any = None
+    assert inspected._side_error(wall, np.ones(2), np.ones(2)) is None

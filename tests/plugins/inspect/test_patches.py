@@ -56,7 +56,7 @@ def test_the_fullest_tile_is_the_one_with_most_cells_that_count() -> None:
     assert image(grey, valid).fullest_part(7).grey.shape == (5, 7)
 
 
-@pytest.mark.parametrize("apart", [(0.0, 0.0), (1.3, -2.6), (-3.0, 3.75)])
+@pytest.mark.parametrize("apart", [(0.0, 0.0), (1.3, -2.6), (-3.0, 3.75), (5.0, -5.0), (-5.0, 5.0)])
 def test_a_displacement_is_measured_in_every_whole_patch(apart: tuple[float, float]) -> None:
     true = texture()
     found = patches.measure_shifts(image(moved(true, *apart)), image(true), reach_cells=5)
@@ -210,3 +210,77 @@ def test_a_cell_between_others_is_valid_where_all_four_are_there(corner: tuple[i
         for right in (0, 1):
             expected &= padded[np.ix_(places[0] + down, places[1] + right)]
     np.testing.assert_array_equal(found[0], expected)
+
+
+@pytest.mark.parametrize(("n_columns", "is_valid"), [(1, True), (0, False)])
+def test_a_lone_line_of_cells_can_be_smoothed_and_a_lone_cell_cannot(
+    n_columns: int, is_valid: bool
+) -> None:
+    """Of what a Gaussian of one cell looks at, a line holds 0.4 and a cell 0.16."""
+    valid = np.zeros((30, 30), dtype=np.bool_)
+    valid[15, 15] = True
+    valid[:, 15 : 15 + n_columns] = True
+    smooth = patches._smoothed(image(np.full((30, 30), 90.0), valid))
+    assert smooth.valid[15, 15] == is_valid
+    assert smooth.grey[15, 15] == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize("n_cells", [900, 40])
+def test_steps_are_least_squares_and_as_exact_as_smoothed_noise_lets_them_be(n_cells: int) -> None:
+    rng = np.random.default_rng(8)
+    design, rest = rng.normal(size=(2, n_cells, 3)), rng.normal(size=(2, n_cells))
+    weight = np.ones((2, n_cells))
+    weight[1, ::2] = 0.0
+    step, sigma = patches._normal_step(design, rest, weight)
+    # Noise that was smoothed by a Gaussian of one cell: so many cells are one observation.
+    kernel = gaussian_filter(np.pad([[1.0]], 12), 1.0, mode="constant")
+    per_sample = kernel.sum() ** 2 / (kernel**2).sum()
+    for k, used in enumerate((slice(None), slice(1, None, 2))):
+        rows, values = design[k, used], rest[k, used]
+        expected = np.linalg.lstsq(rows, values, rcond=None)[0]
+        np.testing.assert_allclose(step[k], expected[:2], rtol=1e-6)
+        squares = ((values - rows @ expected) ** 2).sum()
+        n_free = max(len(rows) / per_sample - 3.0, 1.0)
+        variances = squares / n_free * np.diag(np.linalg.inv(rows.T @ rows))
+        np.testing.assert_allclose(sigma[k], np.sqrt(variances[:2]), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("sigma_cells", "n_found"), [(0.14, 16), (0.16, 0)])
+def test_a_patch_must_be_measured_to_a_seventh_of_a_cell(
+    sigma_cells: float, n_found: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(_design: object, rest: NDArray[np.float64], _weight: object) -> object:
+        return np.zeros((len(rest), 2)), np.tile([0.01, sigma_cells], (len(rest), 1))
+
+    monkeypatch.setattr(patches, "_normal_step", step)
+    found = patches.measure_shifts(image(texture()), image(texture()), reach_cells=1)
+    assert len(found.centre) == n_found
+
+
+def test_cells_about_the_middle_count_most_where_a_width_is_asked_for() -> None:
+    centre = np.array([[40.0, 50.0]])
+    cut = patches._cut_patches(image(texture()), centre, focus_cells=5.0)
+    assert (cut.rows.min(), cut.rows.max()) == (34.0, 65.0)
+    assert (cut.columns.min(), cut.columns.max()) == (24.0, 55.0)
+    # The middles of cells about the corner of four.
+    away = np.hypot(cut.rows + 0.5 - 50.0, cut.columns + 0.5 - 40.0)
+    np.testing.assert_allclose(cut.weight, np.exp(-(away**2) / 50.0))
+    assert (patches._cut_patches(image(texture()), centre).weight == 1.0).all()
+
+
+def test_an_intensity_is_grey_by_itself_or_by_its_roots() -> None:
+    intensity = np.array([[0.0, 0.25, 1.0, np.nan]], dtype=np.float32)
+    for of_roots, expected in ((False, [0.0, 63.75, 255.0, 0.0]), (True, [0.0, 127.5, 255.0, 0.0])):
+        grey = patches.IntensityGrey(intensity=intensity, of_roots=of_roots).whole()
+        np.testing.assert_allclose(grey.grey[0], expected)
+        assert grey.valid[0].tolist() == grey.region[0].tolist() == [True, True, True, False]
+    assert not patches.IntensityGrey(intensity=intensity).of_roots
+
+
+def test_patches_of_some_rows_are_counted_from_the_first_of_these() -> None:
+    rows = np.array([2.9, 3.0, 6.9, 7.0])
+    all_of = patches.unrefined(np.column_stack([np.arange(4.0), rows]), np.ones((4, 2)))
+    some = all_of.within(slice(3, 7))
+    np.testing.assert_allclose(some.centre, [[1.0, 0.0], [2.0, 3.9]])
+    np.testing.assert_allclose(all_of.within(slice(3, None)).centre[:, 1], [0.0, 3.9, 4.0])
+    np.testing.assert_array_equal(all_of.within(slice(None)).centre, all_of.centre)

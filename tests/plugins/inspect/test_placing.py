@@ -117,6 +117,8 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
         (1.01 * BUFFER_M, 0.0, True),
         (-0.99 * BUFFER_M, 0.0, False),
         (-1.01 * BUFFER_M, 0.0, True),
+        (0.0, 1.9, False),
+        (0.0, -2.1, True),
         (0.0, 80.0, True),
     ],
 )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import point_doubts
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 
 from orthoflow.errors import MethodError
@@ -67,7 +70,7 @@ def test_three_points_tell_another_raster_where_nine_tenths_of_what_they_are_off
     assert [("laid otherwise" in warning) for warning in warnings] == [True] * is_told
 
 
-@pytest.mark.parametrize("off_cells", [[3.0, 4.0], [-12.0, 9.0]])
+@pytest.mark.parametrize("off_cells", [[3.0, 4.0], [-12.0, 9.0], [11.4, 15.2]])
 def test_an_orthoimage_that_is_off_by_cells_is_a_result_and_no_doubt(
     tmp_path: Path, off_cells: list[float]
 ) -> None:
@@ -110,3 +113,50 @@ def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> Non
     (warning,), metrics = said(tmp_path, replace(points, shown_world=own))
     assert warning.startswith("x, y, z of 3 of 4 check points are those of the orthoimage")
     assert metrics["n_found"] == 4
+
+
+@pytest.mark.parametrize(
+    ("factor", "aside", "told"),
+    [
+        (1.03, 30.0, "measured on cells of about"),
+        (1.015, 30.0, "laid otherwise"),
+        (0.97, 30.0, "measured on cells of about"),
+        (1.0, 15.0, "laid otherwise"),
+    ],
+)
+def test_cells_of_another_size_are_so_by_two_hundredths(
+    tmp_path: Path, factor: float, aside: float, told: str
+) -> None:
+    middle = PLACES.mean(axis=0)
+    (warning,), _ = said(
+        tmp_path, points_at(surveyed(), pixels=middle + factor * (PLACES - middle) + aside)
+    )
+    assert told in warning
+
+
+def test_two_points_tell_the_size_of_cells_and_one_tells_nothing(tmp_path: Path) -> None:
+    for count, is_told in ((2, True), (1, False)):
+        warnings, _ = said(tmp_path, points_at(surveyed()[:count], pixels=2.5 * PLACES[:count]))
+        assert any("measured on cells of about" in warning for warning in warnings) == is_told
+
+
+def test_mirrored_places_say_nothing_of_the_size_of_cells(tmp_path: Path) -> None:
+    middle = PLACES.mean(axis=0)
+    assert said(tmp_path, points_at(surveyed(), pixels=2.0 * middle - PLACES))[0] == []
+
+
+@pytest.mark.parametrize("side", [(-1.0, 0.3), (2.0, 0.3), (0.3, -1.0), (0.3, 2.0)])
+def test_points_are_far_beyond_the_length_of_their_wall(side: tuple[float, float]) -> None:
+    image = inspect_scenes.displaced(0, 0)
+    picture: Any = SimpleNamespace(frame=image.frame)
+    rows, columns = image.frame.shape
+    for further, is_far in ((0.95, False), (1.05, True)):
+        off = further * max(rows, columns)
+        place = [
+            -off if part < 0.0 else size + off if part > 1.0 else part * size
+            for part, size in zip(side, (columns, rows), strict=True)
+        ]
+        point: Any = SimpleNamespace(expected=np.array(place))
+        expected = GSD_M * off if is_far else 0.0
+        assert point_doubts._beyond_m(point, picture) == pytest.approx(expected)
+    assert point_doubts._beyond_m(point, None) == 0.0

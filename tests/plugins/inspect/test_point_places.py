@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import point_places
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.point_places import (
     Picture,
@@ -288,3 +289,31 @@ def test_a_target_is_found_within_the_search_and_carried_back_into_space(
         np.testing.assert_allclose(found.place, [120.0, 100.0], atol=0.05)
         # Half of the target's radius says how deep it lies.
         np.testing.assert_allclose(found.point_world[None], at(120.0, 100.0, 0.01), atol=3e-4)
+
+
+@pytest.mark.parametrize(("search_m", "cells"), [(0.001, 2), (0.0199, 4), (0.5, 12)])
+def test_a_scene_is_looked_at_two_to_twelve_cells_about_a_point(
+    search_m: float, cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def look(*_: object, search_cells: int, **__: object) -> None:
+        asked.append(search_cells)
+
+    monkeypatch.setattr(point_places, "find_by_truth", look)
+    finding = replace(finder(at(120.0, 100.0, 0.0), truth=True), search_m=search_m)
+    found = finding.find(0)
+    assert asked == [cells]
+    assert found.how == "not found"
+    assert found.place.shape == (2,)
+    assert np.isnan(found.place).all()
+
+
+def test_places_in_metres_count_before_those_in_cells() -> None:
+    where = painted()[1]
+    place_m = np.array([[0.2, -0.3], [np.nan, np.nan]])
+    pixels = np.array([[33.0, 44.0], [55.0, 66.0]])
+    both = np.vstack([at(120.0, 100.0, 0.0)] * 2)
+    found = finder(both, pixels_wall=pixels, places_m=place_m, wall=4)
+    np.testing.assert_allclose(found.find(0).place, where.wall_from_raster(place_m[0]))
+    np.testing.assert_array_equal(found.find(1).place, [55.0, 66.0])

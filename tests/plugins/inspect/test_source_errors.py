@@ -154,3 +154,46 @@ def test_what_shows_an_object_is_a_ghost_whichever_of_the_scenes_surfaces_it_is(
     expected = where.gsd_m * np.array([[[0.5 - 0.75, 0.0], [1.5 - 0.75, 0.0]]])
     np.testing.assert_allclose(found.displacement_m, expected, atol=1e-9)
     assert (found.n_seen_by_both, found.n_seen_painted) == (1, 1)
+
+
+def test_cells_of_large_walls_are_gathered_in_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = source_errors()
+    plain = source_findings([errors, errors], 1)
+    allocated = {}
+
+    def allocate(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        allocated[name] = np.full(shape, np.nan, dtype)
+        return allocated[name]
+
+    for most, n_allocated in ((20, 0), (19, 2)):
+        monkeypatch.setattr(module, "IN_MEMORY_CELLS", most)
+        assert source_findings([errors, errors], 1, allocate) == plain
+        assert len(allocated) == n_allocated
+    assert {name: len(values) for name, values in allocated.items()} == {"away": 8, "steps": 4}
+
+
+def test_cells_are_seen_that_any_photo_sees() -> None:
+    where = frame(shape=(2, 3))
+    origin = np.array([5.0, -2.0, 1.0])
+    depth = np.full((2, 3), 0.25, dtype=np.float32)
+    asked = np.array([[True, True, False], [True, True, True]])
+    looked = []
+
+    def sees(column: int, points: np.ndarray) -> np.ndarray:
+        places = where.wall_from_world(points + origin)
+        np.testing.assert_allclose(places[:, 2], 0.25, atol=1e-6)
+        looked.append(len(points))
+        return np.asarray(np.floor(places[:, 0]) == column)
+
+    views: Any = SimpleNamespace(sees=sees)
+    true: Any = SimpleNamespace(frame=where, depth_m=depth)
+    photos = [SimpleNamespace(viewing=lambda at=at: at) for at in (0, 2)]
+    truth: Any = SimpleNamespace(
+        scene=SimpleNamespace(origin=origin), cameras=SimpleNamespace(cameras=photos)
+    )
+    seen = module._seen_by_photos(true, asked, truth, views)
+    assert seen.tolist() == [[True, False, False], [True, False, True]]
+    # Of the five cells the second photo is asked for those that the first does not see.
+    assert looked == [5, 3]
+    truth.cameras = None
+    assert not module._seen_by_photos(true, asked, truth, views).any()

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import targets
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.targets import find_crossing
 from scipy.ndimage import gaussian_filter
@@ -108,3 +109,22 @@ def test_a_target_at_the_border_of_the_picture_is_found() -> None:
     place = found(cut, (60.0, 15.0), search=5.0)
     assert place is not None
     np.testing.assert_allclose(place - CENTRE, [0.0, -45.0], atol=0.1)
+
+
+@pytest.mark.parametrize(("n_known", "is_known"), [(1, False), (2, False), (3, True)])
+def test_grey_is_told_between_three_cells_in_a_row(n_known: int, is_known: bool) -> None:
+    """A fifth of what a Gaussian of 1.2 cells looks at must be there."""
+    valid = np.zeros((21, 21), dtype=np.bool_)
+    valid[10, 9 : 9 + n_known] = True
+    closed = targets._closed(np.where(valid, 80.0, 0.0), valid)
+    assert closed.valid[10, 10] == is_known
+    assert closed.grey[10, 10] == pytest.approx(80.0 if is_known else 0.0, abs=1e-3)
+
+
+def test_slopes_go_on_through_voids() -> None:
+    rows, columns = np.mgrid[:40, :40]
+    grey = 3.0 * columns - 2.0 * rows + 90.0
+    valid = np.random.default_rng(5).random((40, 40)) > 0.4
+    closed = targets._closed(np.where(valid, grey, 0.0), valid)
+    np.testing.assert_allclose(closed.grey[closed.valid], grey[closed.valid], atol=0.01)
+    assert closed.valid[8:-8, 8:-8].all()

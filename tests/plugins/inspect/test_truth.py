@@ -15,12 +15,14 @@ import rasterio
 from orthoflow_plugins.inspect import truth as module
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import report
+from orthoflow_plugins.inspect.patches import unrefined
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.simulate.room import SimulateRoom
 from rasterio.transform import Affine
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import encode_webp
 from orthoflow.files.sidecars import frame_json
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
@@ -457,3 +459,131 @@ def test_painters_without_an_oriented_photo_of_their_name_are_told(tmp_path: Pat
     images.images[0].sources = ("d.jpg",)
     module._warn_of_untraced(images, cameras, ctx)
     assert list(ctx.warnings) == []
+
+
+def sources(rows: int, columns: int) -> Any:
+    """Traced cells of a band whose displacement tells the cell; one in seven is not known."""
+    rng = np.random.default_rng(rows)
+    displacement = rng.normal(size=(rows, columns, 2))
+    displacement[rng.random((rows, columns)) < 1.0 / 7.0] = np.nan
+    return SimpleNamespace(
+        displacement_m=displacement, traced=np.isfinite(displacement).all(axis=2)
+    )
+
+
+def test_of_many_traced_cells_every_so_manyth_of_the_wall_is_kept() -> None:
+    bands = [sources(40, 101), sources(53, 101), sources(31, 101)]
+    whole = np.concatenate([item.displacement_m for item in bands])
+    expected = np.argwhere(np.isfinite(whole).all(axis=2))
+    step = len(expected) // 4000
+    assert step == 2
+    cells, shifts = module._traced_cells(bands)
+    np.testing.assert_array_equal(cells, expected[::step])
+    np.testing.assert_array_equal(shifts, whole[tuple(expected[::step].T)])
+    few, _ = module._traced_cells(bands[:1])
+    assert len(few) == np.count_nonzero(np.isfinite(bands[0].displacement_m[..., 0]))
+
+
+def test_bands_are_whole_blocks_with_a_block_about_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bands_of(height: int, width: int) -> list[tuple[int, int, int, int]]:
+        image: Any = SimpleNamespace(
+            mask=np.broadcast_to(np.uint8(0), (height, width)),
+            frame=SimpleNamespace(shape=(height, width)),
+        )
+        found = [*module._bands(image)]
+        return [(b.rows.start, b.rows.stop, b.around.start, b.around.stop) for b in found]
+
+    monkeypatch.setattr(module, "_BAND_CELLS", 50 * 96 * 4)
+    assert bands_of(384, 50) == [(0, 384, 0, 384)]
+    # Four blocks at once, of which one above and one below are about the band.
+    assert bands_of(500, 50) == [(0, 192, 0, 288), (192, 384, 96, 480), (384, 500, 288, 500)]
+    assert bands_of(200, 300) == [(0, 96, 0, 192), (96, 192, 0, 200), (192, 200, 96, 200)]
+
+
+def test_what_is_kept_of_a_band_lies_where_it_is_in_the_wall() -> None:
+    whole = np.arange(200.0 * 30).reshape(200, 30)
+    image: Any = SimpleNamespace(mask=np.zeros((200, 30)))
+    for first in (0, 96):
+        band: Any = SimpleNamespace(rows=slice(first, first + 96))
+        errors = module.WallErrors(
+            samples=SimpleNamespace(),  # type: ignore[arg-type]
+            patches=module.PatchShifts.joined(
+                [unrefined(np.array([[5.0, 6.5]]), np.array([[1.0, 2.0]]))]
+            ),
+            depth_m=whole[band.rows],
+            grey=-whole[band.rows],
+        )
+        kept = module._Judge._kept(SimpleNamespace(), errors, image, band, 5)  # type: ignore[arg-type]
+        assert kept.patches.centre.tolist() == [[5.0, 6.5 + first]]
+        rows = [row for row in range(0, 200, 5) if first <= row < first + 96]
+        np.testing.assert_array_equal(kept.depth_m, whole[rows, ::5])
+        np.testing.assert_array_equal(kept.grey, -whole[rows, ::5])
+
+
+def test_displacements_are_those_of_patches_and_of_the_middles_of_cells() -> None:
+    image = inspect_scenes.image_of(np.full((30, 40), 90.0))
+    traced = sources(6, 5)
+    verdict: Any = SimpleNamespace(
+        patches=SimpleNamespace(centre=np.array([[16.0, 17.0]])),
+        samples=SimpleNamespace(shift_m=np.array([[0.25, 0.5]])),
+        sources=(traced,),
+    )
+    found = module._inspection(Orthoimages(images=(image,)), [verdict], (), [], {})
+    rows, columns = np.nonzero(np.isfinite(traced.displacement_m[..., 0]))
+    places = np.vstack([[16.0, 17.0], np.column_stack([columns + 0.5, rows + 0.5])])
+    np.testing.assert_allclose(found.points_world, image.frame.world_from_wall(places))
+    np.testing.assert_array_equal(
+        found.displacement_m, np.vstack([[0.25, 0.5], traced.displacement_m[rows, columns]])
+    )
+    assert found.kind.tolist() == [0] + [1] * len(rows)
+    assert found.wall.tolist() == [0] * len(found.kind)
+    assert found.kinds == ("patch", "painted cell")
+
+
+def test_of_a_large_wall_every_so_manyth_displacement_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    picture = encode_webp(np.zeros((1, 1, 3), dtype=np.uint8))
+
+    def draw(cells: Any) -> bytes:
+        drawn.append(cells)
+        return picture
+
+    monkeypatch.setattr(module, "displacement_map", draw)
+    for name in ("depth_error_map", "colour_error_map"):
+        monkeypatch.setattr(module, name, lambda _: picture)
+    image = inspect_scenes.image_of(np.full((30, 40), 90.0))
+    bands = (sources(10, 40), sources(10, 40), sources(10, 40))
+    verdict: Any = SimpleNamespace(depth_m=None, grey=None, step=3, sources=bands)
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    module._draw(image, verdict, ctx)
+    whole = np.concatenate([item.displacement_m for item in bands])
+    expected = np.hypot(whole[..., 0], whole[..., 1])[::3, ::3] / image.frame.gsd_m
+    np.testing.assert_allclose(drawn[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("wired", "dropped", "missing"),
+    [
+        (("orthoimages",), "orthoimages", "walls"),
+        (("walls", "cameras"), "walls and cameras", "orthoimages"),
+        (("cameras",), "cameras", "orthoimages and walls"),
+    ],
+)
+def test_what_would_let_more_be_compared_is_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    wired: tuple[str, ...],
+    dropped: str,
+    missing: str,
+) -> None:
+    monkeypatch.setattr(module, "inspect_planes", lambda *_: None)
+    given = dict.fromkeys(("orthoimages", "walls", "cameras"))
+    inputs: Any = SimpleNamespace(
+        **(given | dict.fromkeys(wired, 1)), planes=1, labels=None, truth=None
+    )
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    module._inspect_planes(inputs, ctx)
+    (said,) = ctx.warnings
+    assert f"the truth: {dropped}, for want of {missing}; only" in said

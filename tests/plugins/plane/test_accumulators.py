@@ -159,6 +159,32 @@ def test_of_a_thin_sample_cells_ask_their_neighbours_too() -> None:
     np.testing.assert_array_equal(residuals.cells(claims), expected)
 
 
+@pytest.mark.parametrize("turn_deg", [2.4, 37.3, 121.0])
+def test_a_wall_lies_where_finer_angles_and_bins_put_it(turn_deg: float) -> None:
+    """Steps of five degrees, looked at between them; bins of half a cell."""
+    turn = np.radians(turn_deg)
+    normal, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    wall = Rectangle("wall", (*(0.513 * normal), 0.0), (*(3.0 * along), 0.0), (0, 0, 1), 12_000)
+    cloud = prepare(
+        cloud_of(points_of((wall,), noise_m=0.002)),
+        np.eye(3),
+        cell_m=0.05,
+        least_share=0.005,
+        parts=1,
+        counts_plan=True,
+    )
+    proposer = PlanProposer(
+        cloud,
+        Voting(angle_step_deg=5.0, least_points=1_000.0, walls=True, levels=False, is_raw=False),
+    )
+    candidate = proposer.propose(Unassigned.of(cloud))
+    assert candidate is not None
+    found = candidate.plane
+    side = np.sign(found.normal[:2] @ normal)
+    assert abs(np.degrees(np.arcsin(found.normal[:2] @ along))) < 0.3
+    assert side * found.offset_m == pytest.approx(0.513, abs=0.008)
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 37.0, 178.0], ids=lambda turn: f"{turn:.0f}")
 def test_what_was_rejected_bars_lines_like_it_from_both_sides(turn_deg: float) -> None:
     turn = np.radians(turn_deg)

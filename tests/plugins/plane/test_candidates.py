@@ -251,3 +251,21 @@ def test_without_points_near_a_plane_cells_are_those_of_the_tolerance() -> None:
     sums, found = candidates._cells_near(np.zeros((0, 3)), away, left, rules())
     assert not sums.n_find.any()
     assert found.cell_m == 0.05
+
+
+def test_without_its_largest_part_no_plane_is_fitted() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform([4.0, -1.0, 1.0], [5.0, 1.0, 1.0], (400, 3))
+    part = np.zeros((20, 30), dtype=np.int64)
+    part[:, 20:] = 1
+    cells = np.ones((20, 30), dtype=np.bool_)
+    place: Any = SimpleNamespace(cells=cells, part_of_cell=part, parts_m=np.zeros((2, 4)))
+    start = Plane(normal=UP, offset_m=1.0)
+
+    def fitted() -> Plane | None:
+        return candidates._fitted_to_parts(start, points, raster(), place, (0.05, 0.05), "free", UP)
+
+    assert fitted() is None
+    # All of it is one part.
+    place.parts_m = np.zeros((1, 4))
+    assert fitted() is not None

@@ -283,3 +283,14 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     for name in ("n_find", "rms_find_m", "n_fit", "rms_fit_m", "mean_fit_m", "histogram"):
         np.testing.assert_array_equal(getattr(turned, name), getattr(found, name)[order])
     assert (turned.find_m, turned.fit_m) == (find_m, fit_m)
+
+
+def test_a_plane_of_one_point_deviates_by_its_distance() -> None:
+    points = np.array([[0.0, 0.0, 0.03], [5.0, 5.0, 5.0], [5.0, -5.0, 3.0]])
+    prepared = prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
+    prepared.claims[:] = [0, -1, -1]
+    slabs = np.array([[0, 0, 1.0, 0.0, 1.0, 0, 0, 0, 0, 1.0, 0, 0]])
+    found = measure_planes(prepared, slabs, np.array([[-1.0, 1, -1, 1]]), find_m=0.1, fit_m=0.05)
+    assert (found.n_find[0], found.n_fit[0]) == (1, 1)
+    for value in (found.rms_find_m[0], found.rms_fit_m[0], found.mean_fit_m[0]):
+        assert value == pytest.approx(0.03, rel=1e-3)

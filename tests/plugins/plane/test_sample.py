@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane import sample as sampling
 from orthoflow_plugins.plane.assignment_kernels import assign_points, sum_assigned
 from orthoflow_plugins.plane.block_kernels import PlanGrid, each_part, piece_of
 from orthoflow_plugins.plane.sample import (
@@ -22,7 +23,7 @@ from orthoflow_plugins.plane.sample import (
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import Plane, wall_axes
 from tests.plane_scenes import cloud_of
 
@@ -277,3 +278,24 @@ def test_passes_have_eight_parts_at_most(asked: int, parts: int) -> None:
     points = np.random.default_rng(0).normal(size=(100, 3)) * (1.0, 2e-4, 0.0)
     found = prepare(cloud_of(points), np.eye(3), cell_m=0.1, least_share=0.1, parts=asked)
     assert found.parts == parts
+
+
+@pytest.mark.parametrize("counts_plan", [False, True])
+def test_a_point_that_is_no_place_is_refused_though_the_sample_misses_it(
+    counts_plan: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "SAMPLE_POINTS", 10)
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
+    cloud = cloud_of(points)
+    missed = np.setdiff1d(np.arange(100), draw_sample(cloud).index)[0]
+    prepare(cloud, np.eye(3), cell_m=0.1, least_share=0.1, parts=1, counts_plan=counts_plan)
+    points[missed, 1] = np.nan
+    with pytest.raises(ProductError):
+        prepare(
+            cloud_of(points),
+            np.eye(3),
+            cell_m=0.1,
+            least_share=0.1,
+            parts=1,
+            counts_plan=counts_plan,
+        )
