@@ -31,6 +31,30 @@ def test_a_number_in_words_gets_its_value(parameter: str, text: object, said: st
 
 
 @pytest.mark.parametrize(
+    ("parameter", "words", "units"),
+    [
+        (
+            "gsd_m",
+            "metres",
+            {"m": 1, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "µm": 1e-6, "km": 1000},
+        ),
+        ("noise_mm", "millimetres", {"mm": 1, "um": 0.001, "m": 1000}),
+        ("tilt_deg", "degrees", {"deg": 1, "°": 1, "rad": 180 / math.pi, "gon": 360 / 400}),
+        ("tilt_rad", "radians", {"rad": 1, "°": math.pi / 180}),
+        ("limit_s", "seconds", {"s": 1, "ms": 0.001, "min": 60, "h": 60 * 60}),
+        ("shift_px", "px", {"px": 1}),
+    ],
+)
+def test_units_of_one_family_are_reckoned_into_each_other(
+    parameter: str, words: str, units: dict[str, float]
+) -> None:
+    for unit, factor in units.items():
+        assert meant_number(parameter, f"3 {unit}") == (
+            f"; it is in {words}, and no unit stands behind it: {3 * factor:g}"
+        )
+
+
+@pytest.mark.parametrize(
     ("name", "value", "said"),
     [
         ("gsd_mm", 50, " (it is gsd_m, in metres: gsd_m: 0.05)"),

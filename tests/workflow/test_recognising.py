@@ -15,6 +15,7 @@ from orthoflow.workflow.recognising import Recognised, recognised
 
 TIES = "photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4,5\nb.jpg,1,2,3,4,5\n"
 POINTS = "name,x,y,z\nP1,1,2,3\nP2,2,2,3\nP3,2,2,3\n"
+REALITYCAPTURE = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
 LENS = "cameras: {a.jpg: {width: 640, height: 480, fx: 500, fy: 500, cx: 319.5, cy: 239.5}}"
 
 
@@ -79,6 +80,27 @@ def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> N
     (tmp_path / "wall.json").write_text("{}")
     (beside,) = recognised([tmp_path / "wall.tif"])
     assert (beside.kind, beside.said) == ("other", "an orthoimage with its frame beside it")
+
+
+def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) -> None:
+    text = f"{REALITYCAPTURE}a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n"
+    found = one(tmp_path / "cameras.csv", text)
+    assert (found.kind, found.said) == ("cameras", "1 cameras")
+    assert one(tmp_path / "cameras.txt", text).kind == "unknown"
+
+
+@pytest.mark.parametrize(("n_bytes", "is_told"), [(990_000, True), (1_010_000, False)])
+def test_a_workflow_is_one_by_its_first_megabyte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int, *, is_told: bool
+) -> None:
+    def refused(_path: Path) -> str:
+        raise InputError("it is no calibration")
+
+    # It would take seconds to read so much YAML.
+    monkeypatch.setattr(recognising, "_calibration_said", refused)
+    found = one(tmp_path / "big.yaml", "#".ljust(n_bytes - 1) + "\nsteps:\n")
+    assert found.kind == "unknown"
+    assert (found.said == "big.yaml is a workflow itself") is is_told
 
 
 def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:

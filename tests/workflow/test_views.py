@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import jsonschema
@@ -10,6 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.mermaid import mermaid
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
@@ -29,6 +31,7 @@ def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
     document = json.loads(text)
     assert text == json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     assert str(tmp_path) not in text
+    assert "datasets" not in document
     assert document["inputs"]["scan"]["files"] == ["mine.e57"]
     assert document["inputs"]["photos"]["files"] == ["data/photos/*.jpg"]
     assert document["overrides"] == ["--set wall.gsd_m=0.5", "--input scan=mine.e57"]
@@ -122,6 +125,27 @@ steps:
         '    step3 -->|"walls"| step4\n'
         '    step1 -->|"cloud"| step4\n'
     )
+
+
+def test_mermaid_counts_datasets_and_draws_ports_between_two_steps_as_one_edge() -> None:
+    plugins = discover_catalog()
+    drawn = mermaid(load_workflow("quickstart", plugins), plugins)
+    edges = re.findall(r"^    (\w+ (?:-->|-\.->))\|\"([^\"]+)\"\| (\w+)$", drawn, re.MULTILINE)
+    assert len({(source, target) for source, _, target in edges}) == len(edges)
+    assert any(", " in ports for _, ports, _ in edges)
+    assert "datasets" not in drawn
+
+
+def test_mermaid_counts_the_datasets_of_an_input(catalog: Catalog, write: Path) -> None:
+    text = """\
+orthoflow: 1
+inputs: {scan: {optional: true}, photos: {files: photos}}
+steps: {cloud: {use: read.scan, in: {files: inputs.scan}}}
+datasets: {hall: {scan: hall.e57}, court: {scan: court.e57}}
+"""
+    assert mermaid(load(text, write, catalog), catalog).splitlines()[1:3] == [
+        *('    input0[/"scan<br/>of 2 datasets"/]', '    input1[/"photos"/]'),
+    ]
 
 
 @pytest.mark.parametrize("name", ["direct", "direct.yaml", "workflows/direct.yaml"])
