@@ -10,13 +10,14 @@ from typing import Final
 
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import baseline_cells, combinations_of, is_missing
+from orthoflow.report.combinations import baseline_cells, baseline_of, combinations_of, is_missing
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
 from orthoflow.report.summaries import limits
+from orthoflow.workflow.cells import variants_text
 from orthoflow.workflow.format import DATA
 
 _ORIENTED: Final = "n_oriented"
@@ -60,11 +61,13 @@ class DatasetTable:
         columns: what is measured of each: step, and metric with its unit.
         rows: in the order of the run.
         has_photos: some step oriented photos.
+        baseline: the variants that the numbers are of; empty where nothing varies.
     """
 
     columns: tuple[tuple[str, str], ...]
     rows: tuple[DatasetRow, ...]
     has_photos: bool
+    baseline: str = ""
 
     @property
     def n_whole(self) -> int:
@@ -109,6 +112,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
             for name, part in parts.items()
         ),
         has_photos=any(key[1] == _ORIENTED for key in units),
+        baseline=variants_text(baseline_of(next(iter(parts.values())))) if parts else "",
     )
 
 

@@ -220,10 +220,9 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         n_better = sum(effect > 0 for effect in shown)
         n_worse = len(shown) - n_better
         if shown:
-            said.append(
-                f"{name} against {against}: better in {n_better}, worse in {n_worse} of "
-                f"{len(judged)} numbers"
-            )
+            counts = ((n_better, "better"), (n_worse, "worse"))
+            how = " and ".join(f"{word} in {count}" for count, word in counts if count)
+            said.append(f"{name} against {against}: {how} of {len(judged)} numbers")
     if not said:
         return f"Nobody is shown to lead in any of {len(judged)} numbers (p below {_SHOWN_P:g})"
     others = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""

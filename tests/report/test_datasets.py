@@ -192,7 +192,7 @@ def test_distances_to_a_plane_are_not_ranked_where_its_tolerance_cuts_them(tmp_p
     ("n_rooms", "step_mm", "said"),
     [
         (3, 0.5, "Nobody is shown to lead: 3 datasets are too few for a test; it takes 6 that"),
-        (7, 0.0, "plane=hough-tolerance_m-0_05 against plane=hough-tolerance_m-0_02: better in 0"),
+        (7, 0.0, "plane=hough-tolerance_m-0_05 against plane=hough-tolerance_m-0_02: worse in"),
         (7, 0.5, "plane=ransac-tolerance_m-0_1 against plane=hough-tolerance_m-0_1: better in 1"),
     ],
 )
