@@ -60,6 +60,14 @@ def test_other_words_make_another_sense(one: str, other: str) -> None:
     assert sense(one) != sense(other)
 
 
+def test_what_is_told_of_the_others_is_what_differs() -> None:
+    texts = [
+        f"wall 3: photo IMG_{number}.jpg is {share}% dark" for number, share in ((1, 5), (2, 7))
+    ]
+    (found,) = alike([("a", text) for text in texts])
+    assert found.others == ("IMG_2.jpg",)
+
+
 def test_one_sentence_of_several_cells_is_said_once() -> None:
     found = alike([("wall@a=1", "no intensity"), ("wall@a=2", "no intensity")])
     assert found == (

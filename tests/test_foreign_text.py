@@ -60,6 +60,21 @@ def test_json_stays_the_same_json(value: dict[str, str]) -> None:
     assert shown(text, keep="\n") == text
 
 
+@pytest.mark.parametrize(
+    ("letters", "written"),
+    [
+        ("a\nb", "a\nb"),
+        ("\x9b\u202e", "\\u009b\\u202e"),
+        # JSON has letters beyond the first 65,536 as two halves.
+        ("\U000e0041", "\\udb40\\udc41"),
+        ("\ud800", "\\ud800"),
+    ],
+    ids=ascii,
+)
+def test_json_has_what_readers_cannot_see_in_its_own_escapes(letters: str, written: str) -> None:
+    assert shown_json(letters) == written
+
+
 @given(
     st.lists(
         st.lists(

@@ -248,3 +248,26 @@ def test_faces_say_what_their_photo_was() -> None:
     (face, *_) = fisheye_faces(b"bytes", "a", LENS)
     assert isinstance(face, FisheyeFace)
     assert (face.photo, face.face, face.fisheye) == (b"bytes", "front", LENS)
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "height", "problem"),
+    [
+        (8_000.0, 30_000, ""),
+        (8_500.0, 30_000, "its faces would have 17000 x 17000 pixels"),
+        # Of few pixels, but with more columns than a picture may have.
+        (16_300.0, 1_000, ""),
+        (16_500.0, 1_000, "its faces would have 33000 x 2064 pixels"),
+    ],
+)
+def test_faces_are_as_large_as_pictures_may_be(focal_px: float, height: int, problem: str) -> None:
+    lens = FisheyeLens(
+        width=30_000,
+        height=height,
+        fx=focal_px,
+        fy=focal_px,
+        cx=15_000.0,
+        cy=0.5 * height,
+        field_of_view_deg=90.0,
+    )
+    assert problem_of(lens) == problem

@@ -662,3 +662,6 @@ def test_the_faces_of_a_fisheye_have_its_place_and_their_own_directions(tmp_path
     assert given.of_face("back").reason == "its fisheye lens does not show that face"
     folding = replace(given, lens=replace(given.lens, radial=(-0.9, 0.0, 0.0, 0.0)))
     assert folding.of_face("front").reason.startswith("its fisheye lens is none: it folds back")
+    # What has no orientation has none on any face, and keeps its reason.
+    lost = replace(given, rotation=None, translation=None, reason="too few ties")
+    assert lost.of_face("front") is lost

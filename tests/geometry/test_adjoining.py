@@ -58,6 +58,16 @@ def test_planes_that_end_far_from_each_other_have_no_edge() -> None:
     assert len(edges_between(surfaces, reach_m=GAP_M + 0.01)) == 12
 
 
+def test_an_edge_alone_has_no_corner() -> None:
+    surfaces = surfaces_of(box_planes())
+    edges = edges_between(surfaces)
+    assert corners_between(surfaces, edges[:1]) == ()
+    # Nor do three of which two do not adjoin.
+    first = edges[0]
+    apart = [edge for edge in edges if first.first in (edge.first, edge.second)]
+    assert corners_between(surfaces, apart) == ()
+
+
 def test_nearly_parallel_planes_meet_nowhere() -> None:
     up = Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0)
     for angle, meets in ((19.0, False), (21.0, True)):

@@ -87,3 +87,17 @@ def test_a_covariance_that_rounding_left_without_a_root_is_widened_all_the_same(
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [1e-3, 1e6, 6.0], rtol=1e-6)
     np.testing.assert_allclose(found, found.T)
     np.testing.assert_allclose(found[0, 1], 1e3, rtol=1e-6)
+
+
+def test_a_group_that_alone_fixes_an_unknown_leaves_it_where_it_is() -> None:
+    # Without a prior, only the last of four groups sees the second unknown: left out, nothing does.
+    jacobian = np.zeros((4, 2, 2))
+    jacobian[:, 0, 0] = 1.0
+    jacobian[3, 1, 1] = 1.0
+    residuals = np.zeros((4, 2))
+    residuals[:, 0] = [3.0, -1.0, -2.0, 0.0]
+    cofactors = np.diag([0.25, 1.0])
+    found = honest_covariance(jacobian, residuals, cofactors, np.arange(4), sigma0=0.5)
+    # The mean of the other three moves by a third of what the group left out is off.
+    moves = residuals[:, 0] / 3.0
+    np.testing.assert_allclose(found, np.diag([0.75 * moves @ moves, 0.25]), atol=1e-12)

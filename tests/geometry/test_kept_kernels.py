@@ -193,3 +193,49 @@ def test_what_was_damaged_or_replaced_is_not_run_but_compiled_again(
     mended = load()
     assert mended.asked(3) == 214.0
     assert counts(mended.asked) == (1, 0)
+
+
+def test_a_kernel_whose_contents_nobody_can_tell_is_known_by_its_file(
+    load: Callable[[], Any], tmp_path: Path
+) -> None:
+    def known_as(text: str) -> str:
+        (tmp_path / "kernels.py").write_text(text)
+        os.utime(tmp_path / "kernels.py", (1e9, 1e9))
+        return str(load().asked._cache._contents())
+
+    text = (
+        "from orthoflow.geometry.compiling import compiled\n"
+        "@compiled\ndef asked(x):\n    return {1, 2}\n"
+        "asked.py_func.__defaults__ = (object(),)\n"
+    )
+    # With its address in it, no name of the object would be the same in two processes.
+    assert known_as(text) == known_as(text)
+    assert known_as(text) != known_as(f"{text}\n")
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> kept_kernels._CheckedFiles:
+    files = kept_kernels._CheckedFiles(str(tmp_path), "kernel", "digest")  # type: ignore[no-untyped-call]
+    files._save_index({"int64": "kernel.nbc"})  # type: ignore[no-untyped-call]
+    return files
+
+
+def test_an_index_holds_for_one_kernel_of_one_numba(
+    index: kept_kernels._CheckedFiles, tmp_path: Path
+) -> None:
+    def opened(digest: str) -> kept_kernels._CheckedFiles:
+        return kept_kernels._CheckedFiles(str(tmp_path), "kernel", digest)  # type: ignore[no-untyped-call]
+
+    assert opened("digest")._load_index() == {"int64": "kernel.nbc"}
+    assert opened("other")._load_index() == {}
+    newer = opened("digest")
+    newer._version = "another"
+    assert newer._load_index() == {}
+
+
+def test_where_files_cannot_be_locked_nobody_waits() -> None:
+    class NoLock:
+        def take(self, *, is_shared: bool, waits: bool) -> bool:
+            raise OSError(37, "no locks available")
+
+    assert kept_kernels._take(NoLock())  # type: ignore[arg-type]

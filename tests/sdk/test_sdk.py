@@ -135,7 +135,7 @@ def test_warnings_are_collected_and_heard(tmp_path: Path) -> None:
     ctx = context(tmp_path, listen=heard.append)
     ctx.warn("no station known")
     assert ctx.warnings == ["no station known"]
-    assert heard == [StepEvent(kind="warning", text="no station known")]
+    assert heard == [StepEvent(kind="warning", text="no station known", fraction=0.0)]
 
 
 def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:

@@ -88,6 +88,15 @@ def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
     assert (np.diff(picture[0, 10:, 0].astype(int)) >= 0).all()
 
 
+def test_grey_of_a_wall_that_nobody_saw_is_white(tmp_path: Path) -> None:
+    write_raster(tmp_path / "a.tif", np.full((5, 10), np.nan, "f4"), gsd_m=0.1, tags={})
+    stretch = stretch_of(tmp_path / "a.tif")
+    assert (stretch.low, stretch.high) == (0.0, 1.0)
+    write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20)
+    assert (decode_image(picture_file(tmp_path / "p").read_bytes()) == 255).all()
+    assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.1) == []
+
+
 def test_contours_of_a_slope_are_where_it_has_their_depth(tmp_path: Path) -> None:
     # Depth grows by 0.2 m over a metre to the right.
     slope = 0.2 * (np.arange(200, dtype=np.float32) + 0.5) / 200.0

@@ -113,3 +113,10 @@ def test_the_first_line_that_does_not_fit_is_named(tmp_path: Path, text: str, li
 def test_a_long_line_is_told_by_its_first_sixty_letters(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"got '1 2 3{' 4' * 27} '; correct"):
         read(tmp_path / "a.xyz", "1 2 3" + " 4" * 40, 0)
+
+
+def test_where_every_line_fits_the_first_of_them_is_named(tmp_path: Path) -> None:
+    # Of a block that pandas refuses for reasons of its own.
+    layout = Layout(separator=SPACES, decimal=".", n_columns=3)
+    error = tables._bad_line(tmp_path / "a.xyz", [b"1 2 3\n"], layout, (0, 1, 2), 17)
+    assert str(error) == ("a.xyz, from line 17: expected 3 numbers per line; export the file again")
