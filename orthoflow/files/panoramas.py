@@ -146,7 +146,7 @@ def face_picture(panorama: Colours, name: str) -> Colours:
     looked_up = cv2.remap(
         framed,
         (columns + 1.0).astype(np.float32),
-        np.clip(rows, 0.0, height - 1.0).astype(np.float32),
+        rows.astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )

@@ -114,8 +114,8 @@ class _Source(io.BytesIO):
         # Pillow asks for the end to know how much all values together may have.
         return super().seek(self.most_bytes if whence == io.SEEK_END else offset)
 
-    def read(self, size: int | None = -1) -> bytes:
-        wanted = size or 0
-        found = super().read(wanted)
-        self.is_short |= len(found) < wanted
-        return found if len(found) == wanted else bytes(wanted)
+    def read(self, size: int | None = None) -> bytes:
+        assert size is not None  # noqa: S101 - Pillow says how much it wants
+        found = super().read(size)
+        self.is_short |= len(found) < size
+        return found if len(found) == size else bytes(size)

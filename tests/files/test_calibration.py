@@ -372,3 +372,29 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     path.write_text("[" * 1200)
     with pytest.raises(InputError, match="1:61: the document is nested deeper than 60 levels"):
         read_calibration(path)
+
+
+def test_what_is_no_yaml_is_told_once(tmp_path: Path) -> None:
+    assert refusal(tmp_path, "cameras: [}").count("calibration.yaml:") == 1
+    assert refusal(tmp_path, "").count("calibration.yaml:") == 1
+
+
+@pytest.mark.parametrize(("count", "is_refused"), [(1000, False), (1001, True)])
+def test_a_thousand_cameras_are_the_most(tmp_path: Path, count: int, is_refused: bool) -> None:
+    # What stands for each is no camera, which is told where they are looked at.
+    text = "cameras: {" + ", ".join(f"p{k}" for k in range(count)) + "}"
+    told = refusal(tmp_path, text)
+    assert ("calibration.yaml:1:1: cameras: expected at most 1000 entries, got" in told) is (
+        is_refused
+    )
+    assert ('cameras."p0": expected width' in told) is not is_refused
+
+
+@pytest.mark.parametrize(("n_lists", "is_refused"), [(201, False), (202, True)])
+def test_twenty_thousand_values_are_the_most(
+    tmp_path: Path, n_lists: int, is_refused: bool
+) -> None:
+    # Two mappings and the list; each list in it counts itself and its 98 numbers.
+    lists = [f"&a [{', '.join('0' * 98)}]", *["*a"] * (n_lists - 1)]
+    told = refusal(tmp_path, f"cameras: {{a: [{', '.join(lists)}]}}")
+    assert ("the document has more than 20000 values" in told) is is_refused

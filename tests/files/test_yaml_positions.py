@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from orthoflow.files import yaml_positions
 from orthoflow.files.yaml_positions import (
     Dialect,
     Listing,
@@ -234,3 +236,101 @@ def test_merged_entries_stand_behind_those_of_the_table() -> None:
 def test_the_place_of_what_the_reader_refuses_is_told() -> None:
     ((line, column, _, _),) = problems_of("a: 1\nbc: \x01", TOLERANT)
     assert (line, column) == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            "a: {b: 0,003}",
+            (
+                *(1, 10, "a"),
+                "a key must be text, got 003; if it ends a number, decimals have a point: 0.003",
+            ),
+        ),
+        ("a: {1.5: x}", (1, 5, "a", "a key must be text, got 1.5")),
+        ("a: {: x}", (1, 6, "a", "a key must be text, got nothing")),
+        ("a: !foo {b: 1}", (1, 4, "a", "tags are not allowed in a workflow, got !foo")),
+        ("b: !foo [1]", (1, 4, "b", "tags are not allowed in a workflow, got !foo")),
+        ("a:\n\tb: 1", (2, 1, "", "this is not YAML: a tab stands here; indent with spaces")),
+        (
+            "a:\n    b: 1\n  c: 2",
+            (
+                *(3, 3, ""),
+                "this is not YAML: this line is indented as none above it is, or a line above "
+                "lacks its end",
+            ),
+        ),
+        (
+            "a:\n  b: [1, 2\nc: }",
+            (
+                *(2, 6, ""),
+                "this is not YAML: the bracket [ that opens here is not closed; noticed in line 3: "
+                "expected ',' or ']', but got ':'",
+            ),
+        ),
+        (
+            "a: {b: 1\n",
+            (
+                *(1, 4, ""),
+                "this is not YAML: the brace { that opens here is not closed; noticed in line 2: "
+                "expected ',' or '}', but got '<stream end>'",
+            ),
+        ),
+        (
+            "\na: 'b\n",
+            (
+                *(2, 4, ""),
+                "this is not YAML: the quotes that open here are not closed; noticed in line 3: "
+                "found unexpected end of stream",
+            ),
+        ),
+        # Over two lines nothing is a key, nor what has more letters than YAML lets keys have.
+        ("a\nb: 1", (2, 2, "", "this is not YAML: mapping values are not allowed here")),
+        (
+            "k" * 1025 + ": 1",
+            (1, 1026, "", "this is not YAML: mapping values are not allowed here"),
+        ),
+        (f"a: 0x{'1' * 999}", (1, 4, "a", f"'0x{'1' * 98}...' is no int")),
+    ],
+    ids=lambda value: None if isinstance(value, tuple) else repr(value)[:20],
+)
+def test_a_mistake_is_told_in_whole_where_it_was_made(
+    text: str, problem: tuple[int, int, str, str]
+) -> None:
+    assert problems_of(text) == [problem]
+
+
+def test_what_is_just_short_enough_is_read() -> None:
+    assert plain(read("k" * 1024 + ": 1", Dialect())) == {"k" * 1024: 1}
+    assert plain(read(f"0x{'1' * 998}", Dialect())) == int("1" * 998, 16)
+    assert describe(read("a" * 100)) == f'the text "{"a" * 100}"'
+    assert describe(read("a" * 101)) == f'the text "{"a" * 100}..."'
+
+
+def test_aliases_lead_no_deeper_than_brackets() -> None:
+    def nested(n_around: int) -> str:
+        return f"[&a {'[' * 30}1{']' * 30}, {'[' * n_around}*a{']' * n_around}]"
+
+    read(nested(29))
+    (problem,) = problems_of(nested(30), TOLERANT)
+    assert problem[3] == "the document is nested deeper than 60 levels"
+
+
+def test_a_key_that_is_no_word_is_told_once_and_stands_as_one() -> None:
+    problems = Problems()
+    document = read_yaml("? [x]\n: 1", problems, TOLERANT)
+    assert isinstance(document, Table)
+    (entry,) = document
+    assert (entry.key, entry.is_text) == ("?", True)
+    assert [words for *_, words in problems.found] == ["a key must be text, got a list or mapping"]
+
+
+def test_what_the_library_tells_without_a_place_is_told_of_the_first_letter() -> None:
+    told = yaml_positions._unreadable(MarkedYAMLError("while composing", None, "odd  words", None))
+    assert (str(told), told.position) == (
+        "this is not YAML: while composing, odd words",
+        Position(line=1, column=1),
+    )
+    assert yaml_positions._reader_position("a\nb", YAMLError()) == Position(line=1, column=1)
+    assert yaml_positions._first_line(YAMLError()) == "YAMLError"
