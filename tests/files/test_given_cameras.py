@@ -17,8 +17,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.colmap import write_colmap_model
 from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses
-from orthoflow.files.given_cameras import MOST_BYTES, MOST_MODEL_BYTES, CentredLens, GivenCamera
-from orthoflow.files.metashape import MOST_TAGS
+from orthoflow.files.given_cameras import CentredLens, GivenCamera
 from orthoflow.files.panoramas import face_picture
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.rotations import quaternion_from_rotation
@@ -479,7 +478,7 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "sigma_wall_mm of a.jpg must be numbers"),
         ({"c.json": cameras_json(lambda e: e.update(width=10**30))},
          r"a.jpg is 100000000000\.\.\. x 480 pixels"),
-        ({"c.xml": "<a/>" * (MOST_TAGS + 1)}, f"c.xml has more than {MOST_TAGS} tags"),
+        ({"c.xml": "<" * 2_000_001}, "c.xml has more than 2000000 tags"),
     ],
 )  # fmt: skip
 def test_files_that_make_no_sense_end_in_one_sentence(
@@ -530,11 +529,11 @@ def test_a_line_that_no_model_has_is_refused(
 @pytest.mark.parametrize(
     ("names", "most"),
     [
-        (("cameras.json",), MOST_BYTES),
-        (("a.xml",), MOST_BYTES),
-        (("a.csv",), MOST_BYTES),
-        (("cameras.txt", "images.txt"), MOST_MODEL_BYTES),
-        (("cameras.bin", "images.bin"), MOST_MODEL_BYTES),
+        (("cameras.json",), 50_000_000),
+        (("a.xml",), 50_000_000),
+        (("a.csv",), 50_000_000),
+        (("cameras.txt", "images.txt"), 500_000_000),
+        (("cameras.bin", "images.bin"), 500_000_000),
     ],
 )
 def test_a_file_that_no_cameras_need_is_not_read(

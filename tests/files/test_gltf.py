@@ -190,6 +190,11 @@ def test_accessors_stay_inside_their_views(request: pytest.FixtureRequest, model
         assert view["byteOffset"] % 4 == 0
     for view in told["bufferViews"]:
         assert view["byteOffset"] + view["byteLength"] <= len(binary)
+    # What a view is for, vertices or indices, is not said of pictures.
+    pictures = [told["bufferViews"][image["bufferView"]] for image in told.get("images", [])]
+    assert all("target" not in view for view in pictures)
+    drawn = {entry["bufferView"] for entry in told["accessors"]}
+    assert {told["bufferViews"][place]["target"] for place in drawn} == {34962, 34963}
 
 
 def test_a_page_shows_the_model_without_a_server(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files import calibration, images, metashape, polygons, sidecars, survey_points
+from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.drawings import title_blocks
 from orthoflow.files.images import encode_png
 
@@ -100,3 +102,56 @@ def test_what_is_as_large_as_allowed_is_read_and_nothing_larger(
     monkeypatch.setattr(limit.module, limit.constant, limit.size - 1)
     with pytest.raises(InputError):
         limit.read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "most_bytes", "read"),
+    [
+        ("calibration.yaml", 400_000, calibration.read_calibration),
+        ("block.yaml", 100_000, title_blocks.read_title_block),
+        ("points.csv", 20_000_000, survey_points.read_survey_points),
+        ("ties.csv", 20_000_000, survey_points.read_measured_ties),
+        ("wall_0_depth.json", 1_048_576, sidecars.read_sidecar),
+        ("masks.geojson", 50_000_000, masks),
+        ("cameras.json", 50_000_000, lambda path: read_given_cameras([path])),
+        ("cameras.xml", 50_000_000, lambda path: read_given_cameras([path])),
+    ],
+)
+def test_what_is_larger_than_any_file_of_its_kind_is_not_read(
+    tmp_path: Path, name: str, most_bytes: int, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / name
+    path.touch()
+    os.truncate(path, most_bytes + 1)  # without a byte on the disk
+    with pytest.raises(InputError, match=rf"{name}.* (at most|more than) {most_bytes}"):
+        read(path)
+
+
+@pytest.mark.parametrize(("n_letters", "is_read"), [(300, True), (301, False)])
+def test_a_field_of_a_title_block_has_three_hundred_letters(
+    tmp_path: Path, n_letters: int, is_read: bool
+) -> None:
+    path = tmp_path / "block.yaml"
+    path.write_text(f"title: {'x' * n_letters}\n")
+    if is_read:
+        assert title_blocks.read_title_block(path).title == "x" * n_letters
+        return
+    with pytest.raises(InputError, match=r":1:1: title: has 301 letters, at most 300 fit"):
+        title_blocks.read_title_block(path)
+
+
+@pytest.mark.parametrize(("count", "is_read"), [(10_000, True), (10_001, False)])
+def test_ten_thousand_polygons_are_the_most(tmp_path: Path, count: int, is_read: bool) -> None:
+    ring = [[0, 0], [4, 0], [4, 3], [0, 0]]
+    feature = {
+        "type": "Feature",
+        "properties": {"photo": "a.jpg"},
+        "geometry": {"type": "MultiPolygon", "coordinates": [[ring]] * count},
+    }
+    path = tmp_path / "masks.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    if is_read:
+        assert len(polygons.read_polygons(path, name="photo", what="a mask")) == count
+        return
+    with pytest.raises(InputError, match="holds more than 10000 polygons: split it"):
+        masks(path)

@@ -257,32 +257,40 @@ def test_the_place_of_what_the_reader_refuses_is_told() -> None:
             "a:\n    b: 1\n  c: 2",
             (
                 *(3, 3, ""),
-                "this is not YAML: this line is indented as none above it is, or a line above "
-                "lacks its end",
+                (
+                    "this is not YAML: this line is indented as none above it is, or a line above "
+                    "lacks its end"
+                ),
             ),
         ),
         (
             "a:\n  b: [1, 2\nc: }",
             (
                 *(2, 6, ""),
-                "this is not YAML: the bracket [ that opens here is not closed; noticed in line 3: "
-                "expected ',' or ']', but got ':'",
+                (
+                    "this is not YAML: the bracket [ that opens here is not closed; noticed in line 3: "
+                    "expected ',' or ']', but got ':'"
+                ),
             ),
         ),
         (
             "a: {b: 1\n",
             (
                 *(1, 4, ""),
-                "this is not YAML: the brace { that opens here is not closed; noticed in line 2: "
-                "expected ',' or '}', but got '<stream end>'",
+                (
+                    "this is not YAML: the brace { that opens here is not closed; noticed in line 2: "
+                    "expected ',' or '}', but got '<stream end>'"
+                ),
             ),
         ),
         (
             "\na: 'b\n",
             (
                 *(2, 4, ""),
-                "this is not YAML: the quotes that open here are not closed; noticed in line 3: "
-                "found unexpected end of stream",
+                (
+                    "this is not YAML: the quotes that open here are not closed; noticed in line 3: "
+                    "found unexpected end of stream"
+                ),
             ),
         ),
         # Over two lines nothing is a key, nor what has more letters than YAML lets keys have.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.drawings.key_plans import MOST_PARTS, MOST_PLANES, outline_of, surfaces_of
+from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
 from orthoflow.geometry.adjoining import (
     Edge,
     Surface,
@@ -214,11 +214,11 @@ def test_planes_that_all_meet_all_others_take_little_time() -> None:
 
 
 def test_more_planes_or_parts_than_a_drawing_bears_are_refused() -> None:
-    few, many = _crossing_planes(3), _crossing_planes(MOST_PLANES + 1)
+    few, many = _crossing_planes(3), _crossing_planes(201)
     in_parts = replace(
         few,
-        part_corners=np.repeat(few.corners[:1], MOST_PARTS + 1, axis=0),
-        part_plane=np.zeros(MOST_PARTS + 1, np.int32),
+        part_corners=np.repeat(few.corners[:1], 20_001, axis=0),
+        part_plane=np.zeros(20_001, np.int32),
     )
     for planes in (many, in_parts):
         for work in (surfaces_of, outline_of):

@@ -28,8 +28,7 @@ _WORKER: Final = Path(__file__).with_name("ahead_worker.py")
 # Fewer points are read before another process would be up.
 _POINTS_LEAST: Final = 4_000_000
 # Of a point: coordinates, colours, row and column as 64 bits, and an intensity; bounds and station.
-_POINT_BYTES: Final = 72
-_BLOCK_BYTES: Final = 256
+_BLOCK_BYTES: Final = 72 * BLOCK_POINTS + 256
 _KEPT: Final = ("station", "bounds")
 
 
@@ -56,9 +55,8 @@ def read_ahead(
         "paths": [str(paths[k].absolute()) for k in others],
         "columns": None if columns is None else asdict(columns),
     }
-    slot_bytes = _POINT_BYTES * BLOCK_POINTS + _BLOCK_BYTES
     order = json.dumps(told)
-    with closing(Decoder(_WORKER, (), slot_bytes=slot_bytes, order=order)) as decoder:
+    with closing(Decoder(_WORKER, (), slot_bytes=_BLOCK_BYTES, order=order)) as decoder:
         yield [
             replace(file, read=partial(_blocks, decoder, file)) if k in others else file
             for k, file in enumerate(files)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan
+from orthoflow.files.points import open_scan, ply
 from tests import scan_files
 from tests.scan_files import read_all, read_points
 
@@ -54,6 +54,21 @@ def test_ply_elements_before_the_vertices_are_skipped(
         data = b"\x02" + items + b"\x01" + b"\x00" + b"\x02"
     path = scan_files.write_ply(
         tmp_path / "a.ply", fields, encoding=encoding, before=before, before_data=data
+    )
+    np.testing.assert_array_equal(read_points(path), points)
+
+
+@pytest.mark.parametrize("n_before", [3, 4, 5])
+def test_many_lines_before_the_vertices_are_skipped_in_blocks(
+    tmp_path: Path, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch, n_before: int
+) -> None:
+    monkeypatch.setattr(ply, "BLOCK_POINTS", 2)
+    path = scan_files.write_ply(
+        tmp_path / "a.ply",
+        dict(zip("xyz", points.T, strict=True)),
+        encoding="ascii",
+        before=f"element strip {n_before}\nproperty uchar kind",
+        before_data=b"1\n" * n_before,
     )
     np.testing.assert_array_equal(read_points(path), points)
 

@@ -1,0 +1,102 @@
+"""Orthoimages in files: which they are, in which order, and their cells, averaged or in bands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files import ortho_files as module
+from orthoflow.files.geotiff import write_orthoimage, write_raster
+from orthoflow.files.ortho_files import OrthoFile, ortho_files
+from orthoflow.geometry import WallFrame
+
+ROWS, COLUMNS = 6, 9
+RGB = np.random.default_rng(1).integers(0, 256, (ROWS, COLUMNS, 3), dtype=np.uint8)
+SHOWN = np.ones((ROWS, COLUMNS), dtype=np.bool_)
+SHOWN[4:, 2] = False
+
+
+def frame(rows: int = ROWS, columns: int = COLUMNS) -> WallFrame:
+    return WallFrame(
+        origin_world=np.zeros(3),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.5,
+        width=columns,
+        height=rows,
+    )
+
+
+def ortho(folder: Path, rgb: NDArray[np.uint8 | np.uint16] = RGB) -> OrthoFile:
+    path = folder / "wall_0_ortho.tif"
+    shown = SHOWN[: len(rgb)]
+    write_orthoimage(path, rgb, shown, gsd_m=0.5, tags={})
+    return OrthoFile(path=path, wall=0, name="wall 0", frame=frame(*rgb.shape[:2]), digest="")
+
+
+def test_orthoimages_are_known_by_their_names_and_come_in_the_order_of_their_walls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beside: dict[str, dict[str, object]] = {
+        "wall_12_ortho.tif": {"name": "east", "product_digest": "ab12"},
+        "wall_3_ortho.tif": {"name": 5, "product_digest": None},
+    }
+    monkeypatch.setattr(module, "placed_raster", lambda path: (frame(), beside[path.name]))
+    names = [*beside, "wall_3_depth.tif", "wall_123456_ortho.tif", "my_wall_1_ortho.tif"]
+    found = ortho_files([Path(name) for name in names])
+    assert [(one.wall, one.name, one.digest, one.path.name) for one in found] == [
+        (3, "wall 3", "", "wall_3_ortho.tif"),
+        (12, "east", "ab12", "wall_12_ortho.tif"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("longest_px", "shape"), [(3, (2, 3)), (9, (6, 9)), (100, (6, 9)), (1, (1, 1))]
+)
+def test_pictures_are_averaged_to_their_longest_side(
+    tmp_path: Path, longest_px: int, shape: tuple[int, int]
+) -> None:
+    rgb, shown = ortho(tmp_path).shrunk(longest_px)
+    assert rgb.shape == (*shape, 3)
+    assert shown.shape == shape
+    if shape == RGB.shape[:2]:
+        np.testing.assert_array_equal(rgb[shown], RGB[SHOWN])
+    else:
+        # All cells of the first are shown, so it is their mean.
+        side = ROWS // shape[0], COLUMNS // shape[1]
+        if SHOWN[: side[0], : side[1]].all():
+            mean = RGB[: side[0], : side[1]].mean(axis=(0, 1))
+            np.testing.assert_allclose(rgb[0, 0], mean, atol=1.0)
+
+
+def test_a_strip_has_a_row_however_small_it_is_shown(tmp_path: Path) -> None:
+    rgb, _ = ortho(tmp_path, RGB[:1]).shrunk(3)
+    assert rgb.shape == (1, 3, 3)
+
+
+@pytest.mark.parametrize(("n_rows", "heights"), [(4, [4, 2]), (3, [3, 3]), (7, [6])])
+def test_bands_are_the_picture_from_the_top(
+    tmp_path: Path, n_rows: int, heights: list[int]
+) -> None:
+    bands = list(ortho(tmp_path).bands(n_rows))
+    assert [len(rgb) for rgb, _ in bands] == heights
+    shown = np.concatenate([shown for _, shown in bands])
+    np.testing.assert_array_equal(shown, SHOWN)
+    np.testing.assert_array_equal(np.concatenate([rgb for rgb, _ in bands])[shown], RGB[shown])
+
+
+def test_pictures_of_sixteen_bits_have_eight_of_them(tmp_path: Path) -> None:
+    rgb, shown = ortho(tmp_path, RGB.astype(np.uint16) * np.uint16(257)).shrunk(9)
+    np.testing.assert_array_equal(rgb[shown], RGB[shown])
+
+
+def test_depths_are_no_colours(tmp_path: Path) -> None:
+    one = ortho(tmp_path)
+    write_raster(one.path, np.zeros((ROWS, COLUMNS), np.float32), gsd_m=0.5, tags={})
+    with pytest.raises(InputError, match=r"ortho\.tif has 1 bands of float32, expected 3 of 8 or"):
+        one.shrunk(9)
