@@ -239,74 +239,64 @@ def test_the_place_of_what_the_reader_refuses_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "problem"),
+    ("text", "place", "words"),
     [
         (
             "a: {b: 0,003}",
-            (
-                *(1, 10, "a"),
-                "a key must be text, got 003; if it ends a number, decimals have a point: 0.003",
-            ),
+            (1, 10, "a"),
+            "a key must be text, got 003; if it ends a number, decimals have a point: 0.003",
         ),
-        ("a: {1.5: x}", (1, 5, "a", "a key must be text, got 1.5")),
-        ("a: {: x}", (1, 6, "a", "a key must be text, got nothing")),
-        ("a: !foo {b: 1}", (1, 4, "a", "tags are not allowed in a workflow, got !foo")),
-        ("b: !foo [1]", (1, 4, "b", "tags are not allowed in a workflow, got !foo")),
-        ("a:\n\tb: 1", (2, 1, "", "this is not YAML: a tab stands here; indent with spaces")),
+        ("a: {1.5: x}", (1, 5, "a"), "a key must be text, got 1.5"),
+        ("a: {: x}", (1, 6, "a"), "a key must be text, got nothing"),
+        ("a: !foo {b: 1}", (1, 4, "a"), "tags are not allowed in a workflow, got !foo"),
+        ("b: !foo [1]", (1, 4, "b"), "tags are not allowed in a workflow, got !foo"),
+        (f"a: 0x{'1' * 999}", (1, 4, "a"), f"'0x{'1' * 98}...' is no int"),
+    ],
+    ids=["decimal comma", "number", "nothing", "mapping", "list", "long"],
+)
+def test_a_strange_value_is_told_in_whole(
+    text: str, place: tuple[int, int, str], words: str
+) -> None:
+    assert problems_of(text) == [(*place, words)]
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "words"),
+    [
+        ("a:\n\tb: 1", (2, 1), "a tab stands here; indent with spaces"),
         (
             "a:\n    b: 1\n  c: 2",
-            (
-                *(3, 3, ""),
-                (
-                    "this is not YAML: this line is indented as none above it is, or a line above "
-                    "lacks its end"
-                ),
-            ),
+            (3, 3),
+            "this line is indented as none above it is, or a line above lacks its end",
         ),
         (
             "a:\n  b: [1, 2\nc: }",
-            (
-                *(2, 6, ""),
-                (
-                    "this is not YAML: the bracket [ that opens here is not closed; noticed in line 3: "
-                    "expected ',' or ']', but got ':'"
-                ),
-            ),
+            (2, 6),
+            "the bracket [ that opens here is not closed; noticed in line 3: expected ',' or ']', "
+            "but got ':'",
         ),
         (
             "a: {b: 1\n",
-            (
-                *(1, 4, ""),
-                (
-                    "this is not YAML: the brace { that opens here is not closed; noticed in line 2: "
-                    "expected ',' or '}', but got '<stream end>'"
-                ),
-            ),
+            (1, 4),
+            "the brace { that opens here is not closed; noticed in line 2: expected ',' or '}', "
+            "but got '<stream end>'",
         ),
         (
             "\na: 'b\n",
-            (
-                *(2, 4, ""),
-                (
-                    "this is not YAML: the quotes that open here are not closed; noticed in line 3: "
-                    "found unexpected end of stream"
-                ),
-            ),
+            (2, 4),
+            "the quotes that open here are not closed; noticed in line 3: found unexpected end of "
+            "stream",
         ),
         # Over two lines nothing is a key, nor what has more letters than YAML lets keys have.
-        ("a\nb: 1", (2, 2, "", "this is not YAML: mapping values are not allowed here")),
-        (
-            "k" * 1025 + ": 1",
-            (1, 1026, "", "this is not YAML: mapping values are not allowed here"),
-        ),
-        (f"a: 0x{'1' * 999}", (1, 4, "a", f"'0x{'1' * 98}...' is no int")),
+        ("a\nb: 1", (2, 2), "mapping values are not allowed here"),
+        ("k" * 1025 + ": 1", (1, 1026), "mapping values are not allowed here"),
     ],
-    ids=lambda value: None if isinstance(value, tuple) else repr(value)[:20],
+    ids=["tab", "indent", "bracket", "brace", "quotes", "two lines", "long key"],
 )
-def test_a_mistake_is_told_in_whole_where_it_was_made(
-    text: str, problem: tuple[int, int, str, str]
+def test_what_is_no_yaml_is_told_where_it_was_written(
+    text: str, place: tuple[int, int], words: str
 ) -> None:
-    assert problems_of(text) == [problem]
+    assert problems_of(text) == [(*place, "", f"this is not YAML: {words}")]
 
 
 def test_what_is_just_short_enough_is_read() -> None:
