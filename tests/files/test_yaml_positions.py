@@ -272,20 +272,26 @@ def test_a_strange_value_is_told_in_whole(
         (
             "a:\n  b: [1, 2\nc: }",
             (2, 6),
-            "the bracket [ that opens here is not closed; noticed in line 3: expected ',' or ']', "
-            "but got ':'",
+            (
+                "the bracket [ that opens here is not closed; noticed in line "
+                "3: expected ',' or ']', but got ':'"
+            ),
         ),
         (
             "a: {b: 1\n",
             (1, 4),
-            "the brace { that opens here is not closed; noticed in line 2: expected ',' or '}', "
-            "but got '<stream end>'",
+            (
+                "the brace { that opens here is not closed; noticed in line 2: "
+                "expected ',' or '}', but got '<stream end>'"
+            ),
         ),
         (
             "\na: 'b\n",
             (2, 4),
-            "the quotes that open here are not closed; noticed in line 3: found unexpected end of "
-            "stream",
+            (
+                "the quotes that open here are not closed; noticed in line 3: "
+                "found unexpected end of stream"
+            ),
         ),
         # Over two lines nothing is a key, nor what has more letters than YAML lets keys have.
         ("a\nb: 1", (2, 2), "mapping values are not allowed here"),

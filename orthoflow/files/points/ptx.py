@@ -121,7 +121,7 @@ def _read_header(path: Path, file: BinaryIO, line: int) -> ScanHeader | None:
         n_columns, n_rows = (int(item) for item in lines[:2])
         numbers = [[float(item) for item in row.split()] for row in lines[2:]]
         # Row vectors in the file: point @ matrix, the translation in the last row.
-        matrix = np.array(numbers[4:8], dtype=np.float64).T
+        matrix = np.array(numbers[4:], dtype=np.float64).T
         is_whole = [len(row) for row in numbers] == [3] * 4 + [4] * 4
     except ValueError:
         is_whole = False
