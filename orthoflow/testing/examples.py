@@ -101,7 +101,7 @@ def example_room(
         local[:, axis] = normal[axis] * (distance + 0.002 * rng.normal(size=count))
         points.append(local @ turn.T)
         offsets.append(distance + float(turn @ normal @ origin))
-        corners.append(_corners(turn @ normal, distance, size[span]) + origin)
+        corners.append(_corners(normal, distance, size[span]) @ turn.T + origin)
     offsets_m = np.concatenate(points).astype(np.float32)
     grey = rng.integers(60, 200, (len(offsets_m), 1)).astype(np.uint8)
     planes = Planes(

@@ -1,0 +1,140 @@
+"""The room that methods are tried on, and which example a method gets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from orthoflow.products import InputFiles, Photos, PointCloud, Truth, Walls
+from orthoflow.sdk import Method, Ports
+from orthoflow.testing.examples import (
+    ExampleError,
+    example,
+    example_inputs,
+    example_room,
+    few_points,
+)
+from orthoflow.testing.photographed import PHOTOGRAPHED
+from orthoflow.testing.surveyed import SURVEYED
+
+SIZE_M = np.array([5.0, 3.6, 2.6])
+# Axis and direction that each side looks to.
+SIDES = ((1, -1), (1, 1), (0, -1), (0, 1), (2, 1), (2, -1))
+
+
+def test_a_room_is_a_box_of_points_on_planes_that_are_known() -> None:
+    n_points = 6000
+    cloud, planes = example_room(n_points=n_points)
+    points = cloud.points_world()
+    first = 0
+    sides_m2 = [SIZE_M.prod() / SIZE_M[axis] for axis, _ in SIDES]
+    for index, (axis, direction) in enumerate(SIDES):
+        count = int(n_points * sides_m2[index] / sum(sides_m2))
+        on_side = points[first : first + count]
+        first += count
+        assert planes.n_points[index] == count
+        np.testing.assert_array_equal(planes.normal[index], direction * np.eye(3)[axis])
+        # It looks into the room: the middle lies half a side before it.
+        assert planes.offset[index] == -0.5 * SIZE_M[axis]
+        distances = on_side @ planes.normal[index] - planes.offset[index]
+        assert np.std(distances) == pytest.approx(planes.rms_m[index], rel=0.15)
+        assert abs(np.mean(distances)) < 4.0 * 0.002 / np.sqrt(count)
+        others = [other for other in range(3) if other != axis]
+        reach = np.abs(on_side[:, others]).max(axis=0)
+        assert (reach < 0.5 * SIZE_M[others]).all()
+        assert (reach > 0.49 * SIZE_M[others]).all()
+        corners = planes.corners[index]
+        np.testing.assert_allclose(corners @ planes.normal[index], planes.offset[index])
+        np.testing.assert_allclose(
+            np.abs(corners[:, others]), np.tile(0.5 * SIZE_M[others], (4, 1))
+        )
+        # Round the side, not across it.
+        lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        np.testing.assert_allclose(sorted(lengths), sorted([*SIZE_M[others]] * 2))
+    assert first == len(cloud)
+    assert planes.rms_m[0] == 0.002
+    assert cloud.stations is not None
+    np.testing.assert_array_equal(cloud.stations, np.zeros((1, 3)))
+    assert cloud.rgb is not None
+    assert cloud.intensity is not None
+    grey = cloud.rgb[:, 0]
+    np.testing.assert_array_equal(cloud.rgb, np.repeat(grey[:, None], 3, axis=1))
+    np.testing.assert_allclose(cloud.intensity, grey / 255.0, rtol=1e-6)
+    assert (grey.min(), grey.max()) == (60, 199)
+
+
+def test_a_room_that_is_turned_and_shifted_has_the_same_points() -> None:
+    shift = np.array([634512.347, 486215.781, 112.193])
+    turn = Rotation.from_euler("z", 33.0, degrees=True).as_matrix()
+    cloud, planes = example_room(n_points=600)
+    moved, found = example_room(n_points=600, turned_deg=33.0, shift_m=shift)
+    np.testing.assert_allclose(
+        moved.points_world(), cloud.points_world() @ turn.T + shift, atol=1e-6
+    )
+    np.testing.assert_allclose(found.normal, planes.normal @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(found.corners, planes.corners @ turn.T + shift, atol=1e-9)
+    np.testing.assert_allclose(
+        found.offset, np.einsum("ij,ij->i", found.normal, found.corners[:, 0]), atol=1e-9
+    )
+    np.testing.assert_array_equal(moved.stations, shift[None])
+    other, _ = example_room(n_points=600, seed=2)
+    assert np.abs(other.points_world() - cloud.points_world()).max() > 0.1
+
+
+def test_a_few_points_have_all_that_a_cloud_may_have() -> None:
+    places = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    cloud = few_points(places)
+    np.testing.assert_array_equal(cloud.points_world(), places)
+    assert cloud.rgb is not None
+    assert cloud.intensity is not None
+    assert (cloud.rgb.shape, cloud.intensity.shape) == ((2, 3), (2,))
+    assert ((cloud.rgb > 0) & (cloud.rgb < 255)).all()
+    assert ((cloud.intensity > 0) & (cloud.intensity < 1)).all()
+    np.testing.assert_array_equal(cloud.stations, np.zeros((1, 3)))
+    assert len(few_points(np.zeros((0, 3)))) == 0
+
+
+def test_a_file_is_the_room_as_text() -> None:
+    files = example("files")
+    assert isinstance(files, InputFiles)
+    (path,) = files.paths
+    assert path.read_text().startswith("//x y z r g b\n")
+    rows = np.loadtxt(path, comments="//")
+    cloud, _ = example_room(n_points=3000)
+    np.testing.assert_allclose(rows[:, :3], cloud.points_world(), atol=6e-5)
+    assert (rows[:, 3:] == 128).all()
+
+
+class _Idle(Method):
+    def run(self, inputs: object, params: object, ctx: object) -> object:
+        raise NotImplementedError
+
+
+class Photographing(_Idle):
+    class In(Ports):
+        photos: Photos
+        walls: Walls
+        cloud: PointCloud | None = None
+
+
+class Surveying(_Idle):
+    class In(Ports):
+        walls: Walls
+        cloud: PointCloud | None = None
+        truth: Truth | None = None
+
+
+def test_what_a_method_gets_is_of_one_scene_and_a_truth_wherever_it_takes_one() -> None:
+    assert example_inputs(Photographing) == {
+        "photos": PHOTOGRAPHED["photos"](),
+        "walls": PHOTOGRAPHED["walls"](),
+    }
+    assert list(example_inputs(Photographing, besides=("photos",))) == ["walls"]
+    found = example_inputs(Surveying)
+    assert list(found) == ["walls", "truth"]
+    assert found["walls"] is SURVEYED["walls"]()
+    assert example_inputs(Surveying, besides=("walls", "truth")) == {}
+    assert example("ties") is PHOTOGRAPHED["ties"]()
+    with pytest.raises(ExampleError, match="there is no example of a dent product: give one in"):
+        example("dent")
