@@ -9,9 +9,144 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.store import Store
-from orthoflow.records.comparison import compare_runs
+from orthoflow.records import comparison as module
+from orthoflow.records.comparison import (
+    CellFacts,
+    ComparedMetric,
+    Difference,
+    Pair,
+    ParameterValue,
+    RunComparison,
+    compare_runs,
+)
 from orthoflow.records.runs import open_run
+from tests.report_runs import HeldRun, cell, distance, metrics, record
 from tests.studios import Studio, open_studio
+
+
+def number(value: float, *, is_cost: bool = False, unit: str = "mm") -> ComparedMetric:
+    return ComparedMetric(
+        value=value, unit=unit, is_cost=is_cost, is_cached=False, environment="here"
+    )
+
+
+def compared(*metrics: Pair[ComparedMetric], alone: tuple[str, ...] = ()) -> RunComparison:
+    """Two runs of the cells of these numbers, some of which only the first has."""
+    told = record([])
+    facts = CellFacts(
+        status="ok", method="a.b", distribution="d 1", result_version=1, determinism="exact",
+        seed=None, code={}, tools={}, error="",
+    )  # fmt: skip
+    cells = tuple(
+        Pair(cell=cell, name="facts", left=facts, right=None if cell in alone else facts)
+        for cell in dict.fromkeys(row.cell for row in metrics)
+    )
+    return RunComparison(
+        left=told,
+        right=replace(told, run_id="r2"),
+        workflow=(),
+        overrides=Pair(name="overrides", left=(), right=()),
+        inputs=(Pair(name="scan", left=(), right=None),),
+        cells=cells,
+        parameters=(
+            Pair(
+                cell=metrics[0].cell,
+                name="a",
+                left=ParameterValue(value=1, is_set=True),
+                right=ParameterValue(value=2, is_set=True),
+            ),
+            Pair(
+                cell=metrics[0].cell,
+                name="b",
+                left=ParameterValue(value=1, is_set=True),
+                right=ParameterValue(value=1, is_set=True),
+            ),
+        ),
+        environment=(),
+        metrics=metrics,
+        products=(
+            distance("planes", "different"),
+            distance("walls", "not measured"),
+            distance("cloud", "identical"),
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "is_same", "is_shared", "either"),
+    [(1, 1, True, True, 1), (1, 2, False, True, 1), (1, None, False, False, 1),
+     (None, 2, False, False, 2)],
+)  # fmt: skip
+def test_a_pair_is_what_both_or_one_of_them_say(
+    left: int | None, right: int | None, is_same: bool, is_shared: bool, either: int
+) -> None:
+    pair = Pair(name="x", left=left, right=right)
+    assert (pair.is_same, pair.is_shared, pair.either) == (is_same, is_shared, either)
+
+
+def test_rows_are_counted_by_who_says_something() -> None:
+    sides = [(1, 1), (1, 2), (3, 4), (1, None), (None, 1), (None, 2), (None, 3), (None, None)]
+    rows = [Pair(name="x", left=left, right=right) for left, right in sides]
+    assert Difference.of(rows) == Difference(n_different=2, n_shared=3, n_left=1, n_right=3)
+
+
+def test_a_number_is_the_same_whatever_machine_measured_it() -> None:
+    here = number(1.0)
+    assert here == replace(here, is_cost=True, is_cached=True, environment="there")
+    assert here != number(2.0)
+    assert here != number(1.0, unit="m")
+
+
+def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
+    rows = (
+        Pair(cell="plane", name="rms_mm", left=number(1.0), right=number(1.5)),
+        Pair(cell="plane", name="n", left=number(4.0, unit="1"), right=number(4.0, unit="1")),
+        Pair(
+            cell="plane",
+            name="wall_s",
+            left=number(4.0, is_cost=True),
+            right=number(9.0, is_cost=True),
+        ),
+        Pair(cell="wall", name="rms_mm", left=number(2.0), right=None),
+    )
+    comparison = compared(*rows, alone=("wall",))
+    assert repr(comparison) == (
+        "<RunComparison of 'r1' and 'r2': 0 of 0 inputs, 1 of 2 parameters, 1 of 2 metrics, "
+        "1 (1 more not measured) of 3 products differ; 1 steps in one of them only>"
+    )
+    assert comparison.measured == rows[:2]
+    table = comparison.metric_table()
+    assert table.difference.tolist()[:3] == [0.5, 0.0, 5.0]
+    assert table.isna().to_numpy().sum(axis=1).tolist() == [0, 0, 0, 2]
+    assert table.unit.tolist() == ["mm", "1", "mm", "mm"]
+    html = comparison._repr_html_()
+    assert html.count("<tr") == 2
+    assert "<td>0.5</td>" in html
+    still = compared(*rows[1:], alone=("wall",))._repr_html_()
+    assert still.endswith(
+        "<p>No number that both runs have differs, time and memory left aside.</p>"
+    )
+
+
+def test_times_and_memory_are_costs_whoever_measured_them() -> None:
+    told = cell("plane", metrics=metrics(rms_mm=1.0, search_s=2.0), cached_from="r0")
+    found = module._metrics(told)
+    assert {name for name, one in found.items() if one.is_cost} == {*found} - {"rms_mm"}
+    assert {"search_s", "wall_s"} < {*found}
+    assert all(one.is_cached and one.environment == "e1" for one in found.values())
+    assert not any(one.is_cached for one in module._metrics(cell("plane")).values())
+
+
+def test_what_only_one_of_the_runs_has_stands_alone() -> None:
+    left, right = (
+        HeldRun(path=Path("run.h5"), record=record([cell(name, params={"x": value}, seed=None)]))
+        for name, value in (("scan", 1), ("room", 2))
+    )
+    one, two = (ParameterValue(value=value, is_set=False) for value in (1, 2))
+    assert module._per_cell(left, right, {"room": "room"}, module._parameters) == (
+        Pair(cell="scan", name="x", left=one, right=None),
+        Pair(cell="room", name="x", left=None, right=two),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +295,8 @@ def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: S
 @pytest.mark.parametrize("preimage", ["", "[1]", "{", "[" * 50_000, '{"code": 5, "tools": [1]}'])
 def test_a_preimage_that_says_nothing_costs_nothing(studio: Studio, preimage: str) -> None:
     first, second = (open_run(studio.folder / name) for name in ("first", "first"))
-    for address, cell in second.cells.items():
-        second.cells[address] = replace(cell, key_preimage=preimage)  # type: ignore[index]
+    for address, recorded in second.cells.items():
+        second.cells[address] = replace(recorded, key_preimage=preimage)  # type: ignore[index]
     (pair, *_) = compare_runs(first, second).cells
     assert pair.right is not None
     assert (pair.right.code, pair.right.tools) == ({}, {})
