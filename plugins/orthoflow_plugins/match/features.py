@@ -167,8 +167,8 @@ def _in_tile(
     ]
     low = [max(0, start - _TILE_OVERLAP_PX) for start in corner]
     part = (
-        slice(low[0], min(picture.shape[0], ends[0] + _TILE_OVERLAP_PX)),
-        slice(low[1], min(picture.shape[1], ends[1] + _TILE_OVERLAP_PX)),
+        slice(low[0], ends[0] + _TILE_OVERLAP_PX),
+        slice(low[1], ends[1] + _TILE_OVERLAP_PX),
     )
     view = np.ascontiguousarray(picture[part])
     found = sift.detect(view, None) if min(view.shape) >= _SIDE_LEAST_PX else ()

@@ -280,3 +280,15 @@ def test_contrast_is_evened_out_over_a_dozen_cells(aside: int, is_even: bool) ->
     if aside == 12:
         # One standard deviation of the surroundings off, most of it is still felt.
         assert 0.6 < ratio < 0.9
+
+
+def test_a_carved_panel_of_ninety_cells_is_compared_as_it_is() -> None:
+    # Relief is told from some sixty cells to either side.
+    columns = np.broadcast_to(np.arange(480), (130, 480))
+    is_panel = np.abs(columns - 240) < 45
+    depth_m = np.where(is_panel & (columns // 8 % 2 == 0), 0.03, 0.0).astype(np.float32)
+    made = wall(np.full(depth_m.shape, 3, dtype=np.uint32), depth_m)
+    made.sigma_m[:] = 0.001
+    grey = channels.target_of(made).grey
+    assert grey is not None
+    assert np.isfinite(grey[:, 220:260]).all()

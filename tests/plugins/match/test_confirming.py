@@ -366,3 +366,8 @@ def test_photos_are_compared_at_sixteen_hundred_pixels(
     # Key points lie in the shrunk picture.
     assert found.features.pixels[:, 0].max() <= width * scale
     assert len(found.features) > 20
+
+
+def test_where_no_photo_has_a_place_nothing_is_prepared() -> None:
+    untouched: Any = None
+    assert confirmed(untouched, {0: (), 2: ()}, {1: untouched}, untouched) == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.match import descriptors as lists
 from orthoflow_plugins.match.descriptors import (
     Matches,
     TwoNearest,
@@ -139,3 +140,22 @@ def test_within_a_window_what_lies_outside_is_not_even_second_best() -> None:
     alone = window([[0.0, 0.0]], [[1.0, 1.0], [50.0, 0.0], [50.0, 2.0], [60.0, 60.0]])
     assert paired(mutual_matches_within(first, second, alone, ratio_most=0.9)) == []
     assert paired(mutual_matches_within(first, second, alone, ratio_most=1.0)) == [(0, 0)]
+
+
+@pytest.mark.parametrize("is_exact", [True, False])
+def test_of_two_that_are_the_same_none_is_distinct(is_exact: bool) -> None:
+    second = descriptors(50, 8)
+    second[7] = second[31]
+    first = second[[7, 12]].copy()
+    assert paired(mutual_matches(first, second, ratio_most=0.9, is_exact=is_exact)) == [(1, 12)]
+    assert paired(best_matches(first, second, ratio_most=0.9)) == [(1, 12)]
+
+
+def test_lists_are_about_the_means_of_what_is_nearest_to_members_spread_over_the_set() -> None:
+    among = descriptors(90, 9, size=8)
+    among[1] = among[0]
+    chosen = among[[0, 12, 25, 38, 51, 64, 77]]
+    apart = np.linalg.norm(among[:, None] - chosen[None], axis=2)
+    expected = np.array([among[apart.argmin(axis=1) == k].mean(axis=0) for k in range(7)])
+    found = lists._middles(among, 7)
+    np.testing.assert_array_equal(found, np.rint(expected))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -132,3 +134,60 @@ def test_the_middle_of_a_patch_counts_most() -> None:
     assert window[2, 5] == pytest.approx(np.exp(-0.5))
     assert window[2, 8] == pytest.approx(np.exp(-1.0))
     np.testing.assert_array_equal(window, window[::-1, ::-1])
+
+
+def test_only_patches_that_are_alike_and_distinct_are_refined(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scores = np.array([[0.5, 0.05], [0.49, 0.05], [0.5, 0.049], [0.9, 0.9]])
+
+    def search(_first: object, _second: object, _at: object, reach: object, found: Any) -> None:
+        assert reach == (6, 4)
+        found[:, :2], found[:, 2:] = [3.0, -2.0], scores
+
+    begun: list[Any] = []
+    monkeypatch.setattr(displacements, "search_shifts", search)
+    monkeypatch.setattr(displacements, "_refined", lambda *asked: begun.append(asked[2]))
+    measure(channels(texture()), channels(texture()), PLACES[:4], RULE)
+    ((places, shifts),) = begun
+    np.testing.assert_array_equal(places, PLACES[[0, 3]])
+    np.testing.assert_array_equal(shifts, [[3.0, -2.0]] * 2)
+
+
+def test_shifts_are_those_of_both_ways_halved_and_believed_when_they_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun = np.tile([1.0, 0.0], (8, 1))
+    # There and back: as good as the same, twice hardly and twice too far apart, drifted hardly and
+    # too far, not alike, and not fixed at all.
+    off = np.array([[0.2, 0], [0.4, 0], [0, 0.4], [0.55, 0], [1.4, 0], [0, 1.6], [0, 0], [0, 0]])
+    again = np.array([[0.1, 0], [0, 0], [0, -0.09], [0, 0], [1.4, 0], [0, 1.6], [0, 0], [0, 0]])
+    there, back = begun + off, -begun - again
+    score = np.array([0.9, 0.5, 0.9, 0.9, 0.9, 0.9, 0.49, 0.9])
+    sigma = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, np.inf])
+    asked: list[Any] = []
+
+    def matched(pictures: Any, start: Any, *_: object) -> Any:
+        asked.append((pictures, start))
+        is_there = len(asked) == 1
+        return displacements._Matched(
+            shifts=there if is_there else back,
+            sigma=sigma if is_there else np.full(8, 0.04),
+            score=score,
+        )
+
+    monkeypatch.setattr(displacements, "_matched", matched)
+    one, other = channels(texture()), channels(texture(2))
+    found = displacements._refined(one, other, (PLACES[:8], begun), RULE)
+    ((pictures, start), (turned, from_there)) = asked
+    assert (pictures, turned) == ((one, other), (other, one))
+    np.testing.assert_array_equal(start[0], PLACES[:8])
+    # The way back begins at the cell that the way there ended in.
+    np.testing.assert_array_equal(from_there[0], PLACES[:8] + np.rint(there).astype(int))
+    np.testing.assert_array_equal(from_there[1], -there)
+    kept = [0, 1, 2, 4]
+    np.testing.assert_array_equal(found.places, PLACES[kept])
+    np.testing.assert_allclose(found.shift_cells, 0.5 * (there - back)[kept])
+    apart = np.abs(there + back).max(axis=1)[kept]
+    np.testing.assert_allclose(found.sigma_cells, np.sqrt(0.00125 + 0.25 * apart**2))
+    np.testing.assert_array_equal(found.score, score[kept])

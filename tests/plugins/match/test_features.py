@@ -137,3 +137,19 @@ def test_rooted_descriptors_have_one_length_and_plain_ones_are_whole_numbers() -
 def test_tiles_cover_an_image_once() -> None:
     assert features._tiles((2048, 2049)) == [(0, 0), (0, 2048)]
     assert features._tiles((2049, 10)) == [(0, 0), (2048, 0)]
+
+
+def test_discs_are_found_once_and_in_place_whichever_tile_they_lie_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def at_discs() -> np.ndarray:
+        pixels = find_features(blobs(), RULE).pixels
+        near = (np.abs(pixels % 40.0 - 20.0) < 5.0).all(axis=1)
+        return np.array(sorted(map(tuple, pixels[near].round(6).tolist())))
+
+    whole = at_discs()
+    monkeypatch.setattr(features, "_TILE_PX", 80)
+    monkeypatch.setattr(features, "_TILE_OVERLAP_PX", 40)
+    tiled = at_discs()
+    assert tiled.shape == whole.shape
+    np.testing.assert_allclose(tiled, whole, atol=0.05)

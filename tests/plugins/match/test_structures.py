@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.match import structures
 from orthoflow_plugins.match.structures import (
     Place,
     WallStructure,
@@ -225,3 +228,49 @@ def test_a_wall_without_intensity_or_of_few_cells_has_no_structure(wall: Wall) -
     assert wall_structure(replace(wall, intensity=None)) is None
     nothing = np.full_like(wall.intensity, np.nan)
     assert wall_structure(replace(wall, intensity=nothing)) is None
+    for n_rows, is_enough in ((31, False), (32, True)):
+        low = replace(
+            wall,
+            frame=replace(wall.frame, height=n_rows),
+            intensity=wall.intensity[:n_rows],
+            rgb=None,
+            rgb_mask=None,
+            percentiles_m=None,
+            **{
+                name: getattr(wall, name)[:n_rows]
+                for name in ("depth_m", "sigma_m", "count", "mask")
+            },
+        )
+        assert (wall_structure(low) is not None) == is_enough
+
+
+@pytest.mark.parametrize(
+    ("width", "level", "width_there"),
+    [(250.0, 0, 250.0), (251.0, 1, 125.5), (500.0, 1, 250.0), (501.0, 2, 125.25)],
+)
+@pytest.mark.parametrize("is_upright", [False, True])
+def test_a_size_is_looked_at_in_cells_that_are_wide_enough(
+    width: float, level: int, width_there: float, is_upright: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr(structures, "_best_at", lambda _, *how: asked.append(how))
+    levels: Any = [SimpleNamespace(photo_cells=250) for _ in range(3)]
+    # The longer side counts, whichever it is.
+    rgb = np.zeros((200, 100, 3) if is_upright else (100, 200, 3), dtype=np.uint8)
+    structures._best_of_size(rgb, 0.5 * width if is_upright else width, levels)
+    ((found, of),) = asked
+    assert of is levels[level]
+    assert found == (0.5 * width_there if is_upright else width_there)
+
+
+def test_parts_slip_by_three_hundredths_of_the_photo_and_one_cell_at_least() -> None:
+    assert [structures._slip(width) for width in (10, 66, 67, 200)] == [1, 1, 2, 6]
+
+
+def test_a_halved_depth_is_known_where_all_four_are() -> None:
+    depth_m = np.arange(35, dtype=np.float32).reshape(5, 7)
+    depth_m[1, 2] = np.nan
+    halved = structures._halved_depth(depth_m)
+    expected = depth_m[:4:2, :6:2].copy()
+    expected[0, 1] = np.nan
+    np.testing.assert_array_equal(halved, expected)

@@ -15,8 +15,10 @@ from orthoflow_plugins.match.tie_pieces import TiePiece
 from orthoflow_plugins.match.tracing import Trace, TracingRule
 from orthoflow_plugins.match.warping import Projection, View
 
+from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.testing import photographed as ms
+from tests import samples
 
 RULE = TracingRule(
     radius_cells=16,
@@ -377,3 +379,111 @@ def test_colours_are_compared_only_where_grey_leaves_doubts(
         : len(tried)
     ]
     assert found.content == "grey"
+
+
+def test_ties_that_determine_no_pose_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise GeometryError("nothing is determined")
+
+    monkeypatch.setattr(tracing, "fitted_pose", fail)
+    pieces = [piece(40, wrong=(3,))]
+    assert tracing._without_misfits(pieces, camera()) is pieces
+    assert tracing._refitted(tracing._joined(pieces), camera()) == (None, math.inf)
+
+
+def test_ties_lie_where_patches_went_and_are_as_exact_as_the_measured_cells_of_their_grain() -> (
+    None
+):
+    frame = samples.facing_south(0.01, 30, 25)
+    wall = samples.wall(frame, sigma_m=np.full((25, 30), 0.001, dtype=np.float32))
+    # Where there is no depth, and where it is known to three cells only.
+    wall.depth_m[5 + 9, 9] = np.nan
+    wall.sigma_m[5 + 12, 12], wall.count[5 + 12, 12] = 0.06, 4
+    places = np.array([[3, 4], [20, 10], [9, 9], [12, 12], [28, 3]])
+    moved = Displacements(
+        places=places.astype(np.intp),
+        shift_cells=np.array([[0.25, -0.5], [1.5, 2.0], [0, 0], [0, 0], [1.5, 0.0]]),
+        score=np.ones(5),
+        sigma_cells=np.full(5, 0.3),
+    )
+    grain = np.ones((20, 30), dtype=np.float32)
+    grain[10, 20] = 9.0
+    found = tracing._piece(4, 7, wall, (moved, projection(first=5)), grain)
+    assert (found.photo, found.wall) == (4, 7)
+    # Beyond the last column nothing is shown.
+    np.testing.assert_allclose(found.pixels_photo, [[6.5, 7.0], [43.0, 24.0]])
+    cells = np.array([[3.5, 9.5], [20.5, 15.5]])
+    np.testing.assert_allclose(found.points_world, frame.world_from_wall(cells), atol=1e-9)
+    # Residuals agree over six cells, and over eight more where nine share one.
+    sigma_cells = [math.hypot(0.3, 0.1), math.hypot(0.3 * math.sqrt(14.0 / 6.0), 0.1)]
+    np.testing.assert_allclose(found.sigma_px, 2.0 * np.array(sigma_cells))
+
+
+def test_walls_share_the_ties_of_a_photo_by_their_size_in_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(5)
+    known = (rng.random((60, 60)) < 0.8).astype(np.float32)
+
+    def target(grey: object = 1) -> Any:
+        channels = SimpleNamespace(part=lambda part: SimpleNamespace(known=known[part]))
+        return SimpleNamespace(
+            grey=grey,
+            wall=None,
+            prepare=lambda content, half: asked.append((content, half)),
+            channels={"grey": channels},
+            textures={"grey": known},
+            grains={RULE.half_patch_cells: known},
+        )
+
+    asked: list[Any] = []
+    # 400, 2400, none, 2400 without a picture, 20 pixels of a photo.
+    projections = [
+        projection(rows=10, columns=10), projection(), None, projection(first=20),
+        projection(rows=1, columns=5),
+    ]  # fmt: skip
+    projections[1].u[3, 4] = np.nan  # type: ignore[union-attr]
+    targets = [target(), target(), target(), target(None), target()]
+    wanted: list[int] = []
+    n_measured: list[int] = []
+
+    def textured(_strength: object, usable: NDArray[np.bool_], n_most: int) -> NDArray[np.intp]:
+        wanted.append(n_most)
+        return np.argwhere(usable)[:n_most:7, ::-1].astype(np.intp)
+
+    def measure(_one: object, _other: object, places: Any, rule: TracingRule) -> Displacements:
+        assert rule.radius_cells == 3
+        n = len(places)
+        n_measured.append(n)
+        moved = Displacements(
+            places=places, shift_cells=np.zeros((n, 2)), score=np.ones(n), sigma_cells=np.ones(n)
+        )
+        # One of them agrees with nobody.
+        moved.shift_cells[:1] = 9.0
+        return moved
+
+    monkeypatch.setattr(tracing, "textured_places", textured)
+    monkeypatch.setattr(tracing, "measure", measure)
+    monkeypatch.setattr(tracing, "_seen", lambda *_: None)
+    made: list[Any] = []
+
+    def piece_of(photo: int, index: int, _wall: object, found: Any, _grain: object) -> Any:
+        made.append((photo, index, found[0]))
+        return piece(max(1, len(found[0].places)), wall=index)
+
+    monkeypatch.setattr(tracing, "_piece", piece_of)
+    view: Any = SimpleNamespace(index=6, projections=projections)
+    found = tracing._measured(view, targets, (RULE, 3, "colours"))
+    # The largest first; whichever is small is asked for fifty.
+    assert [(photo, index) for photo, index, _ in made] == [(6, 1), (6, 0), (6, 4)]
+    n_pixels = 400 + (2400 - 4) + 2400 + 20
+    assert wanted == [max(50, round(100 * (2400 - 4) / n_pixels)), 50, 50]
+    assert asked == [("grey", RULE.half_patch_cells)] * 3
+    assert [each.wall for each in found.pieces] == [0, 1, 4]
+    for (_, _, moved), shown in zip(made, (projections[1], projections[0]), strict=False):
+        at = tuple(moved.places.T[::-1])
+        assert known[shown.part][at].all()  # type: ignore[union-attr]
+        assert np.isfinite(shown.u[at]).all()  # type: ignore[union-attr]
+        assert not (moved.shift_cells == 9.0).any()
+    assert found.n_measured == sum(n_measured)
+    assert found.n_outliers == found.n_measured - sum(len(each) for each in found.pieces)

@@ -319,3 +319,10 @@ def test_the_smallest_cell_of_the_walls_counts() -> None:
     assert candidate(known=(replace(WALL, gsd_m=None),)).gsd_m is None
     unknown = candidate(known=(replace(WALL, gsd_m=None),), error={"rms_m": 1.0, "worst_m": 1.0})
     assert reason_against(unknown) == ""
+
+
+def test_a_pose_by_hand_is_held_to_cells_only_where_they_are_known() -> None:
+    by_hand = candidate(known=(replace(WALL, gsd_m=None),))
+    # Nobody asks for the errors without one tie.
+    by_hand.estimate.without_one = (None,)  # type: ignore[misc, assignment]
+    assert reason_against(by_hand) == ""

@@ -287,3 +287,13 @@ def test_what_a_lens_model_lacks_is_said_from_half_as_much_again(
         assert f"deviate {sigma0:.1f} times" in notes[0]
         assert "would move its points by 2.0 px" in notes[0]
         assert f"the stated error is {np.sqrt(factor):.1f} times as large" in notes[0]
+
+
+def test_a_fuller_lens_that_cannot_be_found_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise GeometryError("the ties do not determine the camera")
+
+    monkeypatch.setattr(direct_linear, "adjust", fail)
+    found = estimated(camera(), seen_by(camera(), 60))
+    assert isinstance(found, Estimate)
+    assert found.notes == ()

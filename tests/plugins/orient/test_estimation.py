@@ -20,6 +20,7 @@ from orthoflow_plugins.orient.estimation import (
     without_chance,
 )
 
+from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
@@ -248,3 +249,18 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     assert found.agreeing[~wrong].mean() > 0.98
     assert found.agreeing[wrong].mean() < 0.2
     np.testing.assert_array_equal(found.agreeing, found.fit.normalised <= found.limit)
+
+
+def test_ties_that_determine_no_camera_make_no_pose_and_no_doubt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise GeometryError("the ties do not determine the camera")
+
+    true, nobody = camera(), np.zeros(60, dtype=np.bool_)
+    with monkeypatch.context() as patched:
+        patched.setattr(estimation, "first_step", fail)
+        assert isinstance(estimate_pose(photo_by(true), seen_by(true, 60), nobody, RULE), Estimate)
+    monkeypatch.setattr(estimation, "adjusted", fail)
+    said = estimate_pose(photo_by(true), seen_by(true, 60), nobody, RULE)
+    assert said == "no pose agrees with enough of its 60 ties"

@@ -172,3 +172,8 @@ def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() ->
     (note,) = given_poses._disagreement(seen, np.array([0.5, 3.6, 9.0, np.nan]), residuals)
     assert note.startswith("2 of its 4 ties")
     assert "by up to 50.0 px: measure at least 6" in note
+
+
+def test_without_walls_ties_are_as_they_are() -> None:
+    ties: Any = object()
+    assert given_poses._on_walls(ties, None) is ties

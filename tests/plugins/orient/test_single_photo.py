@@ -13,7 +13,7 @@ from orthoflow_plugins.orient import single_photo
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.single_photo import ByHand, Oriented
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.products import Camera, Photo, Photos, TieRole, Ties
 from tests import samples
 
@@ -150,3 +150,23 @@ def test_a_photo_without_an_orientation_keeps_its_ties_as_rejected() -> None:
     assert np.isnan(found.residuals_px).all()
     assert found.residuals_px.shape == (4, 2)
     assert (found.numbers, found.table, found.notes) == (None, (), ())
+
+
+def test_ties_that_determine_nothing_together_leave_those_by_hand_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise GeometryError("the ties do not determine the camera")
+
+    kept = np.arange(20) < 6
+    by_hand = SimpleNamespace(estimate=SimpleNamespace(agreeing=kept), start=None)
+    monkeypatch.setattr(single_photo, "pose_by_hand", lambda *_: by_hand)
+    monkeypatch.setattr(single_photo, "candidate_of", lambda *_: None)
+    monkeypatch.setattr(single_photo, "judged", lambda *_: oriented("ok", IN))
+    monkeypatch.setattr(single_photo, "adjusted", fail)
+    of, nothing = tied(20, 6), None
+    of.is_check = of.rule = None
+    hand = single_photo.oriented_by_hand(of, nothing, nothing)  # type: ignore[arg-type]
+    assert hand.is_enough
+    assert hand.joined is None
+    np.testing.assert_array_equal(hand.kept, kept)

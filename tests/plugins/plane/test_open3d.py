@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.plane import open3d_ransac
 from orthoflow_plugins.plane.open3d_patches import Open3dPatches
 from orthoflow_plugins.plane.open3d_ransac import Open3dRansac
 from orthoflow_plugins.plane.ransac import Ransac
@@ -83,3 +85,17 @@ def test_an_open3d_that_does_not_load_is_one_sentence(monkeypatch: pytest.Monkey
     monkeypatch.setattr(open3d_guard, "import_module", fail)
     with pytest.raises(PluginError, match=r"does not load \(libGL\.so\.1: .* file\): install the"):
         load_open3d("plane.x")
+
+
+@pytest.mark.parametrize("installed", ["open3d", "open3d-cpu", None])
+def test_the_version_is_told_under_whichever_name_it_is_installed(
+    installed: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def version(name: str) -> str:
+        if name != installed:
+            raise PackageNotFoundError(name)
+        return "0.19"
+
+    monkeypatch.setattr(open3d_ransac, "version", version)
+    expected = {"open3d": "0.19" if installed else "none"}
+    assert Open3dRansac.tools() == Open3dPatches.tools() == expected
