@@ -409,9 +409,8 @@ class _Reader:
 
 def _folds(camera: Intrinsics) -> bool:
     """Whether the lens model cannot be undone somewhere in the image."""
-    u = np.linspace(0.0, camera.width, 9)
-    v = np.linspace(0.0, camera.height, 9)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    sides = (np.linspace(0.0, side, 9) for side in (camera.width, camera.height))
+    pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     try:
         with np.errstate(all="ignore"):
             rays = camera.posed().rays_camera(pixels)

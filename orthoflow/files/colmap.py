@@ -334,13 +334,13 @@ def _lens_of(model: str, size: tuple[int, int], params: list[float], path: Path)
     if len(params) != len(columns):
         raise damaged(path, f"a camera {model} has {len(columns)} parameters, got {len(params)}")
     values = dict(zip(columns, params, strict=True))
-    focal = values.get("f", 0.0)
+    fx, fy = (values[name if name in values else "f"] for name in ("fx", "fy"))
     if model in _FISHEYES:
         return FisheyeLens(
             width=size[0],
             height=size[1],
-            fx=values.get("fx", focal),
-            fy=values.get("fy", focal),
+            fx=fx,
+            fy=fy,
             cx=values["cx"],
             cy=values["cy"],
             radial=tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")),
@@ -350,8 +350,8 @@ def _lens_of(model: str, size: tuple[int, int], params: list[float], path: Path)
     lens = Intrinsics(
         width=size[0],
         height=size[1],
-        fx=values.get("fx", focal),
-        fy=values.get("fy", focal),
+        fx=fx,
+        fy=fy,
         cx=values["cx"],
         cy=values["cy"],
         distortion=tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")),

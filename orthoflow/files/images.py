@@ -32,7 +32,7 @@ MOST_PIXELS: Final = 1 << 28
 # How far 8 bits lie apart that are cut off, or rounded.
 _ROUNDED_LEVELS: Final = 2
 # Larger images are averaged before they are shrunk, so many rows of the result at a time.
-_WHOLE_PX: Final = 1 << 26
+_IN_MEMORY_PX: Final = 1 << 26
 _BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
 
@@ -156,7 +156,7 @@ def grey_cells(values: NDArray[np.floating]) -> Cells:
 
 def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
     """Rows of a raster with at most some 64 million cells, evenly from all of it."""
-    return values[:: max(1, -(-values.size // _WHOLE_PX))]
+    return values[:: max(1, -(-values.size // _IN_MEMORY_PX))]
 
 
 def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
@@ -280,7 +280,7 @@ def _weighted(
 
 def _averaged_px(shape: tuple[int, ...], longest_side_px: int) -> int:
     """Side of the squares that are averaged before a picture is shrunk."""
-    return max(shape) // (2 * longest_side_px) if math.prod(shape) > _WHOLE_PX else 1
+    return max(shape) // (2 * longest_side_px) if math.prod(shape) > _IN_MEMORY_PX else 1
 
 
 def _shrunk_shape(shape: tuple[int, ...], longest_side_px: int) -> tuple[int, int]:

@@ -161,11 +161,9 @@ class _Terms:
 
     def unknown(self, names: Sequence[str]) -> str:
         """What is said of terms that our lenses have not; empty where there are none."""
-        there = [name for name in names if self(name) != 0.0]
-        if not there:
-            return ""
-        return (
-            f"its sensor {self._label} has {', '.join(there)}, which OpenCV's model has not: "
+        there = ", ".join(name for name in names if self(name) != 0.0)
+        return there and (
+            f"its sensor {self._label} has {there}, which OpenCV's model has not: "
             "optimise the cameras without them and export again"
         )
 

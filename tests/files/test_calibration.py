@@ -268,6 +268,7 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
     ("text", "problem"),
     [
         ("", "calibration.yaml:1:1: the calibration file is empty"),
+        ("~\n", "calibration.yaml:1:1: the calibration file is empty"),
         ("- 1\n", "calibration.yaml:1:1: expected the key cameras"),
         ("camera: 3\n", "calibration.yaml:1:1: expected the key cameras"),
         ("cameras: {}\n", "1:1: cameras: expected one entry per photo name or pattern"),

@@ -161,3 +161,12 @@ def test_quaternions_turn_as_their_matrix(angle: float) -> None:
     vectors = np.eye(3)
     turned = vectors + 2.0 * np.cross(xyz, np.cross(xyz, vectors) + w * vectors)
     np.testing.assert_allclose(turned, rotation.T, atol=1e-9)
+
+
+@pytest.mark.parametrize("skew", [0.75, -2.0])
+def test_a_lens_with_a_skew_is_refused(tmp_path: Path, skew: float) -> None:
+    camera = oriented().cameras[0]
+    assert camera.intrinsics is not None
+    skewed = replace(camera, intrinsics=replace(camera.intrinsics, skew=skew))
+    with pytest.raises(ArgumentError, match=rf"has a skew of {skew:.1f} px, which no model of"):
+        write_colmap_model(tmp_path, Cameras(cameras=(skewed,)))

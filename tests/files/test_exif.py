@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthoflow.files import exif
 from orthoflow.files.containers import icc_profile, image_format, is_cut_off
 from orthoflow.files.exif import Exif, focal_length, read_exif, without_orientation
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
@@ -364,6 +365,9 @@ def test_only_the_orientation_of_a_tiff_is_taken_out() -> None:
     assert without_orientation(made.tiff(image, 6)) == made.tiff(image, 1)
     turned = made.jpeg(image, made.exif_block({made.ORIENTATION: 6}))
     assert without_orientation(turned) is turned
+    # What stands upright is not copied, large as such files are.
+    upright = made.tiff(image, 1)
+    assert without_orientation(upright) is upright
 
 
 def test_a_picture_that_was_taken_less_than_a_pixel_wide_says_nothing_of_its_size() -> None:
@@ -521,3 +525,10 @@ def test_the_pitch_is_the_mean_of_both_axes() -> None:
 )
 def test_the_maker_is_not_said_twice(make: str, model: str, camera: str) -> None:
     assert Exif(make=make, model=model).camera == camera
+
+
+@pytest.mark.parametrize(
+    ("value", "whole"), [(None, None), (0.9, None), (1.0, 1), (1.9, 1), (4000.0, 4000)]
+)
+def test_a_size_is_a_whole_number_of_pixels(value: float | None, whole: int | None) -> None:
+    assert exif._whole(value) == whole

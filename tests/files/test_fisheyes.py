@@ -271,3 +271,17 @@ def test_faces_are_as_large_as_pictures_may_be(focal_px: float, height: int, pro
         field_of_view_deg=90.0,
     )
     assert problem_of(lens) == problem
+
+
+@pytest.mark.parametrize("theta_rad", [0.0, 0.5, 1.5])
+def test_a_plain_fisheye_is_finest_around_its_axis(theta_rad: float) -> None:
+    plain = replace(LENS, radial=(0.0, 0.0, 0.0, 0.0))
+    # Along a radius all angles are as long; a circle is as the angle over its sine.
+    around = theta_rad / np.sin(theta_rad) if theta_rad else 1.0
+    assert plain.finest_px(theta_rad) == pytest.approx(151.0 * around)
+
+
+def test_a_lens_that_spreads_outwards_is_finest_there() -> None:
+    spreading = replace(LENS, radial=(0.1, 0.0, 0.0, 0.0))
+    # The bent angle t + 0.1 t^3 grows by 1 + 0.3 t^2, more than it is over the sine.
+    assert spreading.finest_px(0.5) == pytest.approx(151.0 * (1.0 + 0.3 * 0.25))

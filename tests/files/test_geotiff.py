@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rasterio.transform import Affine
 
@@ -19,6 +21,7 @@ from orthoflow.files.geotiff import (
     require_map_crs,
     world_file_text,
 )
+from orthoflow.geometry.frames import frame_over
 
 PATH = Path("wall.tif")
 
@@ -163,3 +166,11 @@ def test_a_system_that_there_is_not_is_named_in_a_hundred_letters() -> None:
         with pytest.raises(InputError) as caught:
             require_map_crs(crs)
         assert str(caught.value).startswith(f"there is no coordinate system {named}: expected")
+
+
+def test_a_raster_lies_in_a_map_where_its_frame_says_so() -> None:
+    square = np.array([[5.0, 1.0, 0.0], [5.0, 0.0, 0.0], [6.0, 0.0, 0.0], [6.0, 1.0, 0.0]])
+    frame = frame_over(square, np.array([0.0, 0.0, 1.0]), gsd_m=0.25)
+    assert module.map_place(frame) is None
+    place = module.map_place(replace(frame, map_crs="EPSG:25832"))
+    assert place == module.MapPlace(corner_m=(5.0, 1.0), crs="EPSG:25832")

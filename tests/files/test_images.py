@@ -127,7 +127,7 @@ def test_cells_are_grey_where_they_are_known() -> None:
 
 
 def test_rows_are_sampled_evenly_and_only_of_large_rasters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "_WHOLE_PX", 100)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 100)
     values = np.arange(310).reshape(31, 10)
     np.testing.assert_array_equal(images.sampled_rows(values[:10]), values[:10])
     np.testing.assert_array_equal(images.sampled_rows(values), values[::4])
@@ -170,7 +170,7 @@ def test_a_large_picture_is_averaged_over_what_is_shown() -> None:
 def test_a_very_large_one_is_averaged_band_by_band(
     monkeypatch: pytest.MonkeyPatch, band_px: int
 ) -> None:
-    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
     monkeypatch.setattr(images, "_BAND_PX", band_px)
     image, shown = halves()
     asked = []
@@ -186,7 +186,7 @@ def test_a_very_large_one_is_averaged_band_by_band(
 
 
 def test_what_is_left_over_beyond_whole_squares_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "_WHOLE_PX", 100)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 100)
     image = np.full((41, 21), 90, dtype=np.uint8)
     image[40:], image[:, 20:] = 0, 0
     preview = images._preview(
@@ -202,7 +202,7 @@ def test_a_pixel_of_a_preview_covers_what_it_is_averaged_over(
     assert images.cells_per_preview_px((1600, 1200)) == (1.0, 1.0)
     assert images.cells_per_preview_px((3200, 1000)) == (2.0, 2.0)
     assert images.cells_per_preview_px((100, 4800)) == (100 / 33, 3.0)
-    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
     # Squares of two first: 3500 x 1500, which become 1600 x 686.
     assert images.cells_per_preview_px((7000, 3001)) == (4.375, 2 * 1500 / 686)
     # The thinnest picture has a pixel.
@@ -269,3 +269,18 @@ def test_levels_are_as_deep_as_the_file_and_in_the_order_of_colours() -> None:
     found = images.decode_levels(images.encode_png(plain))
     np.testing.assert_array_equal(found, plain)
     assert found.dtype == np.uint8
+
+
+@pytest.mark.parametrize(("apart", "is_read"), [(0, True), (2, True), (-2, True), (3, False)])
+def test_sixteen_bits_are_believed_where_they_are_the_eight_but_for_rounding(
+    monkeypatch: pytest.MonkeyPatch, apart: int, is_read: bool
+) -> None:
+    plain = np.full((2, 3, 3), 100, dtype=np.uint8)
+    plain[1, 2, 0] = 100 + apart
+    deep = np.full((2, 3, 3), 100 * 257, dtype=np.uint16)
+    monkeypatch.setattr(images, "_decoded", lambda *_, is_deep: deep if is_deep else plain)
+    if is_read:
+        np.testing.assert_array_equal(images.decode_levels(b"", "a.tif"), deep)
+        return
+    with pytest.raises(InputError, match=r"a\.tif has 16 bits per channel in a layout that is"):
+        images.decode_levels(b"", "a.tif")

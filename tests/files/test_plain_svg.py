@@ -7,7 +7,7 @@ import io
 import matplotlib.pyplot as plt
 import pytest
 
-from orthoflow.files.plain_svg import MOST_BYTES, is_plain_svg
+from orthoflow.files.plain_svg import is_plain_svg
 
 LINKS = 'xmlns:xlink="http://www.w3.org/1999/xlink"'
 
@@ -84,5 +84,8 @@ def test_what_stands_before_it_is_looked_at(before: str) -> None:
 
 
 def test_what_is_no_drawing_or_too_large_is_not_plain() -> None:
-    for content in (b"", b"GIF89a", picture("<g/>" * (MOST_BYTES // 4))):
+    for content in (b"", b"GIF89a"):
         assert not is_plain_svg(content)
+    blanks = 16_000_000 - len(picture(""))
+    assert is_plain_svg(picture(" " * blanks))
+    assert not is_plain_svg(picture(" " * (blanks + 1)))

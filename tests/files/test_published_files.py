@@ -399,7 +399,7 @@ def test_a_pixel_of_a_preview_covers_so_many_cells(
     whole_px: int,
     covered: tuple[float, float],
 ) -> None:
-    monkeypatch.setattr(images, "_WHOLE_PX", whole_px)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", whole_px)
     assert images.cells_per_preview_px(shape) == covered
 
 
@@ -432,7 +432,7 @@ def test_a_shrunk_picture_has_its_longest_side(side: int) -> None:
 def test_large_rasters_are_sampled_by_rows(
     monkeypatch: pytest.MonkeyPatch, n_rows: int, n_kept: int
 ) -> None:
-    monkeypatch.setattr(images, "_WHOLE_PX", 30)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 30)
     values = np.arange(3 * n_rows).reshape(n_rows, 3)
     kept = images.sampled_rows(values)
     assert len(kept) == n_kept

@@ -145,7 +145,7 @@ def test_previews_open_where_their_rasters_lie(
 ) -> None:
     import rasterio
 
-    monkeypatch.setattr(images, "_WHOLE_PX", whole_px)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", whole_px)
     wide = replace(frame, width=6407, height=1203)
     half = np.zeros((*wide.shape, 3), dtype=np.uint8)
     half[:, 3000:] = 200
@@ -452,7 +452,7 @@ def test_large_images_are_written_in_bands_and_read_back_the_same(
         folder.mkdir()
         publishing.publish_orthoimages(product, folder, DIGEST)
         monkeypatch.setattr(geotiff, "_IN_MEMORY_CELLS", 1000)
-        monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+        monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
     whole, bands = (geotiff.read_raster(folder / "wall_3_ortho.tif") for folder in folders)
     np.testing.assert_array_equal(bands.values, whole.values)
     np.testing.assert_array_equal(bands.shown, whole.shown)
@@ -473,7 +473,7 @@ def test_previews_of_large_images_are_those_of_the_whole(monkeypatch: pytest.Mon
     rgb = np.repeat(np.repeat(rng.integers(0, 256, (24, 40, 3), np.uint8), 16, 0), 16, 1)
     shown = np.repeat(np.repeat(rng.random((24, 40)) < 0.8, 16, 0), 16, 1)
     whole = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "whole")
-    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
     bands = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "bands")
     np.testing.assert_array_equal(bands, whole)
 

@@ -136,3 +136,11 @@ def test_a_table_is_sorted_into_a_block() -> None:
     assert (block.n_read, block.scan) == (2, 0)
     bare = point_block(table[:, :3], columns_of_text("x y z"))
     assert (bare.intensity, bare.rgb, bare.row, bare.column) == (None, None, None, None)
+
+
+def test_columns_are_found_among_those_that_are_used() -> None:
+    columns = Columns(names=("x", "y", "z", "row"), rule="")
+    assert columns.used == ("x", "y", "z")
+    assert columns.index_of(("z", "x", "y")) == [2, 0, 1]
+    assert columns.index_of(("y",)) == [1]
+    assert columns.index_of(("x", "row")) == []

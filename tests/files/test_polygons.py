@@ -1,0 +1,104 @@
+"""Polygons in GeoJSON files, filled on a grid and drawn around areas of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import InputError
+from orthoflow.files.polygons import NamedPolygon, filled, outlines, read_polygons
+
+SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 0.0]]
+HOLE = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]
+
+
+def feature(coordinates: Any, *, kind: str = "Polygon", **properties: Any) -> dict[str, Any]:
+    return {
+        "type": "Feature",
+        "properties": {"photo": "a.jpg", **properties},
+        "geometry": {"type": kind, "coordinates": coordinates},
+    }
+
+
+def read(folder: Path, *features: Any) -> list[NamedPolygon]:
+    path = folder / "masks.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return read_polygons(path, name="photo", what="a mask of photos")
+
+
+def test_polygons_come_in_their_order_with_their_holes_and_what_is_said_of_them(
+    tmp_path: Path,
+) -> None:
+    # Heights are left out.
+    high = [[*corner, 7.0] for corner in SQUARE]
+    first, second, third = read(
+        tmp_path,
+        feature([high, HOLE], note="window"),
+        feature([[SQUARE], [HOLE]], kind="MultiPolygon", photo="b.jpg"),
+    )
+    assert [one.name for one in (first, second, third)] == ["a.jpg", "b.jpg", "b.jpg"]
+    assert first.properties == {"photo": "a.jpg", "note": "window"}
+    for one, rings in ((first, [SQUARE, HOLE]), (second, [SQUARE]), (third, [HOLE])):
+        assert [ring.tolist() for ring in one.rings] == rings
+
+
+@pytest.mark.parametrize(
+    "strange",
+    [
+        feature([SQUARE], photo=5),
+        feature([SQUARE[:2]]),
+        feature([]),
+        feature([[[0.0, 0.0], [1e9, 0.0], [4.0, 3.0]]]),
+        feature([SQUARE], kind="Point"),
+        {"type": "Feature", "properties": {}, "geometry": None},
+        7,
+    ],
+    ids=["name", "line", "nothing", "far", "point", "no geometry", "no feature"],
+)
+def test_what_is_no_polygon_with_a_name_is_refused_with_its_number(
+    tmp_path: Path, strange: Any
+) -> None:
+    told = (
+        r"masks\.geojson is not a mask of photos: expected a GeoJSON FeatureCollection of polygons,"
+        r' each with the property "photo" \(feature 1\)$'
+    )
+    with pytest.raises(InputError, match=told):
+        read(tmp_path, feature([SQUARE]), strange)
+    assert len(read(tmp_path, feature([SQUARE[:3]]))) == 1
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"features": {}}'])
+def test_what_is_no_collection_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "m.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"^m\.json is not a mask: expected a GeoJSON Feature"):
+        read_polygons(path, name="photo", what="a mask")
+
+
+def test_cells_are_filled_whose_centres_lie_inside_and_in_no_hole() -> None:
+    outer = np.array([[0.4, 0.4], [4.6, 0.4], [4.6, 3.4], [0.4, 3.4]])
+    hole = np.array([[1.4, 1.4], [2.6, 1.4], [2.6, 2.6], [1.4, 2.6]])
+    found = filled((outer, hole), (4, 6))
+    expected = np.zeros((4, 6), dtype=np.bool_)
+    expected[0:3, 0:5] = True
+    expected[1:3, 1:3] = False
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_areas_are_drawn_along_their_cells_and_touch_at_corners_only() -> None:
+    values = np.full((4, 5), -1, dtype=np.int16)
+    values[0:3, 0:3] = 7
+    values[1, 1] = -1
+    # Two cells that share but a corner are two areas; zero is a value as any other.
+    values[2, 3] = values[3, 4] = 0
+    found = outlines(values)
+    assert sorted(value for value, _ in found) == [0, 0, 7]
+    painted = np.full(values.shape, -1, dtype=np.int16)
+    for value, rings in found:
+        painted[filled(rings, values.shape)] = value
+        assert len(rings) == (2 if value == 7 else 1)
+    np.testing.assert_array_equal(painted, values)
