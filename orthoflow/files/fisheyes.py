@@ -261,7 +261,7 @@ class FisheyeFace:
         pixels = self._pixels()
         pixels[~self.fisheye.sees(pixels)] = np.nan
         # OpenCV counts from the centre of the first pixel; NaN it would take anywhere.
-        places = np.nan_to_num(pixels - HALF_PIXEL, nan=-9.0).astype(np.float32)
+        places = np.nan_to_num(pixels - HALF_PIXEL).astype(np.float32)
         looked_up = cv2.remap(
             photo,
             places[..., 0],

@@ -87,6 +87,14 @@ def test_a_calibration_without_distortion_has_none(tmp_path: Path) -> None:
     assert the_lens(calibration).distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize(("skew", "kept"), [(0.75, 0.75), (-2, -2.0), (0, None)])
+def test_axes_that_are_not_square_have_a_skew(
+    tmp_path: Path, skew: float, kept: float | None
+) -> None:
+    calibration = read(tmp_path, f'cameras: {{"*": {{{GOOD}, skew: {skew}}}}}')
+    assert the_lens(calibration).skew == kept
+
+
 def test_what_was_written_is_read_again(tmp_path: Path) -> None:
     calibration = Calibration(
         patterns=('IMG "1".jpg', "wände [x]/ü*.jpg", "*"),

@@ -100,9 +100,8 @@ def open_las(
         name=path.name,
         format_name=FORMAT,
         n_most=n_points,
-        fields=point_fields(
-            has_intensity="intensity" in names, has_rgb={"red", "green", "blue"} <= names
-        ),
+        # Points of every format have an intensity.
+        fields=point_fields(has_intensity=True, has_rgb={"red", "green", "blue"} <= names),
         read=lambda: _blocks(path, laspy, bounds, notes, wanted),
         details=details,
         notes=notes,
@@ -151,7 +150,7 @@ def _block(chunk: Any, classes: frozenset[int]) -> PointBlock:
     axes = _coordinates(chunk)
     points = axes.T
     names = set(chunk.point_format.dimension_names)
-    intensity = np.asarray(chunk.intensity, dtype=np.float32) if "intensity" in names else None
+    intensity = np.asarray(chunk.intensity, dtype=np.float32)
     rgb = None
     if {"red", "green", "blue"} <= names:
         rgb = np.column_stack([np.asarray(chunk[name]) for name in ("red", "green", "blue")])
@@ -177,7 +176,7 @@ def _block(chunk: Any, classes: frozenset[int]) -> PointBlock:
         n_read=len(points),
         n_withheld=int(withheld.sum()),
         n_unwanted=int((~kept & ~withheld).sum()),
-        intensity=None if intensity is None else intensity[kept],
+        intensity=intensity[kept],
         rgb=None if rgb is None else rgb[kept],
         bounds=_bounds(axes),
     )

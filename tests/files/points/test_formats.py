@@ -68,3 +68,21 @@ def test_a_header_that_states_more_points_than_can_be_read_is_refused(
     path = scan_files.write_las(tmp_path / "a.laz", points)
     with pytest.raises(InputError, match=r"a\.laz states 40 points, at most 39 can be read"):
         open_scan(path)
+
+
+def test_points_are_counted_in_four_bytes() -> None:
+    def stated(n_most: int) -> blocks_module.ScanFile:
+        return blocks_module.ScanFile(
+            name="a.las",
+            format_name="LAS/LAZ",
+            n_most=n_most,
+            fields=frozenset(),
+            read=lambda: iter(()),
+        )
+
+    assert stated(2**32 - 1).n_most == 4_294_967_295
+    with pytest.raises(InputError, match="states 4294967296 points, at most 4294967295 can be"):
+        stated(2**32)
+    with pytest.raises(InputError, match=r"a\.las holds no points"):
+        stated(0)
+    assert stated(1).n_most == 1

@@ -178,3 +178,60 @@ def test_bounds_of_a_block_are_none_where_they_are_not_finite() -> None:
     axes[1, 1] = np.nan
     assert las._bounds(axes) is None
     assert las._bounds(np.zeros((3, 0))) is None
+
+
+@pytest.mark.parametrize(("farthest", "is_told"), [(0.9e12, True), (1.1e12, False)])
+def test_bounds_are_believed_up_to_a_trillion_units(farthest: float, *, is_told: bool) -> None:
+    found = block((0.0, 0.0, -2.0), (0.0, 0.0, 1.0))
+    low = (-farthest, 0.0, -1.0)
+    assert outside(found, low, (0.0, 0.0, 1.0)) == 0
+    # Beyond bounds that are said, by more than a thousandth of their largest extent.
+    beyond = block((0.0, 0.0, 0.002 * farthest), (0.0, 0.0, 1.0))
+    assert outside(beyond, low, (0.0, 0.0, 1.0)) == is_told
+
+
+def compressed(*items: tuple[int, int]) -> bytes:
+    """The record of a compression: kind and bytes of each item."""
+    listed = b"".join(struct.pack("<HHH", kind, size, 3) for kind, size in items)
+    return bytes(32) + struct.pack("<H", len(items)) + listed
+
+
+def layered(n_layers: int, n_first: int, n_chunks: int, *, more: int = 0) -> tuple[bytes, int]:
+    """Chunks of so many layers of 3, 4, 5 ... bytes behind a first point, and the size of one."""
+    sizes = [3 + k for k in range(n_layers)]
+    head = bytes(n_first) + struct.pack(f"<I{n_layers}I", 7, *sizes[:-1], sizes[-1] + more)
+    chunk = head + bytes(sum(sizes))
+    return chunk * n_chunks, len(chunk)
+
+
+@pytest.mark.parametrize(
+    ("items", "n_layers"),
+    [
+        ([(10, 30)], 9),
+        ([(10, 30), (11, 6)], 10),
+        ([(10, 30), (12, 8)], 11),
+        ([(10, 30), (13, 29)], 10),
+        # Each byte that a program has added is a layer of its own.
+        ([(10, 30), (11, 6), (14, 5)], 15),
+    ],
+)
+def test_layers_are_as_large_as_their_chunk(
+    tmp_path: Path, items: list[tuple[int, int]], n_layers: int
+) -> None:
+    path = tmp_path / "a.laz"
+    n_first = sum(size for _, size in items)
+    content, n_chunk = layered(n_layers, n_first, 2)
+    path.write_bytes(b"12345" + content)
+    las._check_layers(path, compressed(*items), 5, [n_chunk, n_chunk])
+    content, _ = layered(n_layers, n_first, 2, more=1)
+    path.write_bytes(b"12345" + content)
+    with pytest.raises(InputError, match="layers of its chunks are not as large as they are said"):
+        las._check_layers(path, compressed(*items), 5, [n_chunk, n_chunk])
+    path.write_bytes(b"12345" + bytes(n_first))
+    with pytest.raises(InputError, match="layers of its chunks are not as large as they are said"):
+        las._check_layers(path, compressed(*items), 5, [n_chunk])
+
+
+def test_items_of_older_points_have_no_layers(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="its compression is none of point formats 6 and up"):
+        las._check_layers(tmp_path / "a.laz", compressed((10, 30), (6, 20)), 0, [])
