@@ -135,7 +135,9 @@ class _Compilation(event.Listener):
         kernel = event.data["dispatcher"]
         self._depth += 1
         self._n_begun += 1
-        tell(f"compiling {kernel.py_func.__name__} ({self._n_begun} so far)")
+        # What numba makes within a function of ours, or of its own, is all called alike.
+        name = kernel.py_func.__qualname__.partition(".")[0]
+        tell(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
         """Say that it is there."""
