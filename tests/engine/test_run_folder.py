@@ -1,0 +1,168 @@
+"""The journal of a run folder: what it keeps, who may go on with it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine.run_folder import (
+    JOURNAL,
+    RECORD_FILE,
+    CellDamaged,
+    CellEnded,
+    Journal,
+    RunWent,
+    cell_file_name,
+    is_running,
+    new_run_folder,
+    new_run_id,
+)
+from orthoflow.errors import ArgumentError, RecordError, StoreError
+
+
+def ended(address: str, status: str = "ok", *, cached: bool = False, error: str = "") -> CellEnded:
+    return CellEnded(
+        time="2026-01-02T03:04:05Z",
+        address=address,
+        key=f"key of {address}",
+        status=status,  # type: ignore[arg-type]
+        cached=cached,
+        error="",
+        error_type=error,
+    )
+
+
+def lines(folder: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (folder / JOURNAL).read_text().splitlines()]
+
+
+def test_a_run_goes_on_with_what_its_journal_says(tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "hall"
+    with Journal(folder, "hall", run_id="r1") as journal:
+        assert (journal.run_id, journal.is_resumed, journal.finished_keys) == ("r1", False, set())
+        began = journal.started
+        for line in (
+            ended("a"), ended("b", cached=True), ended("c", "failed"), ended("d", "skipped"),
+            CellDamaged(time=began, address="a", key="k", what="product.h5"),
+        ):  # fmt: skip
+            journal.write(line)
+        assert journal.damaged == {"a": "product.h5"}
+    assert [line["event"] for line in lines(folder)] == ["run", *["finished"] * 4, "damaged"]
+    with Journal(folder, "hall", run_id="r2") as journal:
+        assert (journal.run_id, journal.is_resumed, journal.started) == ("r1", True, began)
+        # Only what this run computed itself.
+        assert journal.finished_keys == {"key of a"}
+        assert journal.damaged == {"a": "product.h5"}
+    assert lines(folder)[-1]["event"] == "resumed"
+    with pytest.raises(ArgumentError, match="holds an unfinished run of hall, not of court; choo"):
+        Journal(folder, "court")
+
+
+def test_a_run_without_an_id_gets_one_of_its_own(tmp_path: Path) -> None:
+    with Journal(tmp_path / "a", "hall") as one, Journal(tmp_path / "b", "hall") as other:
+        assert one.run_id != other.run_id
+        assert one.started.endswith("Z")
+    assert new_run_id() != new_run_id()
+    assert new_run_folder("hall", "r1") == Path("runs/hall-r1")
+    with pytest.raises(
+        RecordError, match=r"the run cannot lie below runs/: .*name its folder with"
+    ):
+        new_run_folder("../hall", "r1")
+
+
+def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
+    assert not is_running(tmp_path)
+    with Journal(tmp_path / "run", "hall"):
+        assert is_running(tmp_path / "run")
+        with pytest.raises(StoreError, match="is in use by another run; wait for its end, or"):
+            Journal(tmp_path / "run", "hall")
+    assert not is_running(tmp_path / "run")
+
+
+def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: Path) -> None:
+    with Journal(tmp_path, "hall") as journal:
+        journal.write(ended("a"))
+    path = tmp_path / JOURNAL
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"event": "finish')
+    with Journal(tmp_path, "hall") as journal:
+        assert journal.finished_keys == {"key of a"}
+        journal.write(ended("b"))
+    assert path.read_bytes().startswith(whole)
+    assert [line["event"] for line in lines(tmp_path)] == [
+        *("run", "finished", "resumed", "finished"),
+    ]
+    for damaged in (whole.replace(b"finished", b"vanished"), whole.partition(b"\n")[2]):
+        path.write_bytes(damaged)
+        with pytest.raises(StoreError, match=r"journal\.jsonl is damaged; remove .* or choose"):
+            Journal(tmp_path, "hall")
+        # It may be mended, and be opened then.
+        assert not is_running(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("ends", "goes_on"),
+    [
+        ([ended("a")], False),
+        ([ended("a", "failed", error="MethodError")], False),
+        ([ended("a", "failed", error="DiskSpaceError"), ended("b")], True),
+        # It had room in the end.
+        ([ended("a", "failed", error="DiskSpaceError"), ended("a")], False),
+    ],
+    ids=["ok", "failed", "no room", "room at last"],
+)
+def test_a_finished_run_goes_on_only_where_the_disk_was_full(
+    tmp_path: Path, ends: list[CellEnded], goes_on: bool
+) -> None:
+    with Journal(tmp_path, "hall", run_id="r1") as journal:
+        for line in [*ends, RunWent(event="ended", time="2026-01-02T03:04:05Z")]:
+            journal.write(line)
+    (tmp_path / RECORD_FILE).write_text("the record")
+    if not goes_on:
+        with pytest.raises(
+            ArgumentError, match=r"holds a finished run \(run\.h5\); choose another"
+        ):
+            Journal(tmp_path, "hall")
+        assert (tmp_path / RECORD_FILE).exists()
+        return
+    with Journal(tmp_path, "hall") as journal:
+        assert (journal.run_id, journal.is_resumed) == ("r1", True)
+    # It is a record no more, and is still there until the next one replaces it.
+    assert not (tmp_path / RECORD_FILE).exists()
+    assert (tmp_path / f".{RECORD_FILE}.earlier").read_text() == "the record"
+
+
+def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(ArgumentError, match="is not empty and holds no unfinished run; choose"):
+        Journal(tmp_path, "hall")
+    (tmp_path / "notes.txt").unlink()
+    (tmp_path / JOURNAL).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ArgumentError, match=r"holds a link, journal\.jsonl, as no run makes them"):
+        Journal(tmp_path, "hall")
+    (tmp_path / JOURNAL).unlink()
+    os.mkfifo(tmp_path / JOURNAL)
+    with pytest.raises(ArgumentError, match=r"holds a pipe or a device, journal\.jsonl, as no run"):
+        Journal(tmp_path, "hall")
+    assert [path.name for path in tmp_path.iterdir()] == [JOURNAL]
+    # A record whose journal nobody can read is of a finished run.
+    (tmp_path / JOURNAL).unlink()
+    (tmp_path / JOURNAL).write_text("nothing\n")
+    (tmp_path / RECORD_FILE).touch()
+    with pytest.raises(ArgumentError, match="holds a finished run"):
+        Journal(tmp_path, "hall")
+
+
+@pytest.mark.parametrize("letter", ["a", "ä"])
+def test_names_of_files_have_two_hundred_bytes_and_stay_apart(letter: str) -> None:
+    n_fitting = 200 // len(letter.encode())
+    fitting = letter * n_fitting
+    assert cell_file_name(fitting) == fitting
+    one, other = (cell_file_name(fitting + end) for end in ("b", "c"))
+    assert one != other
+    for name in (one, other):
+        assert 195 <= len(name.encode()) <= 200
+        assert name.startswith(letter * 90)
