@@ -162,7 +162,7 @@ class Journal:
         if isinstance(line, CellDamaged):
             self.damaged[line.address] = line.what
         content = _codec().dump_python(line, mode="json")
-        text = json.dumps(content, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        text = json.dumps(content, ensure_ascii=False).encode() + b"\n"
         with writing_to(self._folder):
             while text:
                 text = text[os.write(self._descriptor, text) :]

@@ -50,6 +50,8 @@ def test_a_run_goes_on_with_what_its_journal_says(tmp_path: Path) -> None:
         ):  # fmt: skip
             journal.write(line)
         assert journal.damaged == {"a": "product.h5"}
+    # People may read it, and nobody runs it.
+    assert not (folder / JOURNAL).stat().st_mode & 0o111
     assert [line["event"] for line in lines(folder)] == ["run", *["finished"] * 4, "damaged"]
     with Journal(folder, "hall", run_id="r2") as journal:
         assert (journal.run_id, journal.is_resumed, journal.started) == ("r1", True, began)
@@ -59,6 +61,12 @@ def test_a_run_goes_on_with_what_its_journal_says(tmp_path: Path) -> None:
     assert lines(folder)[-1]["event"] == "resumed"
     with pytest.raises(ArgumentError, match="holds an unfinished run of hall, not of court; choo"):
         Journal(folder, "court")
+
+
+def test_letters_stand_in_a_journal_as_they_are(tmp_path: Path) -> None:
+    with Journal(tmp_path, "hall") as journal:
+        journal.write(ended("größe"))
+    assert '"address": "größe"' in (tmp_path / JOURNAL).read_text(encoding="utf-8")
 
 
 def test_a_run_without_an_id_gets_one_of_its_own(tmp_path: Path) -> None:
@@ -74,7 +82,7 @@ def test_a_run_without_an_id_gets_one_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
-    assert not is_running(tmp_path)
+    assert is_running(tmp_path) is False
     with Journal(tmp_path / "run", "hall"):
         assert is_running(tmp_path / "run")
         with pytest.raises(StoreError, match="is in use by another run; wait for its end, or"):

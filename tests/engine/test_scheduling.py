@@ -53,10 +53,12 @@ class Store:
 
     def __init__(self) -> None:
         self.unsound: set[str] = set()
+        # What shows only to who looks at every byte again.
+        self.rotten: set[str] = set()
         self.taken = SimpleNamespace(result=None, damage="")
 
     def is_sound(self, digest: str, *, again: bool = False) -> bool:
-        return digest not in self.unsound
+        return digest not in self.unsound and not (again and digest in self.rotten)
 
     def take(self, key: str) -> SimpleNamespace:
         return self.taken
@@ -123,11 +125,11 @@ def test_a_step_has_its_share_unless_it_asks_and_never_more_than_one_may() -> No
         ({"parts": 5}, True, 5),
         ({"executor": "dask", "parts": 5}, False, 5),
         ({"executor": "dask"}, True, 1),
-        # One of seven workers is busy, and two other steps wait for room.
+        # One of eight workers is busy, and two other steps wait for room.
         ({"executor": "dask", "scheduler": "tcp://x:1"}, False, 2),
         # Workers of its own have the four cores of this machine.
         ({"executor": "dask"}, False, 1),
-        ({"executor": "dask", "all_cores": 7}, False, 2),
+        ({"executor": "dask", "all_cores": 5}, False, 1),
         ({"executor": "dask", "all_cores": 99}, False, 2),
     ],
 )
@@ -139,7 +141,7 @@ def test_a_step_is_computed_in_as_many_parts_as_keep_all_busy(
     del run._waiting["a"]
     run._ready = {"b": object(), "c": object()}
     task: Any = SimpleNamespace(is_compared=is_compared)
-    assert run._n_parts(task, replace(WIDE, n_tasks=7)) == n_parts
+    assert run._n_parts(task, replace(WIDE, n_tasks=8)) == n_parts
 
 
 def test_an_equal_step_waits_for_the_one_that_runs() -> None:
@@ -161,8 +163,10 @@ def test_what_hangs_on_a_damaged_product_is_settled_anew() -> None:
     run._resumed = {"b", "d"}
     assert not run._is_held_up(CHAIN[1], {"a": ref("a")})
     assert list(run._results) == ["a", "b", "c", "d"]
+    run._store.rotten = {"a"}
+    assert run._is_held_up(CHAIN[1], {"a": ref("a")}) is False
     run._store.unsound = {"a"}
-    assert run._is_held_up(CHAIN[1], {"a": ref("a")})
+    assert run._is_held_up(CHAIN[1], {"a": ref("a")}) is True
     assert list(run._results) == ["d"]
     assert list(run._waiting) == ["a", "b", "c"]
     assert (list(run._ready), list(run._cached), run._resumed) == (["e"], ["d"], {"d"})
@@ -188,14 +192,14 @@ def test_a_step_that_failed_by_the_store_has_three_more_chances() -> None:
     task: Any = SimpleNamespace(inputs={"a": SimpleNamespace(ref=ref("a"))})
     for fault in ("unsound", "set aside"):
         run = a_run(*CHAIN)
-        run._store.unsound = {"a"} if fault == "unsound" else set()
+        run._store.rotten = {"a"} if fault == "unsound" else set()
         end = failed() if fault == "unsound" else failed(DamageError)
         tried = [run._is_to_repeat(CHAIN[1], task, end) for _ in range(5)]
         assert tried == [True, True, True, False, False]
     run = a_run(*CHAIN)
-    assert not run._is_to_repeat(CHAIN[1], task, failed())
+    assert run._is_to_repeat(CHAIN[1], task, failed()) is False
     run._store.unsound = {"a"}
-    assert not run._is_to_repeat(CHAIN[1], task, result("b"))
+    assert run._is_to_repeat(CHAIN[1], task, result("b")) is False
     stopped = failed(CancelledStepError, CancelledStepError.exit_code)
     assert not run._is_to_repeat(CHAIN[1], task, stopped)
 
@@ -332,6 +336,7 @@ def test_a_result_is_kept_unless_the_code_changed_meanwhile() -> None:
     kept = taking(run, good)
     assert [what for what, _ in kept] == ["put", "trust", "forget parts", "forget"]
     assert (run._made, run._results["b"], run._running) == ({"key of b"}, good, {})
+    assert run.events == [CellFinished(address="b", result=good, cached=False)]
     run = a_run(*CHAIN)
     run._results["a"] = result("a")
     assert taking(run, good, is_unchanged=False) == []
@@ -339,6 +344,14 @@ def test_a_result_is_kept_unless_the_code_changed_meanwhile() -> None:
     (warning,) = run._results["b"].warnings
     assert warning.startswith("the code of the method changed during the run")
     assert run.events[0] == CellWarned(address="b", text=warning)
+
+
+def test_a_part_that_ends_settles_nothing() -> None:
+    run = a_run(*CHAIN)
+    run._running = {"b, part 1": SimpleNamespace(address="b, part 1", folder="/nonexistent/x")}
+    run._splits = SimpleNamespace(take=lambda *_: None)
+    run._take(SimpleNamespace(address="b, part 1", result=result("b")))
+    assert (run._results, run._running, run.lines, run.events) == ({}, {}, [], [])
 
 
 def test_failures_are_remembered_and_interruptions_are_not() -> None:

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.products import Planes, Product
+from orthoflow.products import Photo, Photos, Planes, Product
 from orthoflow.products.product import Tolerance
 from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
@@ -202,6 +202,79 @@ def test_a_sample_tells_a_picture_that_moved_from_noise(
     before, after = (sample_of(Picture(rgb=image)) for image in (rgb, change(rgb)))
     problem = sample_problem(before, after, Picture.tolerances)
     assert bool(problem) == is_noticed, problem
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "is_apart"),
+    [
+        (None, None, False),
+        (None, 1.0, True),
+        (1.0, None, True),
+        # An amount of 0.01 and a tenth of the larger: 1.01 / 0.9 is 1.122.
+        (1.0, 1.12, False),
+        (1.0, 1.125, True),
+        (1.125, 1.0, True),
+        (-1.0, -1.12, False),
+        (-1.125, -1.0, True),
+        (0.0, 0.01, False),
+        (0.0, 0.012, True),
+        (0.5, -0.5, True),
+    ],
+)
+def test_numbers_are_apart_beyond_an_amount_and_a_share(
+    before: float | None, after: float | None, is_apart: bool
+) -> None:
+    limit = golden._Limit(amount=0.01, share=0.1)
+    assert golden._is_apart(before, after, limit) is is_apart
+
+
+@pytest.mark.parametrize(("factor", "is_noticed"), [(0.9, False), (1.2, True)])
+def test_what_states_no_tolerance_may_differ_by_a_millionth(
+    factor: float, is_noticed: bool
+) -> None:
+    for before, after in ((0.0, factor * 1e-6), (1e3, 1e3 + factor * 1e-3)):
+        pair = ({"a": Sample(shape=[1], values=[value])} for value in (before, after))
+        assert bool(sample_problem(*pair, {})) is is_noticed
+
+
+@pytest.mark.parametrize(("n_moved", "is_noticed"), [(2, False), (3, True)])
+def test_one_of_sixteen_sampled_values_may_stray(n_moved: int, is_noticed: bool) -> None:
+    moved = [1.0] * n_moved + [0.0] * (32 - n_moved)
+    pair = ({"a": Sample(shape=[32], values=values)} for values in ([0.0] * 32, moved))
+    assert bool(sample_problem(*pair, {})) is is_noticed
+
+
+def test_a_sample_has_thirty_two_numbers_of_nine_digits_and_no_bytes() -> None:
+    few = golden._sample(np.arange(32.0) / 3.0)
+    assert few.values == [float(f"{value / 3.0:.9g}") for value in range(32)]
+    many = golden._sample(np.arange(1000.0).reshape(10, 100))
+    assert list(many.shape) == [10, 100]
+    # All over the array, and none twice.
+    assert len(set(many.values)) == len(many.values) == 32
+    assert min(filter(None, many.values)) < 100.0
+    assert max(filter(None, many.values)) > 900.0
+    assert golden._sample(np.array([1.0, np.nan, np.inf])).values == [1.0, None, None]
+    photo = Photo(name="a.png", encoded=b"picture", width=4, height=3)
+    sample = sample_of(Photos(photos=(photo,)))
+    assert not any("encoded" in name for name in sample)
+    # Whether something is so is no number.
+    stated = {"a": [1, {"b": 2.5, "c": True, "d": "x"}], "e": None}
+    assert list(golden._numbers(stated)) == [1.0, 2.5]
+
+
+def test_the_order_of_parameters_and_of_methods_is_none(tmp_path: Path) -> None:
+    class Yours(Mine):
+        id = "plane.yours"
+
+    texts = set()
+    for order in ((Mine, Yours), (Yours, Mine)):
+        path = tmp_path / f"{order[0].id}.json"
+        for method in order:
+            assert golden_problem(path, trial(method, a=1, b=2), {"planes": planes()}) == ""
+        texts.add(path.read_text())
+        turned = golden_problem(path, trial(b=2, a=1), {"planes": planes(0.1)})
+        assert "is another one than" in turned
+    assert len(texts) == 1
 
 
 def test_an_array_that_only_one_of_two_samples_has_is_named() -> None:
