@@ -68,17 +68,17 @@ class PlyHeader:
     n_bytes: int
 
     @property
-    def vertex_position(self) -> int:
-        """Position of the vertex element, -1 without one."""
+    def vertex_position(self) -> int | None:
+        """Position of the vertex element; None without one."""
         names = [element.name for element in self.elements]
-        return names.index("vertex") if "vertex" in names else -1
+        return names.index("vertex") if "vertex" in names else None
 
 
 def open_ply(path: Path) -> ScanFile:
     """Open a PLY file; only its vertices are read."""
     header = _read_header(path)
     position = header.vertex_position
-    vertex = header.elements[position] if position >= 0 else None
+    vertex = None if position is None else header.elements[position]
     columns = columns_of_header(vertex.properties) if vertex else None
     if vertex is None or columns is None or vertex.has_list:
         raise InputError(

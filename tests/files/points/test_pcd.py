@@ -41,6 +41,18 @@ def test_pcd_gives_its_points(tmp_path: Path, points: NDArray[np.float64], data:
     np.testing.assert_array_equal(block.column, index % 8)
 
 
+def test_texts_keep_the_digits_that_their_type_has_no_room_for(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points), data="ascii")
+    first = path.read_bytes().partition(b"DATA ascii\n")
+    x, _, behind = first[2].partition(b" ")
+    assert float(x) == np.float32(points[0, 0])
+    path.write_bytes(b"".join(first[:2]) + b"500000.01 " + behind)
+    (block,) = read_all(path)
+    assert block.points[0, 0] == 500_000.01
+
+
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
 def test_the_grid_of_a_pcd_goes_on_from_block_to_block(
     tmp_path: Path, points: NDArray[np.float64], data: str, monkeypatch: pytest.MonkeyPatch

@@ -120,3 +120,13 @@ def test_where_every_line_fits_the_first_of_them_is_named(tmp_path: Path) -> Non
     layout = Layout(separator=SPACES, decimal=".", n_columns=3)
     error = tables._bad_line(tmp_path / "a.xyz", [b"1 2 3\n"], layout, (0, 1, 2), 17)
     assert str(error) == ("a.xyz, from line 17: expected 3 numbers per line; export the file again")
+
+
+@pytest.mark.parametrize(("n_bytes", "is_read"), [(10_000, True), (10_001, False)])
+def test_a_line_has_ten_thousand_bytes(tmp_path: Path, n_bytes: int, is_read: bool) -> None:
+    line = "1 2 3".ljust(n_bytes - 1) + "\n"
+    if is_read:
+        assert read(tmp_path / "a.xyz", f"4 5 6\n{line}", 0, 1, 2) == [[[4, 5, 6], [1, 2, 3]]]
+        return
+    with pytest.raises(InputError, match="line 2: the line has more than 10000 bytes, so this is"):
+        read(tmp_path / "a.xyz", f"4 5 6\n{line}", 0, 1, 2)
