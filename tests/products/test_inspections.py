@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import ProductError
-from orthoflow.products import CheckPoints, JsonValue, Payload, TakenPhoto, Truth
+from orthoflow.products import CheckPoints, JsonValue, Payload, TakenPhoto, Truth, inspections
 
 ARRAYS = {
     "scene/origin": np.zeros(3),
@@ -122,3 +122,9 @@ def test_check_points_have_a_row_each(name: str) -> None:
             points_of(**{name: wrong})
     with pytest.raises(ProductError, match="3 names have 2 classes"):
         points_of(classes=("", ""))
+
+
+@pytest.mark.parametrize("stored", [None, {}, 7, "IMG_1.jpg", [None], ["IMG_1.jpg"]])
+def test_photos_that_are_not_as_version_1_wrote_them_are_none(stored: JsonValue) -> None:
+    assert inspections._photos_of_version_1(stored) is None
+    assert inspections._photos_of_version_1([]) == []

@@ -6,6 +6,8 @@ import contextlib
 import dataclasses
 import math
 import re
+from enum import IntEnum
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -308,3 +310,41 @@ def test_a_cloud_with_coordinates_that_are_not_finite_is_refused(bad: float) -> 
 def test_a_cloud_with_too_few_points_is_refused() -> None:
     with pytest.raises(ProductError, match="the cloud has 1 points, at least 3 are needed"):
         cloud(1).require_points(3)
+
+
+def test_percentiles_of_the_second_encoding_stand_where_they_do_now() -> None:
+    told = dataclasses.replace(walls(), details={"percentiles": [5.0]})
+    payload = dataclasses.replace(told.to_payload(), encoding_version=2)
+    read = Walls.from_payload(payload)
+    assert (read.percentiles, read.details) == (told.percentiles, {"percentiles": [5.0]})
+
+
+class Mood(IntEnum):
+    CALM = 0
+    WILD = 4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tempers(Product):
+    type_name: ClassVar[str] = "tempers"
+
+    one: Mood
+    all: tuple[Mood, ...] = ()
+
+
+def test_names_that_stand_for_numbers_come_back_as_names() -> None:
+    tempers = Tempers(one=Mood.WILD, all=(Mood.CALM, Mood.WILD))
+    payload = tempers.to_payload()
+    assert payload.metadata == {"one": 4, "all": [0, 4]}
+    read = Tempers.from_payload(payload)
+    assert read == tempers
+    assert isinstance(read.one, Mood)
+    assert all(isinstance(mood, Mood) for mood in read.all)
+    stored = dataclasses.replace(payload, metadata={"one": 3})
+    with pytest.raises(ProductError, match="the stored one must be a Mood, got 3"):
+        Tempers.from_payload(stored)
+
+
+def test_a_photo_stands_upright_unless_somebody_says_otherwise() -> None:
+    photo = Photo(name="a.jpg", encoded=b"", width=4, height=3)
+    assert (photo.exif_orientation, photo.mask, photo.intrinsics) == (1, None, None)

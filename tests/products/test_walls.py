@@ -75,3 +75,34 @@ def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:
         for plane in (None, 0, 7)
     ]
     assert known == [2, 0, 7]
+
+
+@pytest.mark.parametrize(
+    ("counts", "spacing_m"),
+    [
+        # As many points as cells, or more, of cells of half a metre.
+        ([[1, 1, 1, 1], [1, 1, 1, 1]], 0.5),
+        ([[9, 9, 9, 9], [1, 1, 1, 1]], 0.5),
+        # One in four, half of the distance each way; fewer than one in ten say nothing more.
+        ([[1, 0, 0, 0], [1, 0, 0, 0]], 1.0),
+        ([[0, 0, 0, 0], [0, 0, 0, 0]], 0.5 / np.sqrt(0.1)),
+    ],
+)
+def test_points_lie_as_far_apart_as_their_number_says(
+    counts: list[list[int]], spacing_m: float
+) -> None:
+    wall = replace(wall_at(0.0, "a"), count=np.array(counts, dtype=np.uint32))
+    coarse = samples.wall(samples.facing_east(0.75, 4, 2, (3.0, 0.0, 1.0)), name="coarse")
+    assert walls(coarse, wall).spacing_m() == pytest.approx(spacing_m)
+
+
+def test_points_of_cells_that_are_not_known_do_not_count() -> None:
+    wall = wall_at(0.0, "a")
+    depth_m = wall.depth_m.copy()
+    depth_m[0, :2] = np.nan
+    count = np.array([[50, 50, 1, 0], [0, 0, 1, 1]], dtype=np.uint32)
+    some = samples.wall(wall.frame, depth_m=depth_m, count=count)
+    # Three points on six cells.
+    assert walls(some).spacing_m() == pytest.approx(0.5 * np.sqrt(2.0))
+    nothing = samples.wall(wall.frame, depth_m=np.full_like(depth_m, np.nan))
+    assert walls(nothing).spacing_m() == 0.5

@@ -67,7 +67,7 @@ class Columns:
     def index_of(self, names: Sequence[str]) -> list[int]:
         """Where these columns are among `used`; empty unless all are."""
         used = self.used
-        return [used.index(name) for name in names] if set(names) <= set(used) else []
+        return [used.index(name) for name in names] if set(used).issuperset(names) else []
 
 
 def meaning_of(name: str) -> str:

@@ -106,7 +106,7 @@ class Octree:
     @property
     def deepest(self) -> int:
         """Level of the deepest nodes."""
-        return max((node.level for node in self.nodes), default=0)
+        return max(node.level for node in self.nodes)
 
 
 def read_octree(path: Path, chunks: Collection[tuple[int, int, int]]) -> Octree | None:

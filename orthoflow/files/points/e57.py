@@ -76,7 +76,7 @@ class ScanHeader:
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the three coordinates."""
-        return _CARTESIAN if set(_CARTESIAN) <= self.names else _SPHERICAL
+        return _CARTESIAN if self.names.issuperset(_CARTESIAN) else _SPHERICAL
 
     @property
     def invalid_state(self) -> str:
@@ -97,15 +97,15 @@ def open_e57(path: Path) -> ScanFile:
     headers = [header for header in headers if header.n_points > 0]
     limits = [header.intensity_limits for header in headers]
     stated = [item for item in limits if item is not None]
-    rgb_limits = {header.rgb_limit for header in headers if set(_COLOURS) <= header.names}
+    rgb_limits = {header.rgb_limit for header in headers if header.names.issuperset(_COLOURS)}
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=sum(header.n_points for header in headers),
         fields=point_fields(
             has_intensity=all("intensity" in header.names for header in headers),
-            has_rgb=all(set(_COLOURS) <= header.names for header in headers),
-            has_grid=all(set(_GRID) <= header.names for header in headers),
+            has_rgb=all(header.names.issuperset(_COLOURS) for header in headers),
+            has_grid=all(header.names.issuperset(_GRID) for header in headers),
         ),
         read=lambda: _blocks(path, pye57, headers),
         # One scale for all scans of a file, else equal surfaces would differ between them.
@@ -122,7 +122,7 @@ def _read_header(path: Path, file: Any, index: int) -> ScanHeader:
     points = node["points"]
     prototype = file.get_header(index).point_fields
     names = frozenset(str(name) for name in prototype)
-    if not (set(_CARTESIAN) <= names or set(_SPHERICAL) <= names):
+    if not (names.issuperset(_CARTESIAN) or names.issuperset(_SPHERICAL)):
         raise InputError(
             f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}, expected "
             "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
@@ -243,7 +243,7 @@ def _buffers(
 
 
 def _block(arrays: dict[str, NDArray[np.generic]], header: ScanHeader, scan: int) -> PointBlock:
-    n_read = len(arrays[header.axes[0]])
+    n_read = len(next(iter(arrays.values())))
     state = arrays.get(header.invalid_state)
     if state is not None and state.any():
         arrays = {name: array[state == 0] for name, array in arrays.items()}
@@ -251,8 +251,8 @@ def _block(arrays: dict[str, NDArray[np.generic]], header: ScanHeader, scan: int
     if header.axes is _SPHERICAL:
         local = _cartesian(local)
     points = local @ header.rotation.T + header.translation if header.is_posed else local
-    has_rgb = set(_COLOURS) <= arrays.keys()
-    has_grid = set(_GRID) <= arrays.keys()
+    has_rgb = all(name in arrays for name in _COLOURS)
+    has_grid = all(name in arrays for name in _GRID)
     return PointBlock(
         points=points,
         scan=scan,

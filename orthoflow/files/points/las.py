@@ -38,6 +38,7 @@ from orthoflow.files.points.decoders import Decoder, can_share_memory
 from orthoflow.files.points.libraries import guarded, load_library, reading
 
 FORMAT: Final = "LAS/LAZ"
+_COLOURS: Final = ("red", "green", "blue")
 _FARTHEST: Final = 1e12
 _PART_POINTS: Final = 1 << 15
 _HEADER_BYTES: Final = 375
@@ -101,7 +102,7 @@ def open_las(
         format_name=FORMAT,
         n_most=n_points,
         # Points of every format have an intensity.
-        fields=point_fields(has_intensity=True, has_rgb={"red", "green", "blue"} <= names),
+        fields=point_fields(has_intensity=True, has_rgb=names.issuperset(_COLOURS)),
         read=lambda: _blocks(path, laspy, bounds, notes, wanted),
         details=details,
         notes=notes,
@@ -149,11 +150,10 @@ def _blocks(
 def _block(chunk: Any, classes: frozenset[int]) -> PointBlock:
     axes = _coordinates(chunk)
     points = axes.T
-    names = set(chunk.point_format.dimension_names)
     intensity = np.asarray(chunk.intensity, dtype=np.float32)
     rgb = None
-    if {"red", "green", "blue"} <= names:
-        rgb = np.column_stack([np.asarray(chunk[name]) for name in ("red", "green", "blue")])
+    if set(chunk.point_format.dimension_names).issuperset(_COLOURS):
+        rgb = np.column_stack([np.asarray(chunk[name]) for name in _COLOURS])
     block = PointBlock(
         points=points,
         scan=0,

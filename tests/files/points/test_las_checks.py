@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points import las
 from orthoflow.files.points.blocks import PointBlock
+from tests import scan_files
 
 
 def header(
@@ -235,3 +236,23 @@ def test_layers_are_as_large_as_their_chunk(
 def test_items_of_older_points_have_no_layers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="its compression is none of point formats 6 and up"):
         las._check_layers(tmp_path / "a.laz", compressed((10, 30), (6, 20)), 0, [])
+
+
+@pytest.mark.parametrize(("most", "is_refused"), [(49_999, True), (50_000, False)])
+def test_chunks_hold_no_more_points_than_any_program_puts_into_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, *, is_refused: bool
+) -> None:
+    points = np.random.default_rng(1).uniform(0.0, 5.0, (40, 3))
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    monkeypatch.setattr(las, "MOST_FIXED_CHUNK", most)
+    if not is_refused:
+        assert las.open_las(path).n_most == 40
+        return
+    with pytest.raises(InputError, match="its chunks are said to hold 50000 points each"):
+        las.open_las(path)
+
+
+def test_points_of_formats_6_and_up_have_layers() -> None:
+    assert [las._is_layered(struct.pack("<HI", kind, 9)) for kind in (0, 1, 2, 3, 4)] == [
+        *(False, False, False, True, False),
+    ]

@@ -71,6 +71,13 @@ def test_many_lines_before_the_vertices_are_skipped_in_blocks(
         before_data=b"1\n" * n_before,
     )
     np.testing.assert_array_equal(read_points(path), points)
+    # Lines are counted on from the header's.
+    head, _, data = path.read_bytes().partition(b"end_header\n")
+    lines = data.split(b"\n")
+    lines[2] = b"1" * 10_001
+    path.write_bytes(head + b"end_header\n" + b"\n".join(lines))
+    with pytest.raises(InputError, match=rf"line {head.count(bytes([10])) + 4}: the line has more"):
+        read_points(path)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
