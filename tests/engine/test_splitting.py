@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +14,11 @@ import pytest
 from orthoflow.engine import splitting
 from orthoflow.engine.events import CellFinished, CellProgress, CellStarted, RunEvent
 from orthoflow.engine.garbage import collect_garbage
-from orthoflow.engine.results import CellResult
+from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.splitting import _parts, parts_folder
 from orthoflow.engine.store import Store
+from orthoflow.engine.tasks import Task, TaskPart
 from orthoflow.errors import CancelledStepError, DamageError
 from tests.engine_world import World, toy_world
 
@@ -243,3 +245,190 @@ def test_parts_fill_what_is_missing() -> None:
             assert [item for part in parts for item in part] == list(range(n_items))
             assert len(parts) <= n_parts
             assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+# What becomes of a step in parts, without running any -------------------------------------------
+
+
+def a_step(folder: Path) -> Task:
+    return Task(
+        method="work.sums",
+        address="step",
+        run_id="r1",
+        target="x:Y",
+        key="key of the step",
+        key_preimage="{}",
+        params={},
+        seed=0,
+        inputs={},
+        outputs={},
+        cores=1,
+        timeout_s=None,
+        store=str(folder / "store"),
+        folder=str(folder / "scratch" / "whole"),
+        log=str(folder / "step.log"),
+        numba_folder="",
+    )
+
+
+def begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[splitting.Splits, Task]:
+    """Five items in two parts, of code that has changed: nothing is kept in the store."""
+    monkeypatch.setattr(splitting, "_item_names", lambda *_: tuple("abcde"))
+    facts: Any = SimpleNamespace(maps_over="rows", is_code_unchanged=lambda: False)
+    splits, task = splitting.Splits(Store(folder / "store")), a_step(folder)
+    assert splits.begin(task, facts, 2, is_forced=False)
+    return splits, task
+
+
+def came_to(status: str = "ok", **more: Any) -> CellResult:
+    digest = ProductRef(type_name="part", encoding_version=1, digest=f"sha256:{more.get('log')}")
+    plain: dict[str, Any] = {"status": status, "outputs": {"part": digest}, "started": "2026-02"}
+    return CellResult(**(plain | more))
+
+
+def ended(task: Task, result: CellResult) -> Any:
+    return SimpleNamespace(address=task.address, result=result)
+
+
+def test_parts_come_one_after_the_other_and_then_what_joins_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splits, step = begun(tmp_path, monkeypatch)
+    assert splits.addresses == ("step",)
+    assert splits.has_key("key of the step")
+    assert not splits.has_key("another")
+    one, two, none = (splits.next_task("step") for _ in range(3))
+    assert one is not None
+    assert two is not None
+    assert none is None
+    assert (one.address, two.address) == (
+        *("step, part 1 of 2 (a to b)", "step, part 2 of 2 (c to e)"),
+    )
+    assert one.part == TaskPart(first=0, end=2)
+    assert two.part == TaskPart(first=2, end=5)
+    assert len({step.key, one.key, two.key}) == 3
+    assert len({step.folder, one.folder, two.folder}) == 3
+    assert Path(one.folder).parent == Path(step.folder).parent
+    assert Path(one.log).parent == Path(one.folder)
+    # A third of the way is each part, and what joins them.
+    assert splits.said_by("elsewhere", 0.5) == ("elsewhere", 0.5)
+    assert splits.said_by(two.address, 0.5) == ("step", pytest.approx(0.5 / 3))
+    assert splits.said_by(one.address, 0.25) == ("step", pytest.approx(0.75 / 3))
+    first = came_to(
+        log="one\n", wall_s=1.0, cpu_s=2.0, compile_s=0.5, peak_rss_mib=7.0, started="2026-01",
+        warnings=("dark", "far"),
+    )  # fmt: skip
+    second = came_to(
+        log="two\n", wall_s=2.0, cpu_s=3.0, compile_s=None, peak_rss_mib=9.0, warnings=("far",)
+    )
+    assert splits.take(two, ended(two, second)) is None
+    assert splits.said_by(one.address, 0.5) == ("step", pytest.approx(1.5 / 3))
+    assert splits.next_task("step") is None
+    assert splits.take(one, ended(one, first)) is None
+    joining = splits.next_task("step")
+    assert joining is not None
+    assert splits.next_task("step") is None
+    assert (joining.address, joining.key, joining.part) == ("step", step.key, None)
+    assert [(part.first, part.end, part.ref) for part in joining.parts] == [
+        (0, 2, first.outputs["part"]),
+        (2, 5, second.outputs["part"]),
+    ]
+    assert splits.said_by("step", 0.5) == ("step", pytest.approx(2.5 / 3))
+    last = came_to(
+        log="whole\n", wall_s=4.0, cpu_s=4.0, compile_s=1.0, peak_rss_mib=8.0, warnings=("new",)
+    )
+    over = splits.take(joining, ended(joining, last))
+    assert over is not None
+    task, result = over
+    assert task is step
+    assert (result.wall_s, result.cpu_s, result.compile_s) == (7.0, 9.0, 1.5)
+    assert (result.peak_rss_mib, result.started) == (9.0, "2026-01")
+    assert result.warnings == ("dark", "far", "new")
+    assert result.log == (
+        "part 1 of 2 (a to b), 1.0 s:\none\npart 2 of 2 (c to e), 2.0 s:\ntwo\njoined:\nwhole\n"
+    )
+    assert Path(step.log).read_text() == result.log
+    assert splits.addresses == ()
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "said"),
+    [(1, "part 1 of 2 (a to b): why"), (CancelledStepError.exit_code, "why")],
+    ids=["failed", "interrupted"],
+)
+def test_the_first_failure_is_the_steps_once_nothing_runs_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exit_code: int, said: str
+) -> None:
+    splits, step = begun(tmp_path, monkeypatch)
+    one, two = (splits.next_task("step") for _ in range(2))
+    assert one is not None
+    assert two is not None
+    failure = came_to("failed", error_message="why", exit_code=exit_code, log="l\n", key=one.key)
+    assert splits.take(one, ended(one, failure)) is None
+    # Nothing else begins.
+    assert splits.next_task("step") is None
+    over = splits.take(two, ended(two, came_to("failed", error_message="too", log="m\n")))
+    assert over is not None
+    task, result = over
+    assert (task, result.error_message, result.exit_code) == (step, said, exit_code)
+    assert (result.key, result.key_preimage) == (step.key, step.key_preimage)
+    assert result.log == "l\n"
+    assert splits.addresses == ()
+
+
+def test_a_task_of_a_whole_step_is_taken_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splits, _ = begun(tmp_path, monkeypatch)
+    other: Any = SimpleNamespace(address="other")
+    result = came_to()
+    assert splits.take(other, ended(other, result)) == (other, result)
+
+
+@pytest.mark.parametrize(("n_parts", "is_there", "begins"), [(1, False, False), (1, True, False)])
+def test_a_step_in_one_part_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_parts: int, is_there: bool, begins: bool
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(splitting, "_item_names", lambda *_: asked.append(1) or tuple("abc"))
+    facts: Any = SimpleNamespace(maps_over="rows")
+    store, task = Store(tmp_path / "store"), a_step(tmp_path)
+    if is_there:
+        (parts_folder(store) / task.key).mkdir(parents=True)
+    assert splitting.Splits(store).begin(task, facts, n_parts, is_forced=False) is begins
+    # What an interrupted run left is looked at.
+    assert len(asked) == is_there
+    plain: Any = SimpleNamespace(maps_over=None)
+    assert splitting.Splits(store).begin(task, plain, 3, is_forced=False) is False
+
+
+def test_parts_that_are_there_are_taken_where_they_do_not_overlap(tmp_path: Path) -> None:
+    said: dict[str, object] = {
+        "a": {"of": "k", "first": 0, "end": 2},
+        "longer": {"of": "k", "first": 0, "end": 3},
+        "within": {"of": "k", "first": 2, "end": 4},
+        "next": {"of": "k", "first": 3, "end": 5},
+        "last": {"of": "k", "first": 7, "end": 9},
+        "beyond": {"of": "k", "first": 8, "end": 10},
+        "empty": {"of": "k", "first": 6, "end": 6},
+        "before": {"of": "k", "first": -1, "end": 6},
+        "other": {"of": "another", "first": 5, "end": 7},
+        "true": {"of": "k", "first": True, "end": 7},
+        "half": {"of": "k", "first": 5, "end": 7.0},
+        "gone": None,
+    }
+    results = {
+        name: None if text is None else came_to(key_preimage=json.dumps(text), log=name)
+        for name, text in said.items()
+    }
+    for name in results:
+        (tmp_path / f"{name}.json").touch()
+    store: Any = SimpleNamespace(
+        results=tmp_path, take=lambda key: SimpleNamespace(result=results[key])
+    )
+    found = splitting._found_parts(store, "k", 9)
+    assert {part: result.log for part, result in found.items()} == {
+        range(3): "longer",
+        range(3, 5): "next",
+        range(7, 9): "last",
+    }
