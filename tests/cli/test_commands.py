@@ -10,7 +10,14 @@ import h5py
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli.commands import RecordCommand, command_again
+from orthoflow.cli.commands import (
+    LazyCommand,
+    LazyGroup,
+    RecordCommand,
+    Session,
+    command_again,
+    current_session,
+)
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError, GeometryError, ProductError, RecordError
 from tests.provenance_records import write_sample
@@ -33,6 +40,34 @@ def test_a_command_is_repeated_with_what_was_given_and_another_folder() -> None:
     assert sorted(words[1:-2]) == sorted(given[:-2])
     assert words[words.index("a=[1, 2]") - 1] == words[words.index("b=3") - 1] == "--set"
     assert words[-2:] == ["-o", "new one"]
+
+
+def test_a_command_has_the_session_of_its_program_or_one_of_its_own() -> None:
+    assert current_session() == Session(debug=False, resume_hint="")
+    session = Session(debug=True)
+    with click.Context(bake, obj=session):
+        assert current_session() is session
+    with click.Context(bake):
+        assert current_session() == Session()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("bakee", "No such command 'bakee'; did you mean 'bake'?"), ("zzz", "No such command 'zzz'.")],
+)
+def test_a_group_says_which_of_its_commands_was_meant(name: str, said: str) -> None:
+    lazy = {
+        verb: LazyCommand(target=f"{__name__}:bake", summary=f"{verb} it")
+        for verb in ("wash", "bake")
+    }
+    group = LazyGroup("kitchen", lazy=lazy)
+    done = CliRunner().invoke(group, [name])
+    assert done.exit_code == 2
+    assert said in done.output
+    listed = CliRunner().invoke(group, ["--help"]).output
+    # In the order of work.
+    assert listed.index("wash it") < listed.index("bake it")
+    assert group.list_commands(click.Context(group)) == ["wash", "bake"]
 
 
 # --- what fails on a record ---

@@ -1,0 +1,97 @@
+"""Looking at every byte of a store: what is damaged is named and set aside, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.engine.objects import PRODUCT
+from orthoflow.engine.results import CellResult, ProductRef
+from orthoflow.engine.soundness import Aside, Damage, Soundness, check_store
+from orthoflow.engine.store import Store
+from orthoflow.products.product import Product
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heights(Product):
+    type_name: ClassVar[str] = "heights"
+    values: NDArray[np.float64]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def kept(store: Store, name: str, value: float) -> tuple[str, ProductRef]:
+    """A product in the store, and a result that has it."""
+    ref = store.put_product(Heights(values=np.full(300, value)))
+    key = hashlib.sha256(name.encode()).hexdigest()
+    result = CellResult(
+        status="ok", key=key, key_preimage=name, method="a.b", run_id="r1", outputs={"out": ref}
+    )
+    store.put_result(key, result, "step")
+    return key, ref
+
+
+def test_what_is_sound_is_counted_and_left(store: Store) -> None:
+    assert check_store(store) == Soundness(
+        n_results=0, n_objects=0, damaged=(), aside=Aside(count=0, size_bytes=0)
+    )
+    key, ref = kept(store, "one", 1.0)
+    # What others put there is not ours.
+    (store.objects / "notes").mkdir()
+    (store.results / "notes.txt").touch()
+    assert check_store(store) == Soundness(
+        n_results=1, n_objects=1, damaged=(), aside=Aside(count=0, size_bytes=0)
+    )
+    assert store.result(key) is not None
+    assert store.is_sound(ref.digest)
+
+
+def test_what_is_damaged_is_named_and_set_aside_with_the_results_that_need_it(
+    store: Store,
+) -> None:
+    key, ref = kept(store, "one", 1.0)
+    other, _ = kept(store, "other", 2.0)
+    name = ref.digest.removeprefix("sha256:")
+    path = store.objects / name / PRODUCT
+    content, times = bytearray(path.read_bytes()), path.stat()
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    # Nobody would see it who goes by size and time.
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    found = check_store(store)
+    assert (found.n_results, found.n_objects) == (1, 1)
+    first, second = found.damaged
+    assert (first.name, second.name) == (f"objects/{name}", f"results/{key}.json")
+    assert first.what
+    assert second.what
+    assert found.aside.count == 2
+    assert found.aside.size_bytes >= len(content)
+    assert not (store.objects / name).exists()
+    assert store.result(other) is not None
+    assert store.result(key) is None
+    # Once is enough.
+    again = check_store(store)
+    assert (again.n_results, again.n_objects, again.damaged) == (1, 1, ())
+    assert again.aside == found.aside
+
+
+def test_a_result_whose_product_is_gone_is_the_damage(store: Store) -> None:
+    key, ref = kept(store, "one", 1.0)
+    for path in sorted((store.objects / ref.digest.removeprefix("sha256:")).rglob("*")):
+        path.unlink()
+    (store.objects / ref.digest.removeprefix("sha256:")).rmdir()
+    found = check_store(store)
+    assert (found.n_results, found.n_objects) == (0, 0)
+    (damage,) = found.damaged
+    assert isinstance(damage, Damage)
+    assert damage.name == f"results/{key}.json"
