@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, settings
 
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
+from tests.kept_memory import KEPT_MEMORY
 from tests.long_loops import IS_LONG
 from tests.memory_folder import has_room, in_memory
 from tests.shared_bytecode import write_share
@@ -102,6 +103,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Write into memory; the processes that tests are spread over write where this one does."""
     config.pluginmanager.register(_Examples())  # a hook of this module sees files beside it only
     is_spread = "PYTEST_XDIST_WORKER" in os.environ
+    if is_spread:  # it has read them; what it starts is as elsewhere
+        for name in KEPT_MEMORY:
+            os.environ.pop(name, None)
+    elif config.getoption("tx", None):
+        os.environ.update(KEPT_MEMORY)
     if not is_spread and config.option.basetemp is None and has_room():
         config.add_cleanup(_entered(in_memory()))
 

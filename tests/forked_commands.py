@@ -84,9 +84,11 @@ def _framework_path(python_path: str) -> str:
 
 @cache
 def _server(python_path: str) -> subprocess.Popen[str]:
+    from tests.kept_memory import KEPT_MEMORY  # who is started has no `tests`
+
     server = subprocess.Popen(
         [sys.executable, __file__],
-        env={**os.environ, "PYTHONPATH": python_path},
+        env={**os.environ, **KEPT_MEMORY, "PYTHONPATH": python_path},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

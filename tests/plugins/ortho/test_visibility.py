@@ -105,28 +105,36 @@ def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transpare
 
 
 def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Follow rays to the camera: the surface between two cells is linear, void hides nothing."""
+    """Follow rays to the camera: the surface between two cells is linear, void hides nothing.
+
+    They rise, so that nothing of the relief meets a ray that is above all of it.
+    """
     heights = relief.occluding.reshape(relief.depth.shape)
+    highest = relief.step_m * float(heights[heights != NOTHING].max())
+    assert view.height_m > highest
     depths = relief.depth[tuple(cells.T)].astype(np.float64)
     ways = np.array([view.row, view.column]) - cells
     along = np.abs(ways).max(axis=1)
     is_main = np.arange(2) == np.where(np.abs(ways[:, 0]) >= np.abs(ways[:, 1]), 0, 1)[:, None]
-    hidden, inside = np.zeros(len(cells), dtype=np.bool_), np.ones(len(cells), dtype=np.bool_)
+    hidden, followed = np.zeros(len(cells), dtype=np.bool_), np.arange(len(cells))
     for k in range(1, int(along.max()) + 1):
-        way = k / along
-        at = cells + way[:, None] * ways
-        at = np.where(is_main, np.round(at), at)
+        followed = followed[k <= along[followed]]
+        way = k / along[followed]
+        at = cells[followed] + way[:, None] * ways[followed]
+        at = np.where(is_main[followed], np.round(at), at)
         first, second = np.floor(at).astype(int), np.ceil(at).astype(int)
-        inside &= (k <= along) & (first >= 0).all(axis=1) & (second < heights.shape).all(axis=1)
-        asked = np.flatnonzero(inside)
-        one, other = (
-            heights[tuple(places[asked].T)].astype(np.float64) for places in (first, second)
+        inside = (first >= 0).all(axis=1) & (second < heights.shape).all(axis=1)
+        followed, way, at, first, second = (
+            each[inside] for each in (followed, way, at, first, second)
         )
-        share = (at - first)[asked].sum(axis=1)
+        one, other = (heights[tuple(places.T)].astype(np.float64) for places in (first, second))
+        share = (at - first).sum(axis=1)
         surface = relief.step_m * ((1.0 - share) * one + share * other)
-        ray = depths[asked] + way[asked] * (view.height_m - depths[asked])
+        ray = depths[followed] + way * (view.height_m - depths[followed])
         is_known = (one != NOTHING) & (other != NOTHING)
-        hidden[asked] |= is_known & (surface > ray + view.tolerance_m)
+        is_met = is_known & (surface > ray + view.tolerance_m)
+        hidden[followed[is_met]] = True
+        followed = followed[~is_met & (ray < highest)]
     return hidden
 
 
