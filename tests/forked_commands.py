@@ -5,6 +5,8 @@
 Loading takes most of the time of many a command. Reads orders from stdin, a JSON object per line:
 `arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
 `forgone`, numbers of rights of root that it gives up, and `draws`; answers each with the exit code.
+With `steps`, two numbers behind it, it serves steps as `orthoflow.engine.fork_server` does, but for
+their charts.
 A command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
 what the interpreter reads from the environment when it starts is as it was when the first command
 was asked for. Libraries that a command has loaded are loaded here before the next one, and the
@@ -30,6 +32,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Final
 
 _LARGEST: Final = 4096
+# What a command asks its parent for: a server of steps that draw their charts, or not.
+_DRAWN: Final = b"drawn"
+_UNDRAWN: Final = b"undrawn"
 _PR_CAPBSET_DROP: Final = 24
 _CAPABILITY_VERSION_3: Final = 0x20080522
 
@@ -45,7 +50,7 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, without some of the rights of root, and wait for its end.
 
-    Where it does not draw, steps in its own process keep a dot in the place of each chart.
+    Where it does not draw, its steps keep a dot in the place of each chart.
 
     Raises:
         TimeoutExpired: it has not ended; it is killed with the process that it came from.
@@ -171,14 +176,49 @@ class _StepServers:
             return
         with os.fdopen(descriptors[0], "rb") as file:
             variables = json.load(file)
-        key = step_processes._read_at_loading(variables)
+        start = step_processes._start_server if message == _DRAWN else _start_undrawn
+        key = (message, step_processes._read_at_loading(variables))
         server = self._servers.get(key)
         if server is None or server.process.poll() is not None:
             log = os.open(os.devnull, os.O_WRONLY)
-            server = self._servers[key] = step_processes._start_server(variables, log)
+            server = self._servers[key] = start(variables, log)
             os.close(log)
         pid = str(server.process.pid).encode()
         socket.send_fds(self.asked, [pid], [server.control.fileno()])
+
+
+def _start_undrawn(variables: Mapping[str, str], log: int) -> Any:
+    """Start a server of steps that keep dots in the place of charts."""
+    from orthoflow.engine import step_processes
+
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, __file__, "steps", str(theirs.fileno()), str(os.getpid())],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=dict(variables),
+            pass_fds=(theirs.fileno(),),
+            start_new_session=True,
+        )
+    return step_processes._Server(process, ours)
+
+
+def _serve_steps(arguments: list[str]) -> None:
+    _draw_nothing()
+    del sys.path[0]  # as with `python -P`
+
+    from orthoflow.engine import fork_server
+
+    fork_server.main(arguments)
+
+
+def _draw_nothing() -> None:
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+    from tests.undrawn_charts import keep_dots_for_charts
+
+    keep_dots_for_charts()
 
 
 @dataclass(frozen=True)
@@ -201,7 +241,7 @@ class _Elsewhere:
         return 0
 
 
-def _share_servers(parent: socket.socket) -> None:
+def _share_servers(parent: socket.socket, asks: bytes) -> None:
     """Let this command ask its parent for servers of steps, and tell it at its end what it has."""
     from orthoflow.engine import fork_server, step_processes
 
@@ -209,7 +249,7 @@ def _share_servers(parent: socket.socket) -> None:
         with os.fdopen(os.memfd_create("variables"), "w+") as file:
             json.dump(dict(variables), file)
             file.seek(0)
-            socket.send_fds(parent, [b"server"], [file.fileno()])
+            socket.send_fds(parent, [asks], [file.fileno()])
         pid, descriptors, _, _ = socket.recv_fds(parent, _LARGEST, 1)
         control = socket.socket(fileno=descriptors[0])
         return step_processes._Server(_Elsewhere(int(pid)), control)  # type: ignore[arg-type]
@@ -234,12 +274,9 @@ def _become(order: dict[str, Any], parent: socket.socket) -> None:
     if order["forgone"]:
         _forgo(order["forgone"])
     else:
-        _share_servers(parent)
+        _share_servers(parent, _DRAWN if order["draws"] else _UNDRAWN)
     if not order["draws"]:
-        sys.path[0] = str(Path(__file__).resolve().parents[1])
-        from tests.undrawn_charts import keep_dots_for_charts
-
-        keep_dots_for_charts()
+        _draw_nothing()
     framework = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     os.environ.clear()
     os.environ.update(order["environment"])
@@ -272,4 +309,7 @@ def _forgo(rights: Sequence[int]) -> None:
 
 
 if __name__ == "__main__":
-    _serve()
+    if sys.argv[1:]:
+        _serve_steps(sys.argv[2:])
+    else:
+        _serve()

@@ -1,7 +1,7 @@
 """What processes of tests are told of memory: to keep that of arrays for the next ones.
 
-Asking the system for each anew took 6 % of the processor time of tests of methods. The library reads
-it when a process starts, so it stands in the environment of who is to have it, and nowhere else.
+Asking the system for each anew took 6 % of the processor time of tests of methods. The C library
+reads it when a process starts: it stands in the environment of who is to have it, nowhere else.
 """
 
 from __future__ import annotations

@@ -6,12 +6,13 @@ from base64 import b64decode
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
-from typing import Final
-
-import pytest
+from typing import TYPE_CHECKING, Final
 
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
+
+if TYPE_CHECKING:
+    import pytest
 
 # As it was when the tests began.
 FIGURE: Final = StepContext.figure

@@ -66,9 +66,9 @@ class Shell:
         (self.folder / name / "numba").symlink_to(self.store / "numba")
         return name
 
-    def __call__(self, *arguments: object, timeout_s: float = 300) -> Ended:
+    def __call__(self, *arguments: object, timeout_s: float = 300, draws: bool = False) -> Ended:
         words = self.command(*arguments)[3:]
-        done = run_command(self.folder, words, self.variables(), timeout_s, draws=False)
+        done = run_command(self.folder, words, self.variables(), timeout_s, draws=draws)
         return Ended(done.returncode, done.stdout, done.stderr)
 
     def anew(self, *arguments: object, timeout_s: float = 300) -> Ended:

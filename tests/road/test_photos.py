@@ -334,8 +334,9 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell, name: 
     given = folder / "run" / "products" / "orient" / "cameras.json"
     again = quick(
         *("run", "photos-on-scan.yaml", "-o", folder / "given", *said, "--until", "mosaic"),
-        *("--input", f"cameras={given}"),  # each step in its own process
+        *("--input", f"cameras={given}"),  # each step in its own process, charts drawn
         timeout_s=900,
+        draws=True,
     )
     assert again.code == 0, again.said
     # Painted without matching, from the same poses the same picture, but for rounding.
