@@ -29,7 +29,7 @@ _PLACE_BITS: Final = 21
 _GRID_BITS: Final = 7
 _DEEPEST: Final = _PLACE_BITS - _GRID_BITS
 _KEPT_WHOLE: Final = 1 << 15
-_GROUP: Final = 1 << 22
+_IN_MEMORY_POINTS: Final = 1 << 22
 _KEY_BITS: Final = 3 * _DEEPEST
 _SPREADS: Final = (
     (32, 0x1F00000000FFFF),
@@ -67,7 +67,7 @@ class _Waiting:
     @property
     def groups(self) -> NDArray[np.int64]:
         """Which group each cell belongs to; a group begins with a cell, none cuts one."""
-        return (np.cumsum(self.counts) - self.counts) // _GROUP
+        return (np.cumsum(self.counts) - self.counts) // _IN_MEMORY_POINTS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,7 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     half = 0.5 * waiting.side * float(header.scales[0])
     middle = header.offsets + header.scales * waiting.low + half
     sizes = (*middle.tolist(), half, 2.0 * half / 2**_GRID_BITS)
-    info = laspy.VLR("copc", 1, "COPC info", _INFO.pack(*sizes, 0, 0, 0.0, 0.0))
+    info = laspy.VLR("copc", 1, "COPC info", bytes(_INFO.size))
     header.vlrs.insert(0, info)
     packed = lazrs.LazVlr.new_for_compression(
         header.point_format.id, header.point_format.num_extra_bytes, use_variable_size_chunks=True
@@ -276,9 +276,10 @@ def _tree(nodes: _Nodes, chunks: Sequence[tuple[int, int]], offset: int) -> byte
     """The hierarchy: level, x, y, z, offset, bytes and points of each chunk, in their order."""
     entries = []
     for key, (n_points, n_bytes) in zip(np.unique(nodes.key).tolist(), chunks, strict=True):
-        level, place = key >> _KEY_BITS, key & ((1 << _KEY_BITS) - 1)
+        # No level has more bits of a place than stand below its number.
+        level = key >> _KEY_BITS
         x, y, z = (
-            sum((place >> (3 * bit + axis) & 1) << bit for bit in range(level)) for axis in range(3)
+            sum((key >> (3 * bit + axis) & 1) << bit for bit in range(level)) for axis in range(3)
         )
         entries.append(_ENTRY.pack(level, x, y, z, offset, n_bytes, n_points))
         offset += n_bytes

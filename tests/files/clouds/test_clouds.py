@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -193,7 +194,7 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     assert write_copc(path, dress) == len(cloud)
     assert list(tmp_path.iterdir()) == [path]
     # In groups and blocks it gives the same bytes.
-    monkeypatch.setattr(copc, "_GROUP", 500)
+    monkeypatch.setattr(copc, "_IN_MEMORY_POINTS", 500)
     monkeypatch.setattr(copc, "BLOCK", 1000)
     monkeypatch.setattr(dressing, "BLOCK", 1000)
     write_copc(tmp_path / "b.copc.laz", dress)
@@ -231,6 +232,13 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     coarse = open_scan(path, wish=Wish(spacing=info.spacing))
     assert [sum(block.n_read for block in coarse.read())] == root
     assert info.spacing == pytest.approx(2.0 * info.halfsize / 128)
+    # A step of the file about all points, and an odd number of steps; no times are known.
+    steps = round(float((found.header.maxs - found.header.mins).max()) / 1e-4) + 3
+    assert 2.0 * info.halfsize == pytest.approx(1e-4 * (steps | 1), abs=1e-7)
+    np.testing.assert_allclose(
+        info.center - info.halfsize, found.header.mins - 1e-4, rtol=0, atol=1e-7
+    )
+    assert struct.unpack_from("<2d", path.read_bytes(), 375 + 54 + 56) == (0.0, 0.0)
     nothing = dataclasses.replace(dress, box_world=ORIGIN + 100.0 + np.eye(2, 3))
     assert write_copc(tmp_path / "none", nothing) == 0
 
@@ -255,6 +263,115 @@ def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> N
     write_e57(tmp_path / "b.e57", dressed(cloud=without))
     with pye57.E57(str(tmp_path / "b.e57")) as file:
         np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
+
+
+def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
+    cloud = corner()
+    path = tmp_path / "a.e57"
+    write_e57(path, dressed())
+    points = cloud.points_world()
+    with pye57.E57(str(path)) as file:
+        root = file.image_file.root()
+        created = root["creationDateTime"]
+        assert created["dateTimeValue"].value() == created["isAtomicClockReferenced"].value() == 0
+        for scan in (0, 1):
+            node = root["data3D"][scan]
+            assert node["name"].value() == f"scan {scan}"
+            own = points[cloud.scan == scan] - STATIONS[scan]
+            for axis, low, high in zip("xyz", own.min(axis=0), own.max(axis=0), strict=True):
+                bounds = node["cartesianBounds"]
+                assert bounds[f"{axis}Minimum"].value() == pytest.approx(low, abs=1e-8)
+                assert bounds[f"{axis}Maximum"].value() == pytest.approx(high, abs=1e-8)
+            for name in ("colorRed", "colorGreen", "colorBlue"):
+                limits = node["colorLimits"]
+                ends = limits[f"{name}Minimum"].value(), limits[f"{name}Maximum"].value()
+                assert ends == (0, 255)
+            limits = node["intensityLimits"]
+            ends = limits["intensityMinimum"].value(), limits["intensityMaximum"].value()
+            assert ends == (0.0, 1.0)
+            turned = node["pose"]["rotation"]
+            assert [turned[name].value() for name in "wxyz"] == [1.0, 0.0, 0.0, 0.0]
+            fields = pye57.libe57.StructureNode(node["points"].prototype())
+            for name in ("colorRed", "colorGreen", "colorBlue"):
+                assert (fields[name].minimum(), fields[name].maximum()) == (0, 255)
+            state = fields["cartesianInvalidState"]
+            assert (state.minimum(), state.maximum(), state.value()) == (0, 2, 0)
+            plane = fields["orthoflow:plane"]
+            assert (plane.minimum(), plane.maximum()) == (-32_768, 32_767)
+            # Metres from the scanner have every digit, normals and distances those of float32.
+            assert fields["cartesianX"].precision() == pye57.libe57.E57_DOUBLE
+            for name in ("nor:normalZ", "orthoflow:deviation", "intensity"):
+                assert fields[name].precision() == pye57.libe57.E57_SINGLE
+            intensity = fields["intensity"]
+            assert (intensity.minimum(), intensity.maximum()) == (0.0, 1.0)
+
+
+def test_a_scan_without_chosen_points_is_not_written(tmp_path: Path) -> None:
+    cloud = corner()
+    first = cloud.points_world()[0]
+    box = np.array([first - 1e-3, first + 1e-3])
+    dress = dressed(cloud=dataclasses.replace(cloud, stations=None, stations_source=None))
+    assert not dress.is_empty
+    alone = dataclasses.replace(dress, box_world=box)
+    assert write_e57(tmp_path / "a.e57", alone) == 1
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        assert file.scan_count == 1
+        assert file.image_file.root()["data3D"][0]["name"].value() == "scan 0, station not known"
+    nothing = dataclasses.replace(dress, box_world=box + 100.0)
+    assert nothing.is_empty
+    assert write_e57(tmp_path / "b.e57", nothing) == 0
+
+
+def test_what_a_file_holds_is_told_beside_it(tmp_path: Path) -> None:
+    def told(dress: DressedCloud) -> Any:
+        describe_cloud(tmp_path / "a.json", dress, "a.ply", 7)
+        return json.loads((tmp_path / "a.json").read_text())
+
+    cloud = corner()
+    plain = told(dressed(name="ab12"))
+    assert (plain["file"], plain["points"], plain["points_of_the_cloud"]) == (
+        *("a.ply", 7, len(cloud)),
+    )
+    assert plain["product_digest"] == "ab12"
+    assert (plain["up"], plain["origin_world"]) == ([0.0, 0.0, 1.0], ORIGIN.tolist())
+    assert [plain[key] for key in ("wall", "cleaned", "box_world", "coordinate_system_wkt")] == [
+        *[None] * 4,
+    ]
+    assert plain["colour"] == "rgb"
+    assert plain["scans"][0] == {"scan": 0, "station_world": STATIONS[0].tolist()}
+    assert plain.keys().isdisjoint({"colour_scale", "photos"})
+    side_m = 3.0 * neighbourhoods_of(cloud).side_m
+    assert f"sides of {side_m:.4g} m, towards the viewer" in plain["normals"]
+    slab = Slab(
+        frame=frame_over(planes().corners[0], planes().normal[0], gsd_m=0.01),
+        front_m=0.1,
+        behind_m=0.05,
+    )
+    box = ORIGIN + np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    photo = np.array([-1, 0, 1, 1, -1, 1], dtype=np.int16)
+    colours = PointColours(
+        rgb=np.zeros((6, 3), np.uint8), best=np.zeros(6, np.float32), photo=photo
+    )
+    rich = told(
+        dressed(
+            wall=slab,
+            wall_plane=1,
+            box_world=box,
+            is_cleaned=True,
+            crs_wkt="PROJCS[x]",
+            photo_colours=colours,
+            photo_names=("a.jpg", "b.jpg", "c.jpg"),
+        )
+    )
+    assert rich["wall"] == {"plane_index": 1, "deviation": "from the plane of this wall"}
+    assert rich["box_world"] == box.tolist()
+    assert rich["coordinate_system_wkt"] == "PROJCS[x]"
+    assert f"in 3 x 3 x 3 cubes of {side_m:.4g} m, are left out" in rich["cleaned"]
+    assert rich["photos"] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert rich["points_of_the_cloud_by_photo"] == [1, 3, 0]
+    assert rich["points_of_the_cloud_unseen"] == 2
+    unknown = told(dressed(cloud=dataclasses.replace(cloud, stations=None, stations_source=None)))
+    assert unknown["scans"][1] == {"scan": 1, "station_world": None}
 
 
 def test_a_known_coordinate_system_is_in_the_file(tmp_path: Path) -> None:

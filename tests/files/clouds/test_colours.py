@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthoflow.files.clouds.colours import (
+    deviation_colours,
     grey_range,
     greys,
     plane_colour,
@@ -78,3 +79,28 @@ def test_a_dark_point_keeps_two_fifths_of_the_colour_of_its_plane() -> None:
     expected = [(1.0, -1), (0.4, 0), (0.4, 1), (0.7, 1)]
     wanted = [np.multiply(share, plane_colour(k)) for share, k in expected]
     np.testing.assert_allclose(found, wanted, atol=0.5001)
+
+
+@pytest.mark.parametrize(
+    ("index", "colour"),
+    [
+        (-1, (128, 128, 128)),
+        (0, (255, 102, 102)),
+        # Hues of 222 and 85 degrees: steps of the golden ratio round the circle.
+        (1, (102, 147, 255)),
+        (2, (191, 255, 102)),
+    ],
+)
+def test_hues_of_planes_go_round_by_the_golden_ratio(
+    index: int, colour: tuple[int, int, int]
+) -> None:
+    assert plane_colour(index) == colour
+
+
+def test_deviations_go_from_blue_over_white_to_red() -> None:
+    deviation_m = np.array([-0.02, -0.01, -0.004, 0.0, 0.004, 0.01, np.nan], dtype=np.float32)
+    blue, white, red = (33, 102, 172), (247, 247, 247), (178, 24, 43)
+    # Four tenths of the way from white.
+    parts = [np.add(np.multiply(0.6, white), np.multiply(0.4, end)) for end in (blue, red)]
+    expected = np.rint([blue, blue, parts[0], white, parts[1], red, (128, 128, 128)])
+    np.testing.assert_array_equal(deviation_colours(deviation_m, 0.01), expected)
