@@ -72,6 +72,9 @@ def test_a_run_takes_as_long_as_its_longest_cell_or_its_share_of_all() -> None:
 def test_a_run_of_which_part_is_not_known_takes_at_least_the_rest() -> None:
     said = "at least 40 s left, and a step that takes nobody knows how long"
     assert left_of_run([CellState(took_s=40.0), CellState()], 100.0) == said
+    both = [CellState(took_s=40.0), CellState(took_s=4.0), CellState(), CellState()]
+    said = "at least 45 s left, and 2 steps that take nobody knows how long"
+    assert left_of_run(both, 100.0) == said
     # Of a few seconds of one cell a run of minutes would look short.
     unknown = "time left not known yet"
     assert left_of_run([CellState(took_s=4.0), CellState(), CellState()], 100.0) == unknown

@@ -11,7 +11,13 @@ import pytest
 from rich.console import Console
 
 from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
-from orthoflow.cli.progress import LiveProgress, PlainProgress, visible_cells, working_on
+from orthoflow.cli.progress import (
+    LiveProgress,
+    PlainProgress,
+    make_progress,
+    visible_cells,
+    working_on,
+)
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
@@ -89,7 +95,8 @@ def test_the_live_table_keeps_warnings_readable_and_shows_every_state(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     progress = LiveProgress(planned("cloud", "plane", "wall", "other"))
-    with progress:
+    with progress as entered:
+        assert entered is progress
         for event in EVENTS[:6]:
             progress.tell(event)
         table = progress.table()
@@ -123,6 +130,41 @@ def test_what_does_not_fit_is_what_matters_least() -> None:
     assert list(visible_cells(cells, 6)) == list(cells)
     assert list(visible_cells(cells, 3)) == ["step2", "step3", "step4"]
     assert list(visible_cells(cells, 0)) == ["step2"]
+    for order in (("ok", "waiting"), ("waiting", "failed"), ("failed", "running")):
+        pair = {state: CellState(state=state) for state in order}
+        assert list(visible_cells(pair, 1)) == [order[1]]
+
+
+def test_the_live_table_leaves_four_lines_for_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    progress = LiveProgress(planned(*"abcdefgh"))
+    monkeypatch.setattr(progress, "_console", Console(height=10, file=io.StringIO()))
+    assert progress.table().row_count == 6
+
+
+def test_a_run_of_which_nothing_is_left_says_how_many_ended() -> None:
+    progress = LiveProgress(planned("a", "b"))
+    for address in ("a", "b"):
+        progress.tell(CellFinished(address=address, result=OK, cached=True))
+    assert str(progress.drawn().renderables[1]) == "2 of 2 steps ended"
+
+
+def test_a_step_that_begins_anew_begins_at_nought() -> None:
+    progress = LiveProgress(planned("a"))
+    progress.tell(CellProgress(address="a", fraction=0.5, text="half"))
+    progress.tell(CellStarted(address="a"))
+    state = progress._state.cells()["a"]
+    assert (state.state, state.fraction) == ("running", 0.0)
+
+
+@pytest.mark.parametrize(("is_terminal", "kind"), [(True, LiveProgress), (False, PlainProgress)])
+def test_a_terminal_has_a_table_and_a_file_has_lines(
+    monkeypatch: pytest.MonkeyPatch, is_terminal: bool, kind: type
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal)
+    made = make_progress(planned("a", "b", took_s=60.0), jobs=2)
+    assert type(made) is kind
+    # Two at a time.
+    assert made._state.left() == "about 1 min 00 s left"
 
 
 def test_a_step_that_says_nothing_still_moves_in_plain_lines(
