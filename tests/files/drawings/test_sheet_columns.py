@@ -135,8 +135,16 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
         *("checked by: A B", "drawing: 21-017, wall 7, index", "note: n"),
     ]
     high = {one.text: one.high for one in drawn.texts}
-    # The project is the largest text, its own title the next.
-    assert high["Hall"] > high["West"] > high["wall 7"]
+    # The project is the largest text with the scale, its own title the next; fields the smallest.
+    assert 4.0 > high["Hall"] == high["scale 1:50"] > high["West"] > high["wall 7"]
+    assert high["wall 7"] == high["grey of the scan"] == high["index of 3 sheets"]
+    assert high["wall 7"] > high["note: n"] == high["checked by: A B"] > 1.9
+    is_bold = {one.text for one in drawn.texts if one.is_bold}
+    assert is_bold == {"Hall", "West", "scale 1:50"}
+    # The scale stands apart.
+    bottoms = {one.text: one.bottom for one in drawn.texts}
+    apart = bottoms["grey of the scan"] - bottoms["scale 1:50"] - 1.7 * high["scale 1:50"]
+    assert 1.0 < apart < 2.0
 
 
 def test_notes_say_what_contours_and_crosses_are() -> None:
@@ -336,6 +344,8 @@ def test_the_seal_is_read_by_a_phone(drawn: Page) -> None:
     assert written(drawn)[0] == "provenance"
     assert "".join(written(drawn)[-4:]) == DIGEST
     assert "run r1 of hall" in " ".join(written(drawn))
+    assert max(text.high for text in drawn.texts) == drawn.texts[0].high < 2.0
+    assert [text.is_bold for text in drawn.texts] == [True] + [False] * (len(drawn.texts) - 1)
     quiet = high[0] + 4.0 * side
     assert all(text.left > quiet for text in drawn.texts)
     assert max(text.bottom + text.high for text in drawn.texts) <= high[1] + 4.0 * side
@@ -443,3 +453,16 @@ def test_the_wall_of_the_sheet_has_its_number_before_those_beside_it(drawn: Page
     plan = replace(PLAN, walls=walls, numbers=(3, 0))
     module._draw_plan(column(drawn), plan, 40.0, number=0)
     assert written(drawn) == ["N", "0"]
+
+
+@pytest.mark.parametrize("size", [1.0, 1.5])
+def test_a_plan_is_no_higher_than_nine_centimetres_on_small_paper(drawn: Page, size: float) -> None:
+    # A narrow room, for which a column as high as this has more room.
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 20.0], [0.0, 20.0], [0.0, 0.0]])
+    plan = replace(
+        PLAN, walls=np.array([corners[:2]]), numbers=(3,), outlines=(corners,), marked=corners[:2]
+    )
+    paper = Paper(width_mm=size * 420.0, height_mm=1200.0)
+    draw_column(drawn, drawing(plan=plan), sheet("ortho", paper=paper))  # type: ignore[arg-type]
+    outline = max((line.points for line in drawn.lines), key=lambda points: np.ptp(points[:, 1]))
+    assert np.ptp(outline[:, 1]) == pytest.approx(90.0 * size - 5.0, abs=0.01)
