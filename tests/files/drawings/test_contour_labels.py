@@ -82,4 +82,4 @@ def test_a_corner_below_a_number_is_a_blunt_one(sine: float, share: float) -> No
     assert place is not None
     at = line[0] * (1.0 - 2.0 * share)
     below = 2.5 * math.sqrt(1.0 - sine**2) if share == 0.5 else 0.0
-    np.testing.assert_allclose(place.middle_mm, [*at, 0.0, below], atol=1e-9)
+    np.testing.assert_allclose(place.middle_mm, at + np.array([0.0, below]), atol=1e-9)
