@@ -234,8 +234,8 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
     # Two passes of a box come near a Gaussian and cost nothing at any width.
     side = 2 * _LEVEL_REACH + 1
-    once = cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
-    twice = cv2.boxFilter(once, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
+    once = cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
+    twice = cv2.blur(once, (side, side), borderType=cv2.BORDER_CONSTANT)
     return np.asarray(twice, dtype=np.float32)
 
 

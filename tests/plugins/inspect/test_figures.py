@@ -138,3 +138,11 @@ def test_enlargements_are_round_and_limited(length: float, times: float) -> None
 
 def test_nothing_is_not_enlarged() -> None:
     assert enlargement(np.empty((0, 2)), grey_image(600, 800)) == 1.0
+
+
+def test_cells_of_a_small_image_stay_cells() -> None:
+    halves = np.full((60, 150), 80.0)
+    halves[:, 75:] = 160.0
+    shown = np.array(vector_map(image_of(halves), np.empty((0, 2)), np.empty((0, 2))))
+    assert shown.shape == (200, 500, 3)
+    assert np.unique(shown).tolist() == [140, 180]

@@ -209,3 +209,9 @@ def test_depths_beyond_the_wall_are_not_known() -> None:
     found = image_quality._depth_at(samples.wall(frame, depth_m=depth), rows, columns)
     padded = np.pad(depth.astype(np.float64), 1, constant_values=np.nan)
     np.testing.assert_array_equal(found.reshape(5, 6), padded)
+
+
+def test_where_nothing_is_shown_there_are_no_profiles() -> None:
+    nowhere = np.zeros((40, 61), dtype=np.bool_)
+    image = GreyImage(grey=edge(), valid=nowhere, region=nowhere)
+    assert image_quality._edge_profiles(image).shape == (0, image_quality._ALONG.size)

@@ -153,3 +153,22 @@ def test_points_are_counted_by_both_labels() -> None:
     assert joint.tolist() == [[1, 0, 0, 0], [0, 2, 0, 1], [1, 0, 0, 1]]
     nothing = np.full(3, -1, dtype=np.int16)
     assert plane_errors._joint_counts(nothing, nothing, 2).tolist() == [[3], [0], [0]]
+
+
+def test_labels_are_scored_by_plane_whichever_number_they_have() -> None:
+    labels: Any = SimpleNamespace(plane_index=np.array([2, 2, -1, 0, 0, 0], dtype=np.int16))
+    truth: Any = SimpleNamespace(
+        labels=np.array([0, 0, 0, 1, 1, -1], dtype=np.int16), planes=floors(0.0, 3.0, 6.0)
+    )
+    found = counts(plane_errors.label_findings(labels, truth))
+    # Of the third plane there is no point.
+    expected = {
+        "precision": (1.0, 2.0 / 3.0, 0.0),
+        "recall": (2.0 / 3.0, 1.0, 0.0),
+        "f1": (0.8, 0.8, 0.0),
+        "iou": (2.0 / 3.0, 2.0 / 3.0, 0.0),
+    }
+    for score, values in expected.items():
+        of_each = [found[f"label_{score}[floor {k}]"] for k in range(3)]
+        assert of_each == pytest.approx(values), score
+        assert found[f"label_{score}_mean"] == pytest.approx(sum(values) / 3.0), score

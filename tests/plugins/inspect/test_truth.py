@@ -587,3 +587,37 @@ def test_what_would_let_more_be_compared_is_told(
     module._inspect_planes(inputs, ctx)
     (said,) = ctx.warnings
     assert f"the truth: {dropped}, for want of {missing}; only" in said
+
+
+def test_who_sees_a_cell_is_asked_of_each_station_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered_by: list[Any] = []
+    monkeypatch.setattr(
+        "orthoflow.geometry.scene_views.render", lambda *how: rendered_by.append(how)
+    )
+    given: Any = SimpleNamespace(
+        stations=np.array([[3.0, 1.0, 2.0], [0.0, 5.0, 1.0], [3.0, 1.0, 2.0]]),
+        planes=SimpleNamespace(up=np.array([0.0, 0.0, 1.0])),
+        lowest_elevation_deg=-60.0,
+        highest_elevation_deg=80.0,
+        scene="scene",
+    )
+    judge: Any = SimpleNamespace(
+        inputs=SimpleNamespace(truth=given),
+        walls=SimpleNamespace(slab=lambda wall: SimpleNamespace(front_m=0.1 + wall, behind_m=0.2)),
+        params=SimpleNamespace(supersample=5),
+        ctx=SimpleNamespace(cores=3),
+    )
+    chosen: Any = SimpleNamespace(
+        coloured=np.array([[True, False, False]]), lattice=np.array([[False, True, False]])
+    )
+    image: Any = SimpleNamespace(wall=2, frame="frame")
+    module._Judge._true_orthoimage(judge, image, chosen)
+    ((scene, frame, rendering),) = rendered_by
+    assert (scene, frame) == ("scene", "frame")
+    assert (rendering.buffer_front_m, rendering.buffer_behind_m) == (2.1, 0.2)
+    assert (rendering.supersample, rendering.cores) == (5, 3)
+    np.testing.assert_array_equal(rendering.coloured, chosen.coloured)
+    assert rendering.judged.tolist() == [[True, True, False]]
+    viewers = rendering.viewers
+    assert viewers.positions_world.tolist() == [[0.0, 5.0, 1.0], [3.0, 1.0, 2.0]]
+    assert (viewers.lowest_elevation_deg, viewers.highest_elevation_deg) == (-60.0, 80.0)

@@ -155,6 +155,11 @@ def test_larger_photos_are_compared_in_wider_cells(wall: Wall, structure: WallSt
     cell_m, shape = structure.wall.frame.gsd_m, structure.wall.frame.shape
     for levels in (structure.fine, structure.rough):
         assert [level.sample_m / cell_m for level in levels] == [2.0, 4.0, 8.0]
+    for level in (*structure.fine, *structure.rough):
+        # Beside the wall there is room for the largest part of a photo, wherever it slips.
+        longest = level.photo_cells * cell_m / structure.fine[0].sample_m
+        room = np.array(level.padded) - level.shape
+        assert (room >= 0.5 * longest + 2.0 * np.floor(0.03 * longest)).all()
     for level in structure.fine:
         assert level.shape == tuple(int(length * cell_m / level.sample_m) for length in shape)
     # Halves of what the wall shows, in every second of those cells: means over four of them.
@@ -274,3 +279,73 @@ def test_a_halved_depth_is_known_where_all_four_are() -> None:
     expected = depth_m[:4:2, :6:2].copy()
     expected[0, 1] = np.nan
     np.testing.assert_array_equal(halved, expected)
+
+
+@pytest.mark.parametrize("roughly", [False, True])
+def test_places_are_looked_for_finely_or_roughly(
+    roughly: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def best(_: object, width: float, levels: object) -> Place:
+        asked.append(levels)
+        parts = np.zeros((9, 2))
+        return Place(
+            centre_m=np.array([width, 0.0]), width_m=0.01, lead=width, parts_photo=parts,
+            parts_m=parts,
+        )  # fmt: skip
+
+    monkeypatch.setattr(structures, "_best_of_size", best)
+    of: Any = SimpleNamespace(
+        fine="fine",
+        rough="rough",
+        wall=SimpleNamespace(frame=SimpleNamespace(shape=(200, 300), gsd_m=0.01)),
+    )
+    rgb = np.zeros((60, 90, 3), dtype=np.uint8)
+    widths = _widths_cells((60, 90), (200, 300))
+    places = likely_places(rgb, of, n_most=3, roughly=roughly)
+    assert asked == ["rough" if roughly else "fine"] * len(widths)
+    # Those that stand out most.
+    assert [place.lead for place in places] == sorted(widths, reverse=True)[:3]
+    asked.clear()
+    closer(rgb, of, places[0])
+    assert asked == ["fine"]
+
+
+def test_nine_parts_that_slipped_as_far_as_they_may_tell_a_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # A photo of 100 by 75 samples, whose parts may slip by three of them.
+    sides, shape, padded = (37, 50), (120, 160), (200, 260)
+    corners = [(top, left) for top in (0, 19, 38) for left in (0, 25, 50)]
+    slips = [(3 * i, 3 * j) for i in (-1, 0, 1) for j in (1, 0, -1)]
+    row, column = 20, 30
+    maps = iter(
+        np.where(
+            (np.arange(padded[0])[:, None] == row + top + down)
+            & (np.arange(padded[1]) == column + left + right),
+            np.float32(1.0),
+            np.float32(0.0),
+        )
+        for (top, left), (down, right) in zip(corners, slips, strict=True)
+    )
+    asked = []
+
+    def part_map(part: NDArray[np.float32], under: object, _: object) -> NDArray[np.float32]:
+        asked.append((part.shape, under))
+        return next(maps)
+
+    monkeypatch.setattr(structures, "_part_map", part_map)
+    monkeypatch.setattr(structures, "_energy_under", lambda side, _: side)
+    spectra: Any = SimpleNamespace(shape=shape, padded=padded, sample_m=0.5)
+    rgb = np.random.default_rng(3).integers(0, 255, (150, 200, 3), dtype=np.uint8)
+    found = structures._best_at(rgb, 200.0, spectra)
+    assert asked == [((5, *sides), sides)] * 9
+    np.testing.assert_allclose(found.centre_m, 0.5 * np.array([column + 50.0, row + 37.5]))
+    assert found.width_m == 50.0
+    assert found.lead == pytest.approx(9e9)
+    lefts = np.array([[left, top] for top, left in corners])
+    moves = np.array([[right, down] for down, right in slips])
+    half = np.array([25.0, 18.5])
+    np.testing.assert_allclose(found.parts_photo, (lefts + half) / [100.0, 75.0])
+    np.testing.assert_allclose(found.parts_m, 0.5 * (lefts + moves + half + [column, row]))

@@ -150,6 +150,11 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     rgb[~seen] = (20, 40, 60)
     shown = np.array(drawings["wall_8_predicted_error"])
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
+    # No more pictures than enough.
+    drawings.clear()
+    monkeypatch.setattr(figures, "_FIGURES_MOST", 0)
+    draw_wall_errors(context, candidates)
+    assert not drawings
 
 
 # --- where photos were taken ---

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane import assembling
 from orthoflow_plugins.plane.assembling import (
     Assembly,
     assemble,
@@ -345,3 +347,40 @@ def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
         "support": 99.0,
         "own_tolerance_m": None,
     }
+
+
+def test_planes_within_twenty_degrees_do_not_count_for_the_side_of_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+
+    def side(_plane: object, _corners: object, points: Any, is_parallel: Any, **_: object) -> int:
+        asked.append((points, is_parallel))
+        return 1
+
+    monkeypatch.setattr(assembling, "side_of_remaining", side)
+
+    def found(turn_deg: float) -> Any:
+        turn = np.radians(turn_deg)
+        plane = Plane(normal=np.array([np.sin(turn), -np.cos(turn), 0.0]), offset_m=-2.0)
+        stated = SimpleNamespace(stated=lambda: None)
+        return SimpleNamespace(
+            raster=SimpleNamespace(plane=plane, axes=wall_axes(plane.normal, UP)),
+            support=SimpleNamespace(parts_m=np.array([[-1.0, 1.0, -1.0, 1.0]])),
+            adjusted=stated,
+        )
+
+    planes = [found(turn_deg) for turn_deg in (0.0, 19.0, 21.0, 199.0, -19.0, 90.0)]
+    claims = np.array([5, 0, 1, 2, -1, 3, 4, 0], dtype=np.int8)
+    offsets = np.arange(24.0).reshape(8, 3)
+    prepared: Any = SimpleNamespace(
+        sample_claims=claims, sample=SimpleNamespace(index=np.arange(8), offsets_m=offsets)
+    )
+    deviations: Any = SimpleNamespace(
+        extents_m=np.tile([-1.0, 1.0, -1.0, 1.0], (6, 1)), find_m=0.05
+    )
+    faced = assembling._faced(planes, 0, prepared, cloud(), deviations)
+    assert faced.is_guessed
+    ((points, is_parallel),) = asked
+    np.testing.assert_array_equal(points, offsets)
+    assert is_parallel.tolist() == [False, True, True, False, False, True, True, True]

@@ -296,3 +296,13 @@ def test_what_was_rejected_is_looked_at_again_by_the_points_that_are_left(
     (free,) = told
     np.testing.assert_array_equal(free, left.claims[over._witnesses] < 0)
     assert free.mean() == pytest.approx(2 / 3, abs=1e-3)
+
+
+@pytest.mark.parametrize(("n_free", "is_drawn"), [(3, True), (2, False)])
+def test_three_points_make_a_hypothesis(n_free: int, is_drawn: bool) -> None:
+    left = unassigned()
+    over = ConsensusProposer(left, search(family="any"), np.random.default_rng(0))
+    left.claims[:] = 0
+    left.claims[[0, 700, 1900][:n_free]] = -1
+    over._draw(left)
+    assert (over._pool is not None) == is_drawn

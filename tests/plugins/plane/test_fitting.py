@@ -233,3 +233,14 @@ def test_points_on_a_line_refine_no_plane() -> None:
     assert refined is not None
     assert refined.offset_m == pytest.approx(1.001, abs=1e-9)
     np.testing.assert_allclose(refined.normal, UP, atol=1e-9)
+
+
+def test_a_cell_varies_by_the_noise_of_its_points_and_by_the_surface_and_no_more() -> None:
+    heights = np.random.default_rng(9).normal(0.0, 0.0006, (20, 30))
+    fitted = adjusted(heights)
+    assert fitted is not None
+    # Sixteen points of a millimetre each.
+    np.testing.assert_allclose(fitted.observed.noise_m2, 1e-6 / 15.0, rtol=0.05)
+    # What cells scatter by holds that noise already.
+    assert fitted.fit.scale_m == pytest.approx(0.0006, rel=0.2)
+    np.testing.assert_allclose(fitted.fit.variance_m2, fitted.fit.scale_m**2, rtol=0.02)
