@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from orthoflow_plugins.plane import sample as sampling
 from orthoflow_plugins.plane.accumulators import (
     PlanProposer,
     ResidualCounts,
@@ -243,3 +244,29 @@ def test_what_was_rejected_bars_the_heights_about_it() -> None:
     assert proposer.propose(Unassigned.of(cloud)) is None
     # There is no picture of votes for walls that nobody looked for.
     assert proposer.first is None
+
+
+@pytest.mark.parametrize("is_raw", [False, True])
+def test_votes_are_points_of_the_cloud_whether_cells_vote_or_points_of_a_sample(
+    is_raw: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "SAMPLE_POINTS", 1_200)
+    wall = Rectangle("wall", (0.0, 0.513, 0.0), (3.0, 0, 0), (0, 0, 1), 12_000)
+    cloud = prepare(
+        cloud_of(points_of((wall,), noise_m=0.002)),
+        np.eye(3),
+        cell_m=0.05,
+        least_share=0.005,
+        parts=2,
+        counts_plan=True,
+    )
+    proposer = PlanProposer(
+        cloud,
+        Voting(angle_step_deg=5.0, least_points=1_000.0, walls=True, levels=False, is_raw=is_raw),
+    )
+    found = proposer.propose(Unassigned.of(cloud))
+    assert found is not None
+    assert 0.95 * 12_000 < found.votes <= 12_000
+    assert proposer.first is not None
+    # In each direction all points lie somewhere, but for what is rounded.
+    np.testing.assert_allclose(proposer.first.votes.sum(axis=1), 12_000, atol=150)

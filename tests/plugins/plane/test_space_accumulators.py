@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane import sample, space_accumulators
 from orthoflow_plugins.plane.sample import Claim, PreparedCloud, Unassigned, prepare
 from orthoflow_plugins.plane.space_accumulators import (
     SpaceProposer,
@@ -209,3 +210,34 @@ def test_moments_of_wider_voxels_are_those_of_half_as_many_steps(seed: int) -> N
         np.testing.assert_array_equal(
             found[wide], np.rint([len(held), *held.sum(axis=0), *products])
         )
+
+
+def test_bins_grow_where_all_tables_would_hold_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud = prepared_cloud(np.random.default_rng(0).uniform(-1.0, 1.0, (400, 3)), np.eye(3))
+    voting = SpaceVoting(
+        cell_m=0.02, angle_step_deg=30.0, least_points=10, tilt_most_deg=10.0, is_raw=False
+    )
+    n_rows, n_bins = SpaceProposer(cloud, voting)._votes.shape
+    most = n_rows * n_bins // 3
+    monkeypatch.setattr(space_accumulators, "_TABLE_MOST", most)
+    narrow = SpaceProposer(cloud, voting)
+    assert most < narrow._votes.size <= most + 4 * n_rows
+    assert narrow._bin_m == pytest.approx(3.0 * 0.02, rel=0.1)
+
+
+@pytest.mark.parametrize("is_raw", [False, True])
+def test_votes_are_points_of_the_cloud_whether_its_voxels_vote_or_points_of_a_sample(
+    is_raw: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sample, "SAMPLE_POINTS", 2_000)
+    wall = Rectangle("wall", (0.0, 1.01, 0.0), (1.2, 0, 0), (0, 0, 0.8), 20_000)
+    cloud = prepared_cloud(sampled((wall,), noise_m=0.002), np.eye(3))
+    assert cloud.sample.n_represented == 10.0
+    voting = SpaceVoting(
+        cell_m=0.04, angle_step_deg=10.0, least_points=2_000, tilt_most_deg=10.0, is_raw=is_raw
+    )
+    found = SpaceProposer(cloud, voting).propose(Unassigned.of(cloud))
+    assert found is not None
+    assert 0.95 * 20_000 < found.votes <= 20_000
+    few = SpaceProposer(cloud, replace(voting, least_points=90_000))
+    assert few.propose(Unassigned.of(cloud)) is None
