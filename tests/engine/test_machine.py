@@ -18,7 +18,9 @@ import pytest
 from orthoflow.engine import clock, environment, file_digests, memory
 from orthoflow.engine.durability import (
     folder_size,
+    is_broken,
     place_folder,
+    size_of,
     store_error,
     whole_folder,
     write_whole,
@@ -423,6 +425,49 @@ def test_the_first_of_two_folders_stays(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"^cannot write to "):
         place_folder(final, final / "inside")
     assert (final / "who").read_text() == "one"
+
+
+def test_a_whole_folder_takes_the_place_of_an_empty_one_only(tmp_path: Path) -> None:
+    final = tmp_path / "made"
+    final.mkdir()
+    with whole_folder(final) as aside:
+        aside.mkdir()
+        (aside / "a").write_text("one")
+    assert (final / "a").read_text() == "one"
+    with pytest.raises(StoreError, match="cannot write to"), whole_folder(final) as aside:
+        aside.mkdir()
+        (aside / "a").write_text("other")
+    assert (final / "a").read_text() == "one"
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_folder_is_as_large_as_its_files_and_a_link_is_itself(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "a").write_bytes(b"x" * 700)
+    (tmp_path / "deep" / "b").write_bytes(b"x" * 40)
+    assert (size_of(tmp_path / "a"), size_of(tmp_path / "deep"), size_of(tmp_path)) == (
+        *(700, 40, 740),
+    )
+    for name, target in (("to a", "a"), ("to deep", "deep")):
+        (tmp_path / name).symlink_to(target)
+        assert size_of(tmp_path / name) == len(target)
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "broken"),
+    [
+        (errno.EIO, None, True),
+        (errno.EIO, 7, True),
+        (errno.EROFS, "/store/objects/x", True),
+        (errno.EROFS, b"/store/objects/x", True),
+        (errno.EIO, "/elsewhere/x", False),
+        (errno.ENOSPC, "/store/x", False),
+    ],
+)
+def test_a_disk_is_broken_where_it_fails_in_a_folder(
+    number: int, name: str | bytes | int | None, broken: bool
+) -> None:
+    assert is_broken(OSError(number, "why", name), Path("/store")) is broken
 
 
 def test_a_folder_holds_nothing_of_one_that_was_broken_off(tmp_path: Path) -> None:
