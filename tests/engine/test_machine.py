@@ -434,9 +434,14 @@ def test_a_whole_folder_takes_the_place_of_an_empty_one_only(tmp_path: Path) -> 
         aside.mkdir()
         (aside / "a").write_text("one")
     assert (final / "a").read_text() == "one"
-    with pytest.raises(StoreError, match="cannot write to"), whole_folder(final) as aside:
-        aside.mkdir()
-        (aside / "a").write_text("other")
+
+    def make_another() -> None:
+        with whole_folder(final) as aside:
+            aside.mkdir()
+            (aside / "a").write_text("other")
+
+    with pytest.raises(StoreError, match="cannot write to"):
+        make_another()
     assert (final / "a").read_text() == "one"
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
@@ -463,6 +468,7 @@ def test_a_folder_is_as_large_as_its_files_and_a_link_is_itself(tmp_path: Path) 
         (errno.EIO, "/elsewhere/x", False),
         (errno.ENOSPC, "/store/x", False),
     ],
+    ids=["nameless", "a descriptor", "text", "bytes", "elsewhere", "full"],
 )
 def test_a_disk_is_broken_where_it_fails_in_a_folder(
     number: int, name: str | bytes | int | None, broken: bool
