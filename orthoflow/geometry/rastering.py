@@ -173,8 +173,7 @@ def places_of_winners(
         near, NaN in cells without a point of their own.
     """
     is_beside = (winners["n_points"] == 0).reshape(slab.frame.shape)
-    for axis in (0, 1):
-        grown = np.moveaxis(is_beside, axis, 0)
+    for grown in (is_beside, is_beside.T):
         for _ in range(_BESIDE_GAPS_CELLS):
             before = grown.copy()
             grown[1:] |= before[:-1]

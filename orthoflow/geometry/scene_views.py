@@ -110,7 +110,7 @@ def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoima
         frame=frame,
         rgb=np.full((*frame.shape, 3), np.nan, dtype=np.float32),
         depth_m=np.full(frame.shape, np.nan, dtype=np.float32),
-        rectangle=np.full(frame.shape, -1, dtype=np.int32),
+        rectangle=np.empty(frame.shape, dtype=np.int32),
         seen=np.zeros(frame.shape, dtype=np.bool_),
         behind_object=np.zeros(frame.shape, dtype=np.bool_),
     )

@@ -245,3 +245,37 @@ def test_a_part_of_a_scene_keeps_its_holes() -> None:
     # Rectangles 3 (two holes) and 9 (one) become 1 and 3.
     np.testing.assert_array_equal(part.hole_rectangle, [1, 1, 3])
     np.testing.assert_array_equal(part.hole_extent, scene.hole_extent)
+
+
+@pytest.mark.parametrize("supersample", [1, 3])
+def test_the_edge_of_a_surface_is_as_bright_as_its_middle(supersample: int) -> None:
+    """Rays of a cell that miss it do not count, and the first rectangle is one as any other."""
+    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-0.28, 2, -0.9, 1)}
+    scene = a_scene([wall], [])
+    scene = replace(scene, texture_params=scene.texture_params * [1, 1, 1, 1, 0, 1, 1, 1])
+    frame = wall_frame(0.25)
+    image = render_frame(
+        scene, frame, buffer_front_m=0.1, buffer_behind_m=0.1, supersample=supersample
+    )
+    # The wall begins in the seventh cell, left of its middle, and ends in the last row below it.
+    shown = np.zeros(frame.shape, dtype=np.bool_)
+    shown[:, 7:] = True
+    np.testing.assert_array_equal(image.rectangle >= 0, shown)
+    np.testing.assert_array_equal(image.rectangle[~shown], -1)
+    expected = np.where(shown[..., None], [200.0, 160.0, 120.0], np.nan)
+    np.testing.assert_allclose(image.rgb, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("gap_m", "is_seen"), [(0.0003, True), (0.0008, False)])
+def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_seen: bool) -> None:
+    sides = {"a": (1, 0, 0), "b": (0, 0, 1)}
+    wall = {"centre": (0, 0, 0), "extent": (-2, 2, -1, 1), **sides}
+    film = {"centre": (0, -gap_m, 0), "extent": (-2, 2, -1, 1), "role": 3, **sides}
+    scene = a_scene([wall, film], [])
+    viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
+    image = render_frame(
+        scene, wall_frame(0.5), buffer_front_m=1e-4, buffer_behind_m=0.1, viewers=viewers
+    )
+    assert (image.rectangle == 0).all()
+    middle = image.seen[1:3, 3:5]
+    assert (middle == is_seen).all()

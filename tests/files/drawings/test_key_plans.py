@@ -7,6 +7,7 @@ import pytest
 
 from orthoflow.files.drawings.key_plans import key_plan
 from orthoflow.geometry.frames import frame_over
+from tests import samples
 from tests.drawing_runs import GAP_M, GSD_M, SIZE_M, box_planes, wall_frame
 
 
@@ -39,3 +40,26 @@ def test_of_a_floor_all_four_corners_are_marked_and_nothing_points_at_it() -> No
     wide_m, deep_m = SIZE_M[0] - 2 * GAP_M, SIZE_M[1] - 2 * GAP_M
     np.testing.assert_allclose(np.sort(sides), [deep_m, deep_m, wide_m, wide_m], atol=2 * GSD_M)
     assert plan.arrow is None
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -25.0])
+def test_arrows_are_as_long_at_walls_that_lean(tilt_deg: float) -> None:
+    angle = np.radians(tilt_deg)
+    normal = np.array([0.0, -np.cos(angle), np.sin(angle)])
+    down = np.array([0.0, -np.sin(angle), -np.cos(angle)])
+    corner = np.array([1.0, 2.0, 3.0])
+    sides = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float64)
+    corners = corner + 4.0 * sides[:, :1] * [1.0, 0.0, 0.0] + 2.0 * sides[:, 1:] * down
+    planes = samples.planes(
+        normal=normal[None],
+        offset=np.array([normal @ corner]),
+        corners=corners[None],
+        names=("wall 0",),
+    )
+    plan = key_plan(planes, frame_over(corners, normal, gsd_m=0.01))
+    assert plan.arrow is not None
+    along = plan.arrow[1] - plan.arrow[0]
+    # A quarter of the wall before it, but for a tenth of that; towards it, seen from above.
+    assert np.linalg.norm(along) == pytest.approx(0.25 * 4.0 * 0.9)
+    before = plan.arrow[0] - plan.marked.mean(axis=0)
+    np.testing.assert_allclose(before, -along / 0.9, atol=1e-9)
