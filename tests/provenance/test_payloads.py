@@ -17,6 +17,7 @@ from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.payloads import (
     read_payload,
     read_product_file,
+    read_product_metadata,
     write_product_file,
 )
 from orthoflow_provenance.safe import safe_open
@@ -55,6 +56,7 @@ def test_a_product_comes_back_from_its_file(
     assert stored.digest == digest == payload_digest(payload) == payload_digest(stored)
     assert (stored.type_name, stored.encoding_version) == ("walls", 1)
     assert (stored.metadata, stored.mapped) == (metadata, is_mapped)
+    assert read_product_metadata(path) == metadata
     assert stored.arrays.keys() == arrays.keys()
     for name, array in arrays.items():
         assert stored.arrays[name].dtype == array.dtype.newbyteorder("<")

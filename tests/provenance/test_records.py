@@ -29,6 +29,7 @@ from orthoflow_provenance.model import (
     RunRecord,
 )
 from orthoflow_provenance.reader import open_record, read_record
+from orthoflow_provenance.safe import safe_open
 from orthoflow_provenance.seal import seal_file
 from orthoflow_provenance.verify import verify_record
 from orthoflow_provenance.writer import write_record
@@ -163,12 +164,24 @@ def test_the_sample_record_is_whole(tmp_path: Path) -> None:
     assert read_record(path) == record
     assert verify_record(path) == ()
     assert sorted(entry.name for entry in tmp_path.glob("*run*")) == ["run.h5"]
+    timed: list[str] = []
+
+    def look(name: str, entry: h5py.Group | h5py.Dataset) -> None:
+        if entry.id.get_create_plist().get_obj_track_times():
+            timed.append(name)
+
+    # When it was written is no part of a record.
+    with safe_open(path) as file:
+        file.visititems(look)
+    assert timed == []
 
 
 def test_equal_runs_give_equal_files(tmp_path: Path) -> None:
     path, record, shelf = write_sample(tmp_path)
-    write_record(tmp_path / "again.h5", record, shelf.find)
+    seal = write_record(tmp_path / "again.h5", record, shelf.find)
     assert (tmp_path / "again.h5").read_bytes() == path.read_bytes()
+    with safe_open(path) as file:
+        assert file.attrs["content_sha256"] == seal.encode()
 
 
 def test_an_embedded_product_comes_back_with_its_digest(tmp_path: Path) -> None:

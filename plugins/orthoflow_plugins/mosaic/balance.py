@@ -175,14 +175,14 @@ def _radii(
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
         # Beyond the photo nothing is painted; the corner stands for what cannot be projected.
-        radii = np.minimum(np.nan_to_num(radii, nan=1.0), 1.0).astype(np.float32)
+        radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
     return found
 
 
 def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
-    columns, rows = np.minimum(middles.astype(np.int64), np.array(wall.frame.shape[::-1]) - 1).T
+    columns, rows = middles.astype(np.int64).T
     depths_m = wall.depth_m[rows, columns].astype(np.float64)
     return np.asarray(np.nan_to_num(depths_m), dtype=np.float64)
 
@@ -219,9 +219,9 @@ def with_seams(
             continue
         for mine, other, sign in ((i, j, 1.0), (j, i, -1.0)):
             part = common(balance.lights[mine].box, around)
-            part = None if part is None else common(part, shares.boxes[other])
-            if part is None:
-                continue
+            assert part is not None  # noqa: S101 - what both show lies in all of these
+            part = common(part, shares.boxes[other])
+            assert part is not None  # noqa: S101 - what both show lies in all of these
             weights = shares.within(other, part)
             towards = np.float32(sign) * apart[inside(part, around)] * weights[..., None]
             logs[mine][inside(part, balance.lights[mine].box)] += towards

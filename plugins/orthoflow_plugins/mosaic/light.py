@@ -43,7 +43,8 @@ def lit_shares(
 ) -> NDArray[np.float64]:
     """Multiply the light of levels (n, 3), 0 to 1, by the exponentials of (n, 3)."""
     light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
-    gained = np.clip(light * np.exp(log_gains), 0.0, 1.0)
+    # Interpolation ends with the table: light that is clipped is white.
+    gained = light * np.exp(log_gains)
     levels = np.interp(gained, np.linspace(0.0, 1.0, _STEPS), _share_of_light()[:_STEPS])
     return np.asarray(levels, dtype=np.float64)
 

@@ -134,7 +134,7 @@ class PointcloudDirect(Method):
         )
         layers: list[Layer] = []
         seconds = np.zeros(2)
-        best_preview: tuple[int, bytes] | None = None
+        most_filled, preview = -1, b""
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
             layers.append(_empty_layer(wall, k, ctx))
@@ -150,17 +150,16 @@ class PointcloudDirect(Method):
                 # The next band is projected without this one in memory.
                 del projection
             n_filled = _n_filled(layers[-1])
-            if best_preview is None or n_filled > best_preview[0]:
-                best_preview = (n_filled, filling_preview(layers[-1]))
+            if n_filled > most_filled:
+                most_filled, preview = n_filled, filling_preview(layers[-1])
         _require_paint(layers)
         _report(ctx, layers, seconds)
-        if best_preview is not None:
-            ctx.figure(
-                "filling",
-                best_preview[1],
-                "Before and after filling; magenta is void. Fine magenta dots fill well; what was "
-                "a large area of it is invented from its rim.",
-            )
+        ctx.figure(
+            "filling",
+            preview,
+            "Before and after filling; magenta is void. Fine magenta dots fill well; what was "
+            "a large area of it is invented from its rim.",
+        )
         names = tuple(wall.name for wall in inputs.walls.walls)
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))

@@ -94,7 +94,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     The wall is the vertical plane with most points of the scan with most points, seen squarely, up
     is up; beside it lies what else of that scan is within 15 cm of the plane. Every so manieth row
     is a yellow line, every so manieth column a blue one (markiewicz2015, Figure 2b): where they
-    bend, something stands before the wall. None where the cloud has no grid, or no wall.
+    bend, something stands before the wall. None where the cloud has no grid.
     """
     import cv2
 
@@ -107,8 +107,6 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
-    if not on_wall.any():
-        return None
     # To the right of who stands where the scanner stood.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
@@ -134,7 +132,7 @@ class ContactSheet:
     def __init__(self, n_photos: int) -> None:
         self.n_photos = n_photos
         self.n_shown = min(n_photos, _MOST)
-        self._columns = max(1, math.ceil(math.sqrt(self.n_shown)))
+        self._columns = math.ceil(math.sqrt(self.n_shown))
         self._cell_px = min(_CELL_PX, _SHEET_SIDE_PX // self._columns)
         self._cells: list[NDArray[np.uint8]] = []
 
@@ -207,15 +205,19 @@ def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float
     # Points of damaged files lie anywhere: the table of cells between them has to end.
     is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
     some = some[is_near] if is_near.any() else some[:1]
-    fullest, best = -1, (np.array([1.0, 0.0]), 0.0)
-    for angle in np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG)):
-        along = np.array([math.cos(angle), math.sin(angle)])
-        cells = np.floor(some @ [along[1], -along[0]] / _WALL_CELL_M).astype(np.int64)
-        counts = np.bincount(cells - cells.min())
-        if counts.max() > fullest:
-            fullest = int(counts.max())
-            best = along, (int(counts.argmax()) + int(cells.min()) + 0.5) * _WALL_CELL_M
-    return best
+    angles = np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG))
+    ways = [np.array([math.cos(angle), math.sin(angle)]) for angle in angles]
+    cells = [_fullest_cell(some @ [along[1], -along[0]]) for along in ways]
+    best = max(range(len(ways)), key=lambda way: cells[way][0])
+    return ways[best], cells[best][1]
+
+
+def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
+    """How many of some distances (n,) lie in the cell with most, and its middle."""
+    cells = np.floor(distances_m / _WALL_CELL_M).astype(np.int64)
+    counts = np.bincount(cells - cells.min())
+    fullest = int(counts.argmax())
+    return int(counts[fullest]), (fullest + int(cells.min()) + 0.5) * _WALL_CELL_M
 
 
 def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:

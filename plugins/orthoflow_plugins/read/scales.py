@@ -151,7 +151,7 @@ class ColourScale:
         if self.scale == "0..1" and seen == "8 bit":
             # What looked like full brightness was 0 or 1 of 255.
             before[:] = np.rint(before / np.float32(255.0)).astype(np.uint8)
-        elif self.scale is not None and seen == "16 bit":
+        elif seen == "16 bit":
             before[:] = 0
         self.scale = seen
 
@@ -172,14 +172,13 @@ def _scale_of(rgb: NDArray[np.generic]) -> RgbScale:
 def _to_bytes(
     values: NDArray[np.float32], scale: RgbScale | None, limit: float | None
 ) -> NDArray[np.uint8]:
+    scaled = values
     if limit is not None:
-        scaled = values if limit == 255.0 else values * np.float32(255.0 / limit)
+        scaled = values * np.float32(255.0 / limit)
     elif scale == "16 bit":
         # Exact for 8-bit values times 256 and times 257 alike.
         scaled = np.floor(values / np.float32(256.0))
     elif scale == "0..1":
         scaled = values * np.float32(255.0)
-    else:
-        scaled = values
     whole = np.rint(np.clip(np.nan_to_num(scaled), 0.0, 255.0))
     return whole.astype(np.uint8)

@@ -51,12 +51,22 @@ _DARK = Paint(kind=TextureKind.PLAIN, rgb=(92, 88, 84), reflectance=0.2, contras
 _OBJECT = Paint(
     kind=TextureKind.TILES, rgb=(38, 96, 160), reflectance=0.3, period_m=0.09, contrast=0.5, seed=15
 )
-# Walls that are drawn: name, ground colour, from corner to corner, and which fresco.
+_OCHRE = Paint(
+    kind=TextureKind.FRESCO, rgb=(206, 180, 138), reflectance=0.5, period_m=0.34, seed=101
+)
+_GREEN = Paint(
+    kind=TextureKind.FRESCO, rgb=(160, 186, 152), reflectance=0.5, period_m=0.34, seed=201
+)
+_BLUE = Paint(
+    kind=TextureKind.FRESCO, rgb=(150, 170, 178), reflectance=0.5, period_m=0.34, seed=301
+)
+_RED = Paint(kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.5, period_m=0.34, seed=401)
+# Walls that are drawn: name, ground, and from corner to corner.
 _DRAWN: Final = (
-    ("main wall", (206.0, 180.0, 138.0), (-2.7, 2.7), 101),
-    ("opposite wall", (160.0, 186.0, 152.0), (-2.7, 2.7), 201),
-    ("right wall", (150.0, 170.0, 178.0), (-2.4, 2.0), 301),
-    ("left wall", (196.0, 150.0, 132.0), (-2.0, 2.4), 401),
+    ("main wall", _OCHRE, (-2.7, 2.7)),
+    ("opposite wall", _GREEN, (-2.7, 2.7)),
+    ("right wall", _BLUE, (-2.4, 2.0)),
+    ("left wall", _RED, (-2.0, 2.4)),
 )
 # How far what is drawn runs on behind the adjoining walls, the floor and the ceiling.
 _BEYOND_M: Final = 0.1
@@ -129,8 +139,7 @@ def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
 
 
 def _draw_walls(sides: tuple[Side, ...], plan: RoomPlan, rng: np.random.Generator) -> None:
-    for side, (name, rgb, (a0, a1), seed) in zip(sides, _DRAWN, strict=True):
-        ground = Paint(kind=TextureKind.FRESCO, rgb=rgb, reflectance=0.5, period_m=0.34, seed=seed)
+    for side, (name, ground, (a0, a1)) in zip(sides, _DRAWN, strict=True):
         drawing = WallDrawing(
             full=_FULL,
             shown=(a0, a1, FLOOR_M, CEILING_M),

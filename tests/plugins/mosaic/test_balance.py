@@ -9,9 +9,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as balancing
-from orthoflow_plugins.mosaic.balance import Balance, Exposures, Radii, balance_of, estimate
+from orthoflow_plugins.mosaic.balance import (
+    Balance,
+    Exposures,
+    Radii,
+    balance_of,
+    estimate,
+    with_seams,
+)
 from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.light import BlockLight, block_light, light_of_levels, lit
+from orthoflow_plugins.mosaic.light import (
+    BlockLight,
+    block_light,
+    inside,
+    light_of_levels,
+    lit,
+    pairs,
+)
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates
 
@@ -127,6 +141,18 @@ def test_without_gains_colours_stay_untouched(tmp_path: Path) -> None:
     assert not factors(images, layers).any()
 
 
+def test_without_a_feather_each_cell_is_as_its_layer_is_balanced(tmp_path: Path) -> None:
+    layers = two_photos(np.linspace(0.5, 0.8, SHAPE[0])[:, None, None])
+    images, _ = mosaic(tmp_path, layers, feather_cells=0, local_balance=False)
+    balance = balance_of(layers, None, [None, None], is_local=False)
+    assert balance is not None
+    (image,) = images.images
+    for index, one in enumerate(layers):
+        at = np.nonzero(image.source == index)
+        assert len(at[0]) > 1000
+        np.testing.assert_array_equal(image.rgb[at], balance.shown(index, one.rgb[at], *at))
+
+
 def surface(depth_m: NDArray[np.float32]) -> Walls:
     frame = inspect_scenes.frame(shape=SHAPE)
     wall = samples.wall(frame, depth_m=depth_m, mask=np.ones(SHAPE, dtype=np.uint8))
@@ -179,10 +205,18 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
     at = np.linspace(0.0, 0.75, 6)
     loss = found.lenses[0, 0] * at**2 + found.lenses[0, 1] * at**4
     np.testing.assert_allclose(loss, 0.1 * at**2 + 0.3 * at**4, atol=0.02)
+    balanced = [
+        one.log_light + found.logs(k, one, seen)
+        for k, (one, seen) in enumerate(zip(lights, radii, strict=True))
+    ]
+    for i, j, shared in pairs(lights):
+        one, other = (balanced[k][inside(shared, lights[k].box)] for k in (i, j))
+        assert np.median(np.abs(one - other)) < 0.02
     # Where nothing overlaps nothing is changed.
     alone = estimate(lights[:1], radii[:1])
     assert not alone.exposures.any()
     assert not alone.nodes.any()
+    assert (alone.lenses.shape, alone.nodes.shape) == ((1, 2), (1, 4, 4, 3))
 
 
 # --- the pieces ---
@@ -245,6 +279,32 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
     if found is not None:
         apart = found.exposures.exposures[0] - found.exposures.exposures[1]
         np.testing.assert_allclose(apart, np.log(factor), atol=2e-3)
+
+
+def test_one_layer_needs_no_balance_and_lenses_count_where_fields_do() -> None:
+    pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
+    assert balance_of(pair[:1], None, [None], is_local=True) is None
+    for is_local in (False, True):
+        found = balance_of(pair, None, cameras, is_local=is_local)
+        assert found is not None
+        assert len(found.exposures.lenses) == is_local
+
+
+def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere() -> None:
+    bend = np.ones(SHAPE)
+    bend[60:] = 0.8
+    found = balance_of(two_photos(bend[..., None]), None, [None, None], is_local=False)
+    assert found is not None
+    source = np.zeros(SHAPE, dtype=np.int16)
+    source[:, 120:] = 1
+    steps = np.add(*np.indices(SHAPE)) % 2 * np.float32(0.5)
+    (flat,), (rough,) = (surface(depth).walls for depth in (0.0 * steps, steps))
+    plain = with_seams(found, source, None, feather_cells=20)
+    for wall, expected in ((None, plain), (flat, plain), (rough, found)):
+        joined = with_seams(found, source, wall, feather_cells=20)
+        for logs, wanted in zip(joined.logs, expected.logs, strict=True):
+            np.testing.assert_array_equal(logs, wanted)
+    assert max(np.abs(a - b).max() for a, b in zip(plain.logs, found.logs, strict=True)) > 0.03
 
 
 def photographed(fx: float, width: int = 400, height: int = 300) -> Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from orthoflow_plugins.mosaic import blocks, graph_cut
 from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.depth_edges import depth_edges
+from orthoflow_plugins.mosaic.depth_edges import depth_edges, depth_edges_in
 from orthoflow_plugins.mosaic.graph_cut import CutLabels
+from orthoflow_plugins.mosaic.light import lit_shares
 
 from orthoflow.products import LayerMask
 
@@ -35,6 +37,36 @@ def test_blocks_have_rows_and_columns_of_their_own() -> None:
     blocks = Blocks.over((6, 4), 3)
     assert blocks.rows.tolist() == [0, 3, 6]
     assert blocks.columns.tolist() == [0, 2, 4]
+
+
+def test_blocks_of_a_box_count_from_its_first_cell() -> None:
+    whole = Blocks.over((48, 70), 10)
+    part = whole.within((slice(1, 3), slice(2, 6)))
+    assert part.shape == (2, 4)
+    np.testing.assert_array_equal(part.rows, whole.rows[1:4] - whole.rows[1])
+    np.testing.assert_array_equal(part.columns, whole.columns[2:7] - whole.columns[2])
+
+
+def test_means_of_blocks_do_not_hang_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(1).normal(size=(48, 70))
+    of = Blocks.over((48, 70), 10)
+    monkeypatch.setattr(blocks, "row_bands", lambda _: [slice(0, 2), slice(2, 3), slice(3, 5)])
+    found = blocks.block_means(lambda rows: values[rows], of)
+    for row, column in np.ndindex(of.shape):
+        cells = of.cells((slice(row, row + 1), slice(column, column + 1)))
+        assert found[row, column] == pytest.approx(values[cells].mean())
+
+
+def test_depth_edges_of_some_rows_are_those_of_the_whole() -> None:
+    depth_m = np.random.default_rng(2).choice([0.0, 0.02, 0.05], (12, 7)).astype(np.float32)
+    one = depth_edges(depth_m)
+    # On either side of an edge: right and down, left and up.
+    either = one | depth_edges(depth_m[::-1, ::-1])[::-1, ::-1]
+    for parts in ((0, 12), (0, 1, 5, 12), (0, 3, 4, 11, 12)):
+        found = [
+            depth_edges_in(depth_m, slice(start, stop)) for start, stop in itertools.pairwise(parts)
+        ]
+        np.testing.assert_array_equal(np.concatenate(found), either)
 
 
 def test_a_cell_takes_the_layer_of_its_block() -> None:
@@ -145,6 +177,47 @@ def test_a_step_in_depth_costs_as_much_as_one_from_black_to_white() -> None:
     # A photo half as good costs as much as a difference of a twentieth between black and white.
     np.testing.assert_allclose(reduced.views[1, 0, 2:], 0.05)
     assert (reduced.views[1, 0, :2] >= 1000.0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
+    dtype: type[np.unsignedinteger],
+) -> None:
+    rng = np.random.default_rng(3)
+    highest = int(np.iinfo(dtype).max)
+    layers = two_layers((4, 6), (0, 0))
+    for layer in layers:
+        layer.rgb = rng.integers(0, highest // 2, (4, 6, 3)).astype(dtype)
+        layer.mask[1, 3:] = layer.mask[3, 5] = LayerMask.OCCLUDED
+        layer.rgb[layer.mask != LayerMask.PAINTED] = 0
+    blocks_of = Blocks.over((4, 6), 2)
+    means = np.zeros((2, 2, 3, 3))
+    for k, row, column in np.ndindex(2, 2, 3):
+        part = np.s_[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+        known = layers[k].rgb[part][layers[k].mask[part] == LayerMask.PAINTED]
+        means[k, row, column] = known.mean(axis=0) / highest if len(known) else 0.0
+    plain = graph_cut._reduced(layers, None, blocks_of, None)
+    np.testing.assert_allclose(plain.colours, means, atol=1e-6)
+    # Each in the cell in the middle of its block.
+    balance: Any = SimpleNamespace(
+        log_gains=lambda k, rows, columns: (
+            (0.1 * k + 0.2 * rows - 0.1 * columns)[:, None] * np.ones(3)
+        )
+    )
+    balanced = graph_cut._reduced(layers, None, blocks_of, balance)
+    for k, row, column in np.ndindex(2, 2, 3):
+        gain = np.full((1, 3), 0.1 * k + 0.2 * (2 * row + 1) - 0.1 * (2 * column + 1))
+        wanted = lit_shares(means[k, row, column][None], gain)[0]
+        np.testing.assert_allclose(balanced.colours[k, row, column], wanted, atol=1e-6)
+
+
+def test_what_no_layer_paints_has_no_label() -> None:
+    layers = two_layers((4, 12), (9, 9))
+    for layer in layers:
+        layer.mask[:, 9:] = LayerMask.OUTSIDE
+    small = graph_cut.cut_labels(layers, None).small
+    assert np.unique(small[:, :9]).tolist() == [0]
+    assert np.unique(small[:, 9:]).tolist() == [-1]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import seams
+from orthoflow_plugins.mosaic.agreement import count_seams
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
@@ -150,7 +151,9 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     assert metrics.pop("n_orthoimages") == 1
     assert metrics.pop("n_sources") == 2
     assert metrics.pop("n_overlap_patches") == 0
-    assert 0.0 < metrics.pop("seam_share") < 1.0
+    n_seam, _ = count_seams(image.source, None)
+    assert n_seam > 0
+    assert metrics.pop("seam_share") == n_seam / np.count_nonzero(image.source >= 0)
     # Colours of chance: their differences have a standard deviation of 70 grey levels.
     assert 20.0 < metrics.pop("seam_step_rms_grey") < 150.0
     assert metrics.pop("seam_step_mean_delta_e") > 10.0
@@ -267,6 +270,20 @@ def test_cells_that_no_photo_shows_are_told_of_with_their_cause(
     assert "10% have no surface" in warning
 
 
+@pytest.mark.parametrize(("n_cells", "is_told"), [(15, False), (17, True)])
+def test_causes_of_a_hundredth_of_the_cells_are_told(
+    tmp_path: Path, n_cells: int, *, is_told: bool
+) -> None:
+    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
+    mask[:10], mask[39, :n_cells] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
+    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    (warning,) = ctx.warnings
+    assert ("1% have no surface" in warning) == is_told
+
+
 @pytest.mark.parametrize(("n_rows", "is_told"), [(3, False), (5, True)])
 def test_empty_cells_of_the_raster_alone_and_few_others_are_not_told_of(
     tmp_path: Path, n_rows: int, *, is_told: bool
@@ -278,6 +295,14 @@ def test_empty_cells_of_the_raster_alone_and_few_others_are_not_told_of(
     inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
     MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
     assert len(ctx.warnings) == is_told
+
+
+def test_photos_whose_camera_is_not_known_have_no_lens() -> None:
+    known, unknown = (
+        SimpleNamespace(photo=f"{status}.jpg", status=status) for status in ("ok", "failed")
+    )
+    cameras: Any = SimpleNamespace(cameras=(unknown, known))
+    assert seams._oriented(cameras) == {"ok.jpg": known}
 
 
 def test_a_layer_without_paint_is_no_source_but_tells_what_is_hidden(tmp_path: Path) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.ortho import dsm_backward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.layers import CellCounts
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
@@ -413,7 +418,9 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
 
 def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
     where = scenes.frame()
-    ctx = context(tmp_path)
+    # A clock that goes on by a second when it is asked.
+    clock = count()
+    ctx = dataclasses.replace(context(tmp_path), clock_s=lambda: float(next(clock)))
     inputs = DsmBackward.In(
         walls=scenes.walls(where),
         photos=scenes.photos(scenes.rendered()),
@@ -423,11 +430,49 @@ def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
     (layer,) = run(inputs, ctx).layers
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["n_layers"] == 1
+    # What stands about is gathered once, and looked at from each photo.
+    seconds = [metrics[f"{name}_s"] for name in ("occluders", "decoding", "painting")]
+    assert seconds == [2.0, 1.0, 1.0]
+    assert ctx.warnings == []
     assert metrics["painted_share"] == np.mean(layer.mask == LayerMask.PAINTED)
     assert metrics["occluded_share"] == np.mean(layer.mask == LayerMask.OCCLUDED)
     # 2.1 m along the axis, a focal length of 1505 pixels; 0.7 m aside of 2 m before the wall.
     assert metrics["photo_gsd_mm"] == pytest.approx(1e3 * 2.1 / 1505, rel=0.02)
     assert metrics["obliquity_deg"] == pytest.approx(np.degrees(np.arctan2(0.7, 2.0)), abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "weights", "median"),
+    [
+        ([3.0, 1.0, 2.0], [1, 1, 1], 2.0),
+        ([3.0, 1.0, 2.0], [5, 2, 2], 3.0),
+        ([3.0, 1.0, 2.0], [1, 1, 2], 2.0),
+        ([2.0, 1.0], [1, 1], 1.0),
+        ([2.0, 1.0], [3, 2], 2.0),
+    ],
+)
+def test_half_of_the_weight_lies_below_the_median(
+    values: list[float], weights: list[int], median: float
+) -> None:
+    assert dsm_backward._weighted_median(np.array(values), np.array(weights)) == median
+
+
+def test_walls_without_a_surface_have_no_share_of_anything(tmp_path: Path) -> None:
+    part: Any = SimpleNamespace(
+        layers=(),
+        n_cells=np.array([3, 1]),
+        photo_gsd_m=np.array([0.002, 0.003]),
+        obliquity_deg=np.array([10.0, 40.0]),
+        seconds={"painting_s": 2.0},
+    )
+    for n_surface, share in ((0, 0.0), (8, 0.5)):
+        ctx = context(tmp_path)
+        counts = CellCounts(n_surface=n_surface, n_painted=n_surface // 2, n_hidden=n_surface // 4)
+        dsm_backward._report(ctx, counts, [part, part])
+        told = {metric.name: metric.value for metric in ctx.metrics}
+        assert (told["painted_share"], told["occluded_share"]) == (share, share / 2)
+        assert (told["photo_gsd_mm"], told["obliquity_deg"]) == (2.0, 10.0)
+        assert (told["n_layers"], told["painting_s"], told["decoding_s"]) == (0, 4.0, 0.0)
 
 
 def refused(cameras: Cameras, folder: Path, **changes: object) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -72,6 +74,7 @@ def test_what_is_hidden_stays_unpainted_and_nearly_all_else_is_painted(aside_m: 
     assert np.mean(layer.mask[is_behind_board] == LayerMask.OCCLUDED) > 0.99
     assert np.mean(layer.mask[is_visible] == LayerMask.PAINTED) > 0.96
     assert (layer.quality[layer.mask != LayerMask.PAINTED] == 0.0).all()
+    assert not layer.rgb[layer.mask != LayerMask.PAINTED].any()
 
 
 def test_quality_and_reach_are_those_of_the_backward_projection(tmp_path: Path) -> None:
@@ -99,7 +102,12 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     gsd = 2.0 / (1.5 * 300)
     painted = np.mean(holed.mask == LayerMask.PAINTED)
     assert painted <= 1.1 * (where.gsd_m / gsd) ** 2
-    closed = thrown(given, context(tmp_path / "closed"), fill_gap_cells=2)
+    clock = count()
+    ctx = replace(context(tmp_path / "closed"), clock_s=lambda: float(next(clock)))
+    closed = thrown(given, ctx, fill_gap_cells=2)
+    # Of a clock that goes on when it is asked: once for all photos, and for each.
+    told = {metric.name: metric.value for metric in ctx.metrics}
+    assert (told["occluders_s"], told["painting_s"]) == (2.0, 1.0)
     assert closed.filled is not None
     assert np.mean(closed.mask == LayerMask.PAINTED) > 0.97
     is_old = (closed.mask == LayerMask.PAINTED) & (closed.filled == 0)

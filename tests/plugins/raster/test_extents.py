@@ -15,7 +15,7 @@ from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.sampled_points import sampled
 
-from orthoflow.products import Planes, PointCloud, Walls
+from orthoflow.products import Planes, PointCloud, Thickness, Walls
 from tests import raster_scenes as scenes
 from tests import samples
 
@@ -414,6 +414,10 @@ def test_a_plane_bounds_the_side_that_it_lies_beside(
     assert found.noise_m == pytest.approx(3.0 * NOISE_M)
     assert found.line_m == pytest.approx(beyond_m - 3.0 * NOISE_M)
     assert bound_by(place, rms_m=np.full(2, 0.01)).noise_m == 0.02
+    # Of what the plane is thick by, relief apart, where that is known.
+    thick = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.01)
+    for thickness, noise_m in (((None, thick), 0.006), ((thick, None), 3.0 * NOISE_M)):
+        assert bound_by(place, thickness=thickness).noise_m == pytest.approx(noise_m)
     # Positive inside: at the middle of the wall by as much as that is away.
     middle = found.offset_m + found.slopes @ [0.5 * WIDTH_M, 0.5 * HEIGHT_M, 0.2]
     away = 0.5 * (WIDTH_M if side in ("left", "right") else HEIGHT_M) + beyond_m
@@ -496,6 +500,7 @@ def test_what_lies_well_before_or_behind_a_wall_and_no_farther_than_a_metre_stan
     ("share", "before_m", "off_m", "stands"),
     [
         (0.32, 0.5, 0.0, True),
+        (0.3, 0.5, 0.0, True),
         (0.28, 0.5, 0.0, False),
         (0.32, -0.5, 0.0, True),
         (0.32, 0.5, 0.0029, True),

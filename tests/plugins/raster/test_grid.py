@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.raster import grid
+from orthoflow_plugins.raster.extents import Extent
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.errors import MethodError, OrthoflowError
@@ -346,4 +348,43 @@ def test_metrics_and_a_picture_of_the_depth_are_reported(tmp_path: Path) -> None
     assert metrics["n_points_inside"] == 1200
     assert metrics["measured_share"] == 1.0
     assert metrics["void_share"] == metrics["recovered_share"] == 0.0
+    assert not any("balance" in said for said in ctx.warnings)
     assert [figure.name for figure in ctx.figures] == ["depth"]
+
+
+@pytest.mark.parametrize(("away_m", "is_told"), [(0.95, False), (1.05, True)])
+def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
+    tmp_path: Path, away_m: float, *, is_told: bool
+) -> None:
+    known = scenes.leaning_wall()
+    planes = known.planes()
+    params = RasterGrid.Params.model_validate(
+        {"gsd_m": known.gsd_m, "near": [(planes.corners[0, 1] + away_m * known.normal).tolist()]}
+    )
+    ctx = scenes.context(tmp_path)
+    extent = Extent(front_m=0.1, behind_m=0.1)
+    assert list(grid._crops(planes, params, lambda _: extent, ctx)) == [0]
+    assert any(f"is {away_m:.2f} m away: check the" in said for said in ctx.warnings) == is_told
+
+
+@pytest.mark.parametrize(
+    ("askew_m", "told"),
+    [(0.029, None), (0.031, "log"), (0.069, "log"), (0.071, "warn")],
+)
+def test_what_an_adjoining_plane_cuts_off_is_told_of_beyond_a_cell_and_warned_of_from_5_cm(
+    tmp_path: Path, askew_m: float, told: str | None
+) -> None:
+    known = scenes.leaning_wall()
+    heard: list[str] = []
+    ctx = dataclasses.replace(
+        scenes.context(tmp_path), listen=lambda event: heard.append(event.kind)
+    )
+    frame = samples.facing_south(0.01, 20, 10)
+    extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
+    # Of which a margin takes two centimetres.
+    grid._log_cuts({0: frame}, known.planes(), lambda _: extent, ctx, margin_m=0.02)
+    assert len(heard) == (told is not None)
+    assert len(ctx.warnings) == (told == "warn")
+    if told == "warn":
+        assert "at its left runs askew" in ctx.warnings[0]
+        assert "up to 51 mm of the wall are left out" in ctx.warnings[0]

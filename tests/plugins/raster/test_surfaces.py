@@ -44,6 +44,37 @@ def scattered(
     return cloud, places, depths_m
 
 
+def test_intensity_and_colour_are_carried_to_the_centres_of_cells_alone_and_together(
+    tmp_path: Path,
+) -> None:
+    known = scenes.leaning_wall(shape=(20, 30))
+    cloud, places, _ = scattered(known, per_cell=1.5)
+    # Both rise along the wall: carried to its centre, a cell has what lies there.
+    rising = (places[:, 0] / 30.0).astype(np.float32)
+    cloud = dataclasses.replace(
+        cloud,
+        intensity=rising,
+        rgb=np.repeat(np.rint(255.0 * rising)[:, None], 3, axis=1).astype(np.uint8),
+    )
+    clouds = (
+        cloud,
+        dataclasses.replace(cloud, rgb=None),
+        dataclasses.replace(cloud, intensity=None),
+    )
+    (both,), (no_rgb,), (no_intensity,) = (
+        rastered(one, known, scenes.context(tmp_path), recover_gap_cells=0).walls for one in clouds
+    )
+    assert both.intensity is not None
+    assert both.rgb is not None
+    assert no_rgb.rgb is None
+    np.testing.assert_array_equal(no_rgb.intensity, both.intensity)
+    np.testing.assert_array_equal(no_intensity.rgb, both.rgb)
+    few = (both.count == 1) & np.isfinite(both.depth_m)
+    off = np.abs(both.intensity - (np.arange(30) + 0.5) / 30.0)[few]
+    # Points lie a quarter of a cell beside the centre on average.
+    assert np.median(off) < 0.1 * 0.25 / 30.0
+
+
 @pytest.mark.parametrize("cores", [1, 2])
 def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path, cores: int) -> None:
     known = scenes.leaning_wall(shape=(40, 60))
@@ -62,6 +93,8 @@ def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path, cores:
     assert wall.intensity is not None
     np.testing.assert_array_equal(wall.intensity[measured], cloud.intensity[nearest[measured]])
     assert np.isnan(wall.depth_m[~measured]).all()
+    assert wall.rgb is not None
+    assert not wall.rgb[~measured].any()
     assert wall.count.sum() == len(places)
 
 
@@ -159,15 +192,15 @@ def test_percentiles_are_numpys(tmp_path: Path) -> None:
     depths_m = rng.normal(0.0, 0.03, 57)
     points = known.world(rng.uniform(3, 4, 57), rng.uniform(4, 5, 57), depths_m)
     walls = rastered(
-        scenes.cloud_of(points), known, scenes.context(tmp_path), percentiles=[0, 10, 50, 97.5]
+        scenes.cloud_of(points), known, scenes.context(tmp_path), percentiles=[0, 10, 50, 99]
     )
     wall = walls.walls[0]
     assert wall.percentiles_m is not None
     np.testing.assert_allclose(
-        wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 97.5]), atol=1e-6
+        wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 99]), atol=1e-6
     )
     assert np.isnan(wall.percentiles_m[4, 4]).all()
-    assert walls.percentiles == (0, 10, 50, 97.5)
+    assert walls.percentiles == (0, 10, 50, 99)
 
 
 def test_depths_sorted_a_few_at_a_time_give_the_same_medians_and_percentiles(

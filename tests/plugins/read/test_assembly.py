@@ -11,10 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.read import assembly
 from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
 
 from orthoflow.errors import InputError, StoreError
 from orthoflow.files.points.blocks import PointBlock, PointField, ScanFile
+from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 
 FIELDS: tuple[PointField, ...] = ("intensity", "rgb", "grid")
@@ -247,7 +249,7 @@ def test_there_is_room_for_every_array_of_a_point(
     growing._store_scan(1, slice(0, 1))
     n_bytes = sum(path.stat().st_size for path in (tmp_path / "allocated").iterdir())
     assert n_bytes == 1000 * (6 * 4 + 3 + 2)
-    for free, is_enough in ((n_bytes, False), (2 * n_bytes, True)):
+    for free, is_enough in ((n_bytes, False), (39_999, False), (40_000, True)):
         monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
         folder = tmp_path / f"{free}"
         folder.mkdir()
@@ -257,6 +259,18 @@ def test_there_is_room_for_every_array_of_a_point(
             with pytest.raises(StoreError, match="1000 points need"):
                 CloudAssembly(context(folder), [many], 1.0)
             assert list(folder.iterdir()) == []
+
+
+def test_points_that_can_all_be_used_are_not_copied() -> None:
+    points = np.random.default_rng(2).uniform(-FARTHEST_M, FARTHEST_M, (50, 3))
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    assert assembly._usable(points, bounds) == slice(None)
+    points[[7, 9], [0, 2]] = (1.1 * FARTHEST_M, np.nan)
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    np.testing.assert_array_equal(
+        np.flatnonzero(~assembly._usable(points, bounds)),  # type: ignore[operator]
+        [7, 9],
+    )
 
 
 # --- how coordinates are rounded ---

@@ -56,7 +56,8 @@ def test_a_plan_follows_up_and_bears_a_single_place() -> None:
     # Seen along y: what lies along z is across the view.
     shown = pixels(plan_view_png(cloud_of(points, up=(0.0, 1.0, 0.0))))
     assert sorted(shown.shape) == [pytest.approx(160, abs=3), 640]
-    assert pixels(plan_view_png(cloud_of(np.ones((5, 3))))).shape == (1, 1)
+    for n_points, grey in ((1, 177), (2, 255), (5, 255)):
+        assert pixels(plan_view_png(cloud_of(np.ones((n_points, 3))))).tolist() == [[grey]]
 
 
 # --- as its scanner saw it ---
@@ -104,6 +105,8 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
         cloud = replace(cloud, column=29 - cloud.column)
     if upside_down:
         cloud = replace(cloud, row=19 - cloud.row)
+    here = np.array([400.0, -300.0, 50.0])
+    cloud = replace(cloud, origin=here, stations=here[None])
     shown = pixels(polar_view_png(cloud))
     assert np.abs(shown.astype(int) - truth).max() <= 1
     assert shown[16, 25] == 0
@@ -111,6 +114,10 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
 
 def test_a_scan_without_a_station_is_shown_with_its_rows_upwards() -> None:
     cloud = scanned()
+    # Glints and what swallows light are as bright and as dark as the next.
+    intensity = cloud.intensity.copy()  # type: ignore[union-attr]
+    intensity[[100, 300, 500]], intensity[[200, 400]] = 9.0, -9.0
+    cloud = replace(cloud, intensity=intensity)
     truth = expected_grey(cloud, 20, 30)[::-1]
     for blind in (
         replace(cloud, stations=None, stations_source=None),
@@ -123,6 +130,7 @@ def test_the_scan_with_most_points_is_shown() -> None:
     cloud = scanned()
     scan = np.where(cloud.column < 10, 0, 1).astype(np.uint16)
     both = replace(cloud, scan=scan, stations=np.zeros((2, 3)), column=cloud.column + 5)
+    both = replace(both, row=cloud.row + 7)
     shown = pixels(polar_view_png(both))
     assert shown.shape == (20, 20)
     # A station that is not known tells no side.
@@ -183,6 +191,7 @@ def test_the_wall_is_seen_from_the_station() -> None:
     for station_y, sense in ((-2.0, 1), (2.0, -1)):
         shown = pixels(scan_lines_png(wall_scan(station_y=station_y)))
         is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
+        assert np.unique(shown[is_point]).tolist() == [40, 160]
         columns = np.nonzero(is_point)[1]
         bright = columns[shown[is_point][:, 0] > 100].mean()
         assert np.sign(bright - 600) == sense
@@ -194,6 +203,15 @@ def test_broken_lines_are_not_joined_over_gaps() -> None:
     shown = pixels(scan_lines_png(some_of(cloud, kept)))[..., ::-1]
     hole = shown[:, 470:660]
     assert not (hole == figures._ROW_RGB).all(axis=2).any()
+
+
+def test_lines_that_bend_end_where_their_points_end() -> None:
+    cloud = wall_scan()
+    z = cloud.z + 0.3 * np.sin(np.pi * cloud.column / 199.0).astype(np.float32)
+    shown = pixels(scan_lines_png(replace(cloud, z=z)))[..., ::-1]
+    n_rows = (shown == figures._ROW_RGB).all(axis=2).sum(axis=0)
+    # Of 27 lines across a column of the picture, no more lead back to where they began.
+    assert 20 < np.median(n_rows) < 34
 
 
 def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
@@ -212,6 +230,75 @@ def test_clouds_without_a_grid_have_no_lines() -> None:
     assert scan_lines_png(replace(cloud, row=None, column=None)) is None
     bare = pixels(scan_lines_png(replace(cloud, intensity=None)))
     assert bare.shape[1] == 1200
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 46.0, 90.0, 178.0])
+@pytest.mark.parametrize("distance_m", [-3.68, 0.32, 7.43])
+def test_the_fullest_wall_is_found_to_a_degree_and_half_a_cell(
+    angle_deg: float, distance_m: float
+) -> None:
+    angle = np.radians(angle_deg)
+    along, away = (
+        np.array([np.cos(angle), np.sin(angle)]),
+        np.array([np.sin(angle), -np.cos(angle)]),
+    )
+    rng = np.random.default_rng(4)
+    wall = np.linspace(-4.0, 4.0, 400)[:, None] * along + distance_m * away
+    # A shorter wall across, things that stand about, and a fuller one far off.
+    shorter = np.linspace(-2.0, 2.0, 200)[:, None] * away
+    far = 1500.02 * along + np.linspace(0.0, 20.0, 450)[:, None] * away
+    plan = np.concatenate([wall, shorter, rng.uniform(-4.0, 4.0, (300, 2)), far])
+    found, found_m = figures._fullest_wall(plan)
+    np.testing.assert_allclose(found, along, atol=1e-9)
+    assert found_m == pytest.approx(distance_m, abs=0.025)
+    # Every point is looked at, whichever come first.
+    mixed = np.stack([rng.uniform(-4.0, 4.0, (400, 2)), wall], axis=1).reshape(-1, 2)
+    np.testing.assert_allclose(figures._fullest_wall(mixed)[0], along, atol=1e-9)
+    # As far as a kilometre off it counts.
+    plan[900:] -= 600.0 * along
+    found, _ = figures._fullest_wall(plan)
+    np.testing.assert_allclose(np.abs(found @ away), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("before_m", "is_drawn"), [(0.1, True), (0.2, False)])
+def test_what_lies_fifteen_centimetres_beside_the_wall_is_drawn(
+    before_m: float, is_drawn: bool
+) -> None:
+    cloud = wall_scan()
+    above = np.flatnonzero((cloud.row >= 40) & (cloud.column < 60))
+    y = cloud.y.copy()
+    y[above] -= before_m
+    shown = pixels(scan_lines_png(replace(cloud, y=y)))
+    is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
+    assert is_point[:280, 50:400].any() == is_drawn
+    assert is_point[320:, 50:400].any()
+
+
+def test_a_line_breaks_where_a_step_is_six_times_as_long_as_usual() -> None:
+    steps = np.array([2, 2, 3, 2, 12, 2, 13, 2, 2, 40, 2])
+    line = np.column_stack([np.cumsum([5, *steps]), np.full(12, 7)])
+    pieces = figures._unbroken(line)
+    assert [piece[:, 0].tolist() for piece in pieces] == [
+        [5, 7, 9, 12, 14, 26, 28],
+        [41, 43, 45],
+        [85, 87],
+    ]
+    # Points that lie on one another have steps of a pixel.
+    dense = np.column_stack([[0, 0, 0, 0, 6, 6, 13], np.zeros(7, dtype=np.int64)])
+    assert [len(piece) for piece in figures._unbroken(dense)] == [6, 1]
+    assert [len(piece) for piece in figures._unbroken(line[:1])] == [1]
+
+
+def test_about_two_dozen_lines_are_drawn_each_in_its_order() -> None:
+    lines = np.repeat(np.arange(10, 105), 3)
+    order = np.tile([2, 0, 1], 95)
+    found = list(figures._some_lines(lines, order))
+    # Every third of 95.
+    assert [int(lines[mine[0]]) for mine in found] == list(range(10, 105, 3))
+    for mine in found:
+        assert order[mine].tolist() == [0, 1, 2]
+        assert len(set(lines[mine])) == 1
+    assert len(list(figures._some_lines(lines[:90], order[:90]))) == 30
 
 
 # --- the sheet ---
@@ -255,6 +342,16 @@ def test_sheets_hold_no_more_than_a_hundred_photos_and_twelve_hundred_pixels() -
         sheet.add(f"{k}", np.zeros((50, 50, 3), dtype=np.uint8))
     shown: Any = np.array(sheet.encoded())
     assert shown.shape[:2] == (10 * (90 + 18 + 12), 1200)
+
+
+@pytest.mark.usefixtures("_exact_sheets")
+def test_a_photo_of_one_row_is_a_line() -> None:
+    for shape, size in (((1, 3000), (1, 288)), ((3000, 1), (270, 1))):
+        sheet = ContactSheet(1)
+        sheet.add("", np.zeros((*shape, 3), dtype=np.uint8))
+        shown: Any = np.array(sheet.encoded())
+        rows, columns = np.nonzero((shown == 0).all(axis=2))
+        assert (len(set(rows)), len(set(columns))) == size
 
 
 def test_long_names_are_cut_in_the_middle() -> None:

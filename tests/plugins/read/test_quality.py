@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +256,9 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
         "the scans disagree: where two show one surface they lie 9.4 mm apart across it (median), "
         "while each scatters by 3.1 mm: register them again, or take one at a time"
     )
+    thin = context(tmp_path)
+    report_quality(replace(quality, scan_step_m=0.0032, scans_apart_m=0.003), thin)
+    assert thin.warnings == []
     quiet = context(tmp_path)
     report_quality(None, quiet)
     assert (quiet.metrics, quiet.warnings) == ([], [])

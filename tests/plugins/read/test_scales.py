@@ -22,6 +22,7 @@ SEEN = "range of the data"
         ((-0.000_005, 10.0), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
         ((0.0, 10.000_02), [(0.0, 10.0)], None, (0.0, 10.000_02, SEEN)),
         ((-0.000_02, 10.0), [(0.0, 10.0)], None, (-0.000_02, 10.0, SEEN)),
+        ((100.0, 110.000_1), [(100.0, 110.0)], None, (100.0, 110.000_1, SEEN)),
         ((2.0, 9.0), [(0.0, 10.0), None], None, (2.0, 9.0, SEEN)),
         ((2.0, 9.0), [], None, (2.0, 9.0, SEEN)),
         ((7.0, 7.0), [], None, (0.0, 7.0, "0 to the only value")),
@@ -40,9 +41,10 @@ def test_one_scale_serves_all_scans(
 
 def test_intensities_go_from_nought_to_one_and_the_rest_is_clipped_and_counted() -> None:
     scale = IntensityScale(low=10.0, high=30.0, rule="")
-    values = np.array([10.0, 20.0, 30.0, 5.0, 40.0, np.nan, np.inf], dtype=np.float32)
-    assert normalise(values, scale) == 3
-    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.0])
+    values = np.array([10.0, 20.0, 30.0, 5.0, 40.0, np.nan, np.inf, -np.inf])
+    values = values.astype(np.float32)
+    assert normalise(values, scale) == 4
+    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     # A millionth beyond is not worth counting.
     near = np.array([30.0 + 1e-5, 10.0 - 1e-5], dtype=np.float64).astype(np.float32)
     assert normalise(near, scale) == 0
@@ -85,7 +87,7 @@ def test_grey_is_alike_in_all_channels() -> None:
     assert scales.is_grey(rgb)
     for channel in (0, 2):
         other = rgb.copy()
-        other[2, channel] = 91
+        other[3, channel] = 91
         assert not scales.is_grey(other)
 
 
