@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.garbage import collect_garbage
-from orthoflow.engine.objects import files_of
+from orthoflow.engine.objects import EarlierProduct, files_of
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,
@@ -256,6 +256,37 @@ def test_a_link_in_the_place_of_an_object_is_none(store: Store) -> None:
     link = folder.with_name("0" * 64)
     link.symlink_to(folder)
     assert files_of(link) == {}
+
+
+def test_a_product_of_an_earlier_version_is_taken_for_what_its_name_says(store: Store) -> None:
+    ref = store.put_product(heights())
+    folder = object_folder(store, ref)
+    (folder / "object.json").unlink()
+    earlier = EarlierProduct(type="heights", size_bytes=7, publisher="p0")
+    other = folder.rename(folder.with_name("0" * 64))
+    assert store._adopt(other, earlier) is False
+    folder = other.rename(folder)
+    content = (folder / "product.h5").read_bytes()
+    (folder / "product.h5").write_bytes(content[:100])
+    assert store._adopt(folder, earlier) is False
+    assert not (folder / "object.json").exists()
+    (folder / "product.h5").write_bytes(content)
+    assert store._adopt(folder, earlier) is True
+    assert store.is_sound(ref.digest)
+
+
+def test_only_what_is_there_and_damaged_is_set_aside(store: Store) -> None:
+    ref = store.put_product(heights())
+    folder = object_folder(store, ref)
+    # Another run may have put a sound one there meanwhile.
+    assert store._set_aside(folder, lambda: False) is False
+    assert store._set_aside(folder.with_name("0" * 64), lambda: True) is False
+    assert not store.damaged.exists()
+    assert store._set_aside(folder, lambda: True) is True
+    assert not folder.exists()
+    (aside,) = store.damaged.iterdir()
+    assert aside.name.startswith(f"{folder.name}-")
+    assert (aside / "product.h5").exists()
 
 
 def test_a_disk_that_cannot_be_read_is_no_damage(
