@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.camera_kernels import largest_radius, project_point
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.compiling import interpreted
 from orthoflow.geometry.lenses import LensFreedom, linearised, stepped
@@ -151,3 +151,21 @@ def test_a_mirroring_rotation_is_refused() -> None:
             width=3, height=2, fx=1, fy=1, cx=1, cy=1, distortion=np.zeros(5),
             rotation=np.diag([1.0, 1.0, -1.0]), translation=np.zeros(3),
         )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("distortion", "radius"),
+    [
+        ([0.0, 0.0, 0.0, 0.0, 0.0], 10.0),
+        # 1 + 3 k1 r^2, 1 + 5 k2 r^4 and 1 + 7 k3 r^6 are zero.
+        ([-1.0 / 3.0, 0.0, 0.0, 0.0, 0.0], 1.0),
+        ([0.0, -1.0 / 80.0, 0.01, 0.01, 0.0], 2.0),
+        ([0.0, 0.0, 0.0, 0.0, -1.0 / 7.0], 1.0),
+        ([-1.0 / 2700.0, 0.0, 0.0, 0.0, 0.0], 10.0),
+        ([0.2, 0.0, 0.0, 0.0, 0.0], 10.0),
+    ],
+)
+def test_a_lens_is_used_to_where_it_folds_and_no_farther_than_ten(
+    distortion: list[float], radius: float
+) -> None:
+    assert largest_radius(np.array(distortion)) == pytest.approx(radius)

@@ -161,3 +161,8 @@ def test_lines_that_hardly_cross_do_not_join() -> None:
         end = (x + 4.0 * np.cos(np.radians(angle_deg)), y - 4.0 * np.sin(np.radians(angle_deg)))
         found = outline(wall((0.0, y), (x, y)), wall((x, y), end))
         assert len(found.walls) == n_joined
+
+
+def test_a_room_without_walls_has_no_outline() -> None:
+    outline = room_outline([], np.zeros((0, 4, 3)), np.array([0.0, 0.0, 1.0]))
+    assert (outline.walls, outline.chains_world, outline.floor_m) == ((), (), 0.0)

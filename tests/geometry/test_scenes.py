@@ -266,6 +266,21 @@ def test_the_edge_of_a_surface_is_as_bright_as_its_middle(supersample: int) -> N
     np.testing.assert_allclose(image.rgb, expected, atol=1e-3)
 
 
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_straight_up_and_straight_down_are_seen(up: float) -> None:
+    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-2, 2, -1, 1)}
+    # Before the middle of a cell, which lies above its head or below its feet.
+    viewers = Viewers(positions_world=np.array([[0.25, -2.0, 0.25]]), up=np.array([0.0, up, 0.0]))
+    image = render_frame(
+        a_scene([wall], []),
+        wall_frame(0.5),
+        buffer_front_m=0.1,
+        buffer_behind_m=0.1,
+        viewers=viewers,
+    )
+    assert image.seen.all()
+
+
 @pytest.mark.parametrize(("gap_m", "is_seen"), [(0.0003, True), (0.0008, False)])
 def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_seen: bool) -> None:
     sides = {"a": (1, 0, 0), "b": (0, 0, 1)}

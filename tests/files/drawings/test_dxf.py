@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.dxf import LAYERS, _add_polygon
+from orthoflow.files.drawings.dxf import LAYERS, _add_polygon, write_wall_dxf
+from orthoflow.files.drawings.room_lines import DrawnWall, room_lines
+from tests.drawing_runs import WALL, box_planes, wall_frame
 
 
 def test_layers_are_told_apart_by_their_colours() -> None:
@@ -32,3 +36,32 @@ def test_polygons_are_closed_on_paper_and_in_space(n_axes: int) -> None:
         tuple(point)[:n_axes] for point in (line.vertices() if n_axes == 2 else line.points())
     ]
     np.testing.assert_array_equal(points, corners)
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
+    tmp_path: Path, is_known: bool
+) -> None:
+    import ezdxf
+
+    planes = box_planes()
+    lines = room_lines(planes, None, {})
+    wall = DrawnWall(
+        number=WALL,
+        name="the wall",
+        plane_index=WALL if is_known else None,
+        frame=wall_frame(planes),
+        openings=(),
+    )
+    write_wall_dxf(tmp_path / "a.dxf", wall, lines)
+    space = ezdxf.readfile(tmp_path / "a.dxf").modelspace()
+    counts = Counter(entity.dxf.layer for entity in space)
+    assert counts["FRAME"] == 1
+    assert counts["RECTANGLE"] == int(is_known)
+    assert counts["PARTS"] == (len(lines.surfaces[WALL].rectangles_world) if is_known else 0)
+    # A wall of a box meets four others.
+    assert counts["EDGES"] == (4 if is_known else 0)
+    assert counts["IMAGE"] == 0
+    write_wall_dxf(tmp_path / "b.dxf", wall, None)
+    alone = ezdxf.readfile(tmp_path / "b.dxf").modelspace()
+    assert {entity.dxf.layer for entity in alone} == {"FRAME"}

@@ -90,3 +90,13 @@ def test_too_many_sheets_are_refused_before_any_is_laid_out() -> None:
 def test_round_steps() -> None:
     steps = [nice_step(least) for least in (0.011, 0.02, 0.021, 0.4, 1.0, 70.0)]
     np.testing.assert_allclose(steps, [0.02, 0.02, 0.05, 0.5, 1.0, 100.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "scale", [1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000]
+)
+def test_usual_scales_are_those_of_rulers(scale: int) -> None:
+    across, down = (1e-3 * scale * edge for edge in A3.area_mm)
+    assert fitting_scale([(across, down)], A3) == scale
+    if scale < 10_000:
+        assert fitting_scale([(1.001 * across, down)], A3) > scale
