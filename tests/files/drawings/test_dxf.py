@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from orthoflow.files.drawings.dxf import LAYERS, _add_polygon, write_wall_dxf
-from orthoflow.files.drawings.room_lines import DrawnWall, room_lines
+from orthoflow.files.drawings.room_lines import DrawnWall, Residuals, room_lines
 from tests.drawing_runs import WALL, box_planes, wall_frame
 
 
@@ -62,6 +63,25 @@ def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
     # A wall of a box meets four others.
     assert counts["EDGES"] == (4 if is_known else 0)
     assert counts["IMAGE"] == 0
+    # Of residuals on other walls there is nothing, not even how much they are enlarged.
+    shifts = np.full((2, 2), 0.01)
+    elsewhere = Residuals(
+        cell="check",
+        wall=np.array([WALL + 1, WALL]),
+        points_world=np.zeros((2, 3)),
+        displacement_m=shifts,
+        times=5.0,
+    )
+    for wall_of, n_lines, n_texts in (([WALL + 1] * 2, 0, 0), ([WALL + 1, WALL], 1, 1)):
+        residuals = replace(elsewhere, wall=np.array(wall_of))
+        write_wall_dxf(tmp_path / "c.dxf", wall, replace(lines, residuals=(residuals,)))
+        drawn = ezdxf.readfile(tmp_path / "c.dxf").modelspace().query('*[layer=="RESIDUALS"]')
+        kinds = Counter(entity.dxftype() for entity in drawn)
+        assert (kinds["LINE"], kinds["TEXT"]) == (n_lines, n_texts)
+        for line in drawn.query("LINE"):
+            # Five times as long; v goes down, Y up.
+            along = np.subtract(line.dxf.end, line.dxf.start)
+            np.testing.assert_allclose(along, [0.05, -0.05, 0.0], atol=1e-9)
     write_wall_dxf(tmp_path / "b.dxf", wall, None)
     alone = ezdxf.readfile(tmp_path / "b.dxf").modelspace()
     assert {entity.dxf.layer for entity in alone} == {"FRAME"}

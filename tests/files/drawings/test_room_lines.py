@@ -28,7 +28,7 @@ def residuals(shifts: NDArray[np.float64]) -> Residuals:
     [(0.001, 50.0), (0.002, 25.0), (0.0011, 50.0), (0.1, 1.0), (0.3, 1.0), (0.0, 1.0)],
 )
 def test_residuals_are_enlarged_so_that_people_see_them(length_m: float, times: float) -> None:
-    shifts = np.tile([0.6 * length_m, 0.0, -0.8 * length_m], (40, 1))
+    shifts = np.tile([0.6 * length_m, -0.8 * length_m], (40, 1))
     # One in twenty may be longer.
     shifts[7] *= 50.0
     found = residuals(shifts)
@@ -38,18 +38,18 @@ def test_residuals_are_enlarged_so_that_people_see_them(length_m: float, times: 
 
 
 def test_residuals_that_are_not_known_are_left_out() -> None:
-    shifts = np.full((6, 3), 0.001)
+    shifts = np.full((6, 2), 0.001)
     shifts[[0, 4]] = np.nan
     shifts[2, 1] = np.nan
     found = residuals(shifts)
     assert found.wall.tolist() == [1, 3, 5]
     np.testing.assert_array_equal(found.points_world[:, 0], [3.0, 9.0, 15.0])
-    nothing = residuals(np.full((3, 3), np.nan))
+    nothing = residuals(np.full((3, 2), np.nan))
     assert (len(nothing.wall), nothing.times) == (0, 1.0)
 
 
 @pytest.mark.parametrize(("count", "kept"), [(5000, 5000), (5001, 2501), (10_001, 3334)])
 def test_five_thousand_residuals_are_drawn_evenly_over_all(count: int, kept: int) -> None:
-    found = residuals(np.full((count, 3), 0.001))
+    found = residuals(np.full((count, 2), 0.001))
     assert len(found.wall) == kept
     assert len(set(np.diff(found.wall))) == 1
