@@ -96,6 +96,18 @@ def methods(run: Run) -> dict[str, MethodOverDatasets]:
     return {method.name: method for method in metric.methods}
 
 
+def test_oriented_photos_stand_in_a_column_of_their_own(rooms: HeldRun) -> None:
+    resolved = json.loads(rooms.record.workflow_resolved)
+    resolved["compare"]["metrics"] = ["plane.rms_mm", "plane.n_oriented", "plane.n_photos"]
+    told = replace(rooms.record, workflow_resolved=json.dumps(resolved))
+    table = dataset_table(parts_of(replace(rooms, record=told)), {})
+    assert [label for _, label in table.columns] == [
+        *("points to their plane, RMS / mm", "photos"),
+    ]
+    assert table.has_photos
+    assert {row.photos.text for row in table.rows} == {"5 of 6"}
+
+
 def test_errors_of_both_signs_do_not_make_each_other_small(tmp_path: Path) -> None:
     signed = {"hall": (6.0, 1.0), "stairs": (-3.0, 1.0), "cellar": (0.5, 1.0)}
     slow = methods(run_of(tmp_path, signed))["plane=slow"]

@@ -44,6 +44,20 @@ def noise(seed: int, side: int = 300) -> bytes:
     )
 
 
+def test_of_far_too_many_bytes_only_the_smallest_size_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried: list[int] = []
+
+    def keep(figure: RecordedFigure, side_px: int) -> RecordedFigure:
+        tried.append(side_px)
+        return figure
+
+    monkeypatch.setattr(module, "_smaller", keep)
+    module._fitted((figure("a", b"x" * 10_000),), 1.0)
+    assert tried == [min(module._SIDES_PX)]
+
+
 def test_equal_figures_and_those_of_repeats_are_shown_once() -> None:
     of = run(
         [
