@@ -368,6 +368,20 @@ def test_deviations_from_the_baseline_come_each_once() -> None:
     ]
 
 
+@pytest.mark.parametrize(("design", "n_cells"), [("one-at-a-time", 7), ("product", 8)])
+def test_cells_are_counted_as_they_will_be_with_the_repeats_of_the_baseline(
+    design: str, n_cells: int, catalog: Catalog, write: Path
+) -> None:
+    text = GOOD.replace("bundle: {use: orient.bundle,", "bundle: {use: orient.bundle, repeat: 3,")
+    compare = f"compare: {{design: {design}, baseline: {{plane: ransac, orient: bundle}}}}\n"
+    text = text.partition("compare:")[0] + compare
+    cells = cells_of(text, write, catalog)
+    workflow = load_workflow(write, catalog)
+    assert len(addresses(cells, "orient")) == n_cells
+    assert comparison._count_cells(workflow, ["plane", "orient"]) == n_cells
+    assert comparison._count_cells(workflow, ["cloud"]) == 1
+
+
 def test_more_combinations_than_anybody_can_run_are_refused(catalog: Catalog, write: Path) -> None:
     variants = ", ".join(f"v{n}: {{use: plane.ransac}}" for n in range(200))
     text = f"""\

@@ -455,6 +455,18 @@ def test_a_step_cannot_be_called_data_beside_datasets(catalog: Catalog) -> None:
 
 
 @pytest.mark.usefixtures("folder")
+def test_files_say_in_which_line_of_a_table_they_are_named(catalog: Catalog) -> None:
+    named = table("# rooms\nname,scan\nhall,hall.e57\nstairs,stairs.e57\n")
+    for workflow, said in (
+        (load(ROOMS, catalog, datasets=named), {"hall": "rooms.csv:3", "stairs": "rooms.csv:4"}),
+        # Those of the workflow itself stand in none.
+        (load(ROOMS + TWO, catalog), {"hall": "", "stairs": ""}),
+    ):
+        found = {name: one.inputs["scan"].said_in for name, one in workflow.datasets.items()}
+        assert found == said
+
+
+@pytest.mark.usefixtures("folder")
 def test_more_cells_than_anybody_can_run_are_counted_before_they_are_built(
     catalog: Catalog,
 ) -> None:
