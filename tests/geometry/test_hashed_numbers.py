@@ -17,6 +17,15 @@ def test_scrambling_is_that_of_splitmix64() -> None:
     np.testing.assert_array_equal(mixed_bits(states), np.array(expected, dtype=np.uint64))
 
 
+def test_draws_of_a_state_are_the_numbers_of_splitmix64_from_there() -> None:
+    bits = (0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F)
+    # Of the state itself, and of one that is a number further.
+    states = np.array([0, GOLDEN], dtype=np.uint64)
+    for draw in (0, 1):
+        expected = [(number >> 11) / 2.0**53 for number in bits[draw : draw + 2]]
+        np.testing.assert_array_equal(uniforms(states, draw), expected)
+
+
 def test_a_place_has_its_number_whatever_is_asked_with_it() -> None:
     columns, rows = np.arange(-40, 60), np.arange(1000, 1070)
     whole = uniforms(cell_states(columns[:, None], rows, 7), 3)

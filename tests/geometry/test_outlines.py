@@ -166,3 +166,14 @@ def test_lines_that_hardly_cross_do_not_join() -> None:
 def test_a_room_without_walls_has_no_outline() -> None:
     outline = room_outline([], np.zeros((0, 4, 3)), np.array([0.0, 0.0, 1.0]))
     assert (outline.walls, outline.chains_world, outline.floor_m) == ((), (), 0.0)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.08, -0.08])
+def test_walls_reach_up_to_a_ceiling_that_slopes(slope: float) -> None:
+    sloping = CEILING + np.outer(CEILING[:, 0], [0.0, 0.0, slope])
+    found = outline(*walls(0.5), FLOOR, sloping)
+    corners = found.faces_world.reshape(-1, 3)
+    top, bottom = found.faces_world[:, [0, 3]].reshape(-1, 3), found.faces_world[:, [1, 2]]
+    np.testing.assert_allclose(top[:, 2], 3.0 + slope * top[:, 0], atol=1e-6)
+    np.testing.assert_allclose(bottom[..., 2], 0.0, atol=1e-6)
+    assert ring(corners * [1.0, 1.0, 0.0]) == CORNERS

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry import WallFrame, frame_over, scene_views
+from orthoflow.geometry.scene_rays import Hits
 from orthoflow.geometry.scene_views import Rendering, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
@@ -294,3 +295,28 @@ def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_s
     assert (image.rectangle == 0).all()
     middle = image.seen[1:3, 3:5]
     assert (middle == is_seen).all()
+
+
+@pytest.mark.parametrize("n_sub", [1, 2, 3])
+def test_rays_of_a_cell_cross_it_in_as_many_rows_and_columns_as_they_are(n_sub: int) -> None:
+    starts: list[NDArray[np.float64]] = []
+
+    class Misses:
+        def cast(self, begin: NDArray[np.float64], *_: object, within: float) -> Hits:
+            starts.append(begin[:2, 0].copy())
+            return Hits(t=np.full(1, np.inf), rectangle=np.full(1, -1, dtype=np.int32))
+
+        def colours(self, rectangle: NDArray[np.int32], _: object) -> NDArray[np.float32]:
+            return np.zeros((4, len(rectangle)), dtype=np.float32)
+
+    renderer = scene_views._Renderer.__new__(scene_views._Renderer)
+    renderer._rays, renderer._n_sub = Misses(), n_sub  # type: ignore[assignment]
+    renderer._normal, renderer._corner = np.array([[0.0], [0.0], [1.0]]), np.zeros((3, 1))
+    renderer._step_u, renderer._step_v = np.eye(3)[:, :1], np.eye(3)[:, 1:2]
+    renderer._width, renderer._reach_m = 5, 1.0
+    renderer._rgb = np.zeros((10, 3), dtype=np.float32)
+    renderer.colour(np.array([7]))
+    # The third cell of the second row; a position in each n^2-th of it, either way.
+    places = np.array(starts) - [2.0, 1.0]
+    evenly = (np.arange(n_sub**2) + 0.5) / n_sub**2
+    np.testing.assert_allclose(np.sort(places, axis=0), np.column_stack([evenly, evenly]))

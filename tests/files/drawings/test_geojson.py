@@ -106,3 +106,34 @@ def test_a_system_that_programs_know_is_named(
     text = (tmp_path / "a.geojson").read_text()
     assert text.count("\n") == 1
     assert "product_digest" not in text
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
+    tmp_path: Path, is_known: bool
+) -> None:
+    planes = box_planes()
+    lines = room_lines(planes, None, {})
+    wall = DrawnWall(
+        number=WALL,
+        name="the wall",
+        plane_index=WALL if is_known else None,
+        frame=wall_frame(planes),
+        openings=(),
+    )
+    geojson.write_wall_geojson(tmp_path / "a.geojson", wall, lines)
+    kinds = [one["properties"]["kind"] for one in features(tmp_path / "a.geojson")]
+    assert kinds == (["frame", "rectangle", "part", *["edge"] * 4] if is_known else ["frame"])
+
+
+def test_an_opening_says_how_well_each_side_is_known() -> None:
+    (opening,) = box_openings().openings
+    about: Any = geojson.opening_feature(opening, 3)["properties"]
+    assert about["number"] == 3
+    # Millimetres; the third side was found by nobody.
+    assert about["side_sigma_mm"] == [3.0, 1.5, None, 3.0]
+    assert [about[f"{name}_m"] for name in ("depth", "width", "height", "sill")] == [
+        *(0.25, 0.8, 1.2, 0.5),
+    ]
+    assert (about["area_m2"], about["seen_share"]) == (0.96, 0.75)
+    assert len(set(about["side_source"])) == 3

@@ -135,6 +135,9 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
         *("checked by: A B", "drawing: 21-017, wall 7, index", "note: n"),
     ]
     high = {one.text: one.high for one in drawn.texts}
+    other = Page()
+    module._write_title(column(other), drawing(text=text), sheet("intensity", number=2, count=3))
+    assert "drawing: 21-017, wall 7, sheet 2" in written(other)
     # The project is the largest text with the scale, its own title the next; fields the smallest.
     assert 4.0 > high["Hall"] == high["scale 1:50"] > high["West"] > high["wall 7"]
     assert high["wall 7"] == high["grey of the scan"] == high["index of 3 sheets"]
