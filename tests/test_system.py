@@ -6,7 +6,9 @@ import os
 import subprocess
 import sys
 import textwrap
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -173,3 +175,74 @@ def test_room_on_the_disk_is_taken_and_places_are_read(
         assert read_at(descriptor, 4, 3) == b"3456"
     finally:
         os.close(descriptor)
+
+
+def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {1, 4, 5}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert system.usable_cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert system.usable_cores() == 8
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert system.usable_cores() == 1
+
+
+def test_memory_is_limited_where_somebody_limited_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = SimpleNamespace(RLIMIT_AS=9, RLIM_INFINITY=-1)
+    limits.getrlimit = {9: (5_000_000, 7_000_000)}.__getitem__
+    monkeypatch.setattr(system, "resource", limits)
+    assert system.address_space() == 5_000_000
+    limits.getrlimit = {9: (-1, -1)}.__getitem__
+    assert system.address_space() is None
+    monkeypatch.setattr(system, "resource", None)
+    assert system.address_space() is None
+
+
+def test_processes_that_ended_have_used_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    used = SimpleNamespace(ru_utime=1.5, ru_stime=0.25)
+    of_children = SimpleNamespace(RUSAGE_CHILDREN=-1, getrusage={-1: used}.__getitem__)
+    monkeypatch.setattr(system, "resource", of_children)
+    assert system.children_processor_s() == 1.75
+    monkeypatch.setattr(system, "resource", None)
+    times = SimpleNamespace(children_user=2.5, children_system=0.5, user=9.0, system=9.0)
+    monkeypatch.setattr(os, "times", lambda: times)
+    assert system.children_processor_s() == 3.0
+
+
+def test_a_file_is_locked_until_it_is_closed_where_the_kernel_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    path.touch()
+    with path.open("rb") as one, path.open("rb") as other:
+        system.lock_where_possible(one.fileno(), is_shared=True)
+        lock = file_lock(path, other.fileno())
+        assert not lock.take(is_shared=False, waits=False)
+        assert lock.take(is_shared=True, waits=False)
+    with path.open("rb") as one, path.open("rb") as other:
+        monkeypatch.setattr(system, "_fcntl", None)
+        system.lock_where_possible(one.fileno(), is_shared=False)
+        monkeypatch.undo()
+        assert file_lock(path, other.fileno()).take(is_shared=False, waits=False)
+
+
+def test_the_twin_of_a_lock_says_where_there_can_be_none(tmp_path: Path) -> None:
+    lock = system._DatabaseLock(tmp_path / "no folder" / "a")
+    with pytest.raises(OSError, match="unable to open"):
+        lock.take(is_shared=True, waits=False)
+    lock.close()
+
+
+@pytest.mark.parametrize("twin", [False, True], ids=["system", "twin"])
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_working_folder_is_come_back_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, twin: bool, fails: bool
+) -> None:
+    if twin:
+        monkeypatch.delattr(os, "O_PATH", raising=False)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "below").mkdir()
+    with suppress(ZeroDivisionError), system.working_folder_kept():
+        os.chdir("below")
+        assert 1 // (not fails)
+    assert Path.cwd() == tmp_path

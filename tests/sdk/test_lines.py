@@ -32,11 +32,11 @@ def test_a_line_that_is_cut_says_how_long_it_was() -> None:
 
 
 def test_what_cannot_say_anything_is_told_by_its_kind() -> None:
-    class Mute(Exception):
+    class MuteError(Exception):
         def __str__(self) -> str:
             raise RuntimeError
 
-    assert one_line(Mute()) == "a Mute without words"
+    assert one_line(MuteError()) == "a MuteError without words"
 
 
 @pytest.mark.parametrize(
