@@ -251,7 +251,7 @@ class StepContext:
         """
         file_name = f"{port}.{name.replace('/', '.')}"
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
-        if np.dtype(dtype).hasobject or any(side < 0 for side in shape):
+        if np.dtype(dtype).hasobject or min(shape, default=0) < 0:
             raise ProductError(f"an array cannot be of type {np.dtype(dtype)} and shape {shape}")
         if size_bytes == 0:
             return np.zeros(shape, dtype=dtype)
