@@ -115,8 +115,7 @@ class SpaceProposer:
         """Name the plane whose votes stand out most."""
         if self._voted_for != unassigned.n_points:
             self._vote(unassigned)
-        if len(self._unscored):
-            self._score()
+        self._score()
         direction = int(np.argmax(self._scores))
         score = float(self._scores[direction]) / VOTE_SHARES * self._points_per_vote
         if score < VOTE_CAUTION * self._voting.least_points:

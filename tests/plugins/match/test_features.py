@@ -153,3 +153,11 @@ def test_discs_are_found_once_and_in_place_whichever_tile_they_lie_in(
     tiled = at_discs()
     assert tiled.shape == whole.shape
     np.testing.assert_allclose(tiled, whole, atol=0.05)
+
+
+def test_undescribed_ones_keep_where_they_are_and_no_bytes_of_descriptors() -> None:
+    before = some()
+    after = before.undescribed()
+    assert after.descriptors.shape == (5, 0)
+    assert after.descriptors.base is None
+    assert all(a is b for a, b in zip(columns(after)[:3], columns(before)[:3], strict=True))

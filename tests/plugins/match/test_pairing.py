@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import pairing
+from orthoflow_plugins.match import pairing, sift
 from orthoflow_plugins.match.descriptors import Matches
 from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.pairing import (
@@ -420,3 +420,7 @@ def test_matches_are_counted_as_seen_from_the_front_and_from_behind(
     grey = np.zeros((10, 3200), dtype=np.uint8)
     np.testing.assert_array_equal(side_matches(grey, [original, original], RULE), counts)
     assert scales == tried
+
+
+def test_other_methods_pair_as_the_matching_does_by_default() -> None:
+    assert sift._rule(sift.MatchSift.Params()) == pairing.USUAL_RULE

@@ -290,10 +290,15 @@ def test_what_a_lens_model_lacks_is_said_from_half_as_much_again(
 
 
 def test_a_fuller_lens_that_cannot_be_found_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
+    limits: list[float] = []
+
+    def fail(*_: object, soft_limit: float, **__: object) -> None:
+        limits.append(soft_limit)
         raise GeometryError("the ties do not determine the camera")
 
     monkeypatch.setattr(direct_linear, "adjust", fail)
     found = estimated(camera(), seen_by(camera(), 60))
     assert isinstance(found, Estimate)
     assert found.notes == ()
+    # Ties without any error would all lie beyond limits as fine as they are.
+    assert set(limits) == {direct_linear.SOFT_LIMIT}

@@ -289,3 +289,10 @@ def test_a_photo_of_nothing_has_no_key_points() -> None:
     found = photo_features(plain, 100)
     assert found.pixels.shape == (0, 2)
     assert found.descriptors.shape == (0, 128)
+
+
+def test_no_ties_have_as_many_of_everything() -> None:
+    none = photo_ties.no_photo_ties()
+    assert none.photo.shape == none.point.shape == none.scale.shape == (0,)
+    assert none.pixels.shape == (0, 2)
+    assert none.points_world.shape == (0, 3)
