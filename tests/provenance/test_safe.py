@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from orthoflow_provenance import safe
 from orthoflow_provenance.encoding import read_texts
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.reader import open_record
@@ -298,3 +301,32 @@ def test_names_in_notes_are_nobodys_business(tmp_path: Path) -> None:
         file.create_group("notes/a\x1b")
     with safe_open(path) as file:
         assert list(file["notes"]) == ["a\x1b"]
+
+
+def inspected(folder: Path, n_bytes: int, *sizes: tuple[int, int]) -> None:
+    """Look at datasets that say they have so many bytes, and for which so many are stored."""
+    path = folder / "run.h5"
+    with path.open("wb") as file:
+        file.truncate(n_bytes)
+    nothing: Any = None
+    inspection = safe._Inspection(nothing, path)
+    for declared, stored in sizes:
+        dataset: Any = SimpleNamespace(shape=(declared,), get_storage_size=lambda n=stored: n)
+        inspection._check_size(dataset, 1, "/x")
+
+
+def test_datasets_hold_together_what_their_file_holds(tmp_path: Path) -> None:
+    inspected(tmp_path, 100, (50, 50), (50, 50))
+    with pytest.raises(RecordFormatError, match="say more than the file can hold"):
+        inspected(tmp_path, 100, (60, 60), (41, 41))
+
+
+def test_compression_saves_no_more_than_it_can(tmp_path: Path) -> None:
+    # A thousandfold and a bit, of what is more than 64 MiB.
+    inspected(tmp_path, 10**6, (110_000_000, 100_000))
+    with pytest.raises(RecordFormatError, match="but the file holds 100000 for it"):
+        inspected(tmp_path, 10**6, (110_000_001, 100_000))
+    # Below that none need be stored, but not of several.
+    inspected(tmp_path, 10**6, (1 << 26, 0))
+    with pytest.raises(RecordFormatError, match="have more than 64 MiB that the file cannot hold"):
+        inspected(tmp_path, 10**6, (1 << 25, 0), (1 << 25, 0), (1, 0))

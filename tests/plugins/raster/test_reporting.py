@@ -232,3 +232,13 @@ def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
         "wall 0: surface tin spans no gap wider than about 512 cells (2.56 m) where more than 3 "
         "cells of a wall have points, here 4: raise gsd_m to close wider ones"
     )
+
+
+@pytest.mark.parametrize(("n_void", "is_told"), [(1, False), (3, True)])
+def test_a_net_may_leave_a_hundredth_of_a_wall_open(
+    listener: Listener, monkeypatch: pytest.MonkeyPatch, n_void: int, *, is_told: bool
+) -> None:
+    monkeypatch.setattr("orthoflow_plugins.raster.nets.VERTICES_MOST", 3)
+    of = wall([[0] * n_void + [1] * (200 - n_void)])
+    reporting.warn_of_wide_gaps(listener.context, [of])
+    assert len(listener.warnings) == is_told

@@ -67,6 +67,7 @@ def test_intensity_and_colour_are_carried_to_the_centres_of_cells_alone_and_toge
     assert both.intensity is not None
     assert both.rgb is not None
     assert no_rgb.rgb is None
+    assert no_rgb.rgb_mask is None
     np.testing.assert_array_equal(no_rgb.intensity, both.intensity)
     np.testing.assert_array_equal(no_intensity.rgb, both.rgb)
     few = (both.count == 1) & np.isfinite(both.depth_m)

@@ -61,6 +61,7 @@ def test_each_area_is_what_the_rays_say(tmp_path: Path) -> None:
     numbers = {metric.name: metric.value for metric in ctx.metrics}
     assert (numbers["n_openings"], numbers["n_through"], numbers["n_no_data"]) == (3, 1, 1)
     assert [figure.name for figure in ctx.figures] == ["wall_4_openings"]
+    assert ctx.warnings == []
 
 
 def test_the_figure_shows_the_face_pale_where_the_laser_saw_no_intensity(tmp_path: Path) -> None:
@@ -120,6 +121,28 @@ def test_world_coordinates_are_those_of_the_wall(tmp_path: Path) -> None:
         area_m2 = 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
         # Counter-clockwise where Y points upwards.
         assert area_m2 == pytest.approx(opening.area_m2, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("systems", "told"),
+    [
+        ((None, None), None),
+        (("EPSG:31256", None), "EPSG:31256"),
+        (("EPSG:31256", "EPSG:31256"), "EPSG:31256"),
+        (("EPSG:31256", "EPSG:31255"), None),
+    ],
+)
+def test_the_coordinate_system_is_that_of_all_maps(
+    tmp_path: Path, systems: tuple[str | None, ...], told: str | None
+) -> None:
+    walls = scenes.walls()
+    (wall,) = walls.walls
+    both = tuple(
+        replace(wall, frame=replace(wall.frame, map_crs=crs), plane_index=place)
+        for place, crs in enumerate(systems)
+    )
+    openings, _ = found(tmp_path, replace(walls, walls=both, buffers_m=()), scenes.cloud())
+    assert openings.map_crs == told
 
 
 def test_what_a_screen_hides_is_an_opening_only_for_want_of_rays(tmp_path: Path) -> None:

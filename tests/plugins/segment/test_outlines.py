@@ -231,6 +231,17 @@ def test_an_outline_ends_with_the_raster() -> None:
     assert found.seen_of_all == pytest.approx((60.0 + 60.0) / 240.0)
 
 
+@pytest.mark.parametrize("left_cells", [2, 3, 4])
+def test_of_what_lies_beside_a_side_the_raster_holds_some(left_cells: int) -> None:
+    right, bottom = SHAPE[1] - left_cells, SHAPE[0] - left_cells
+    found = outline(block(right=right, bottom=bottom))
+    corners = np.array([[LEFT, TOP], [LEFT, bottom], [right, bottom], [right, TOP]])
+    begin = int(np.linalg.norm(found.corners - corners[0], axis=1).argmin())
+    # The third cell to the right of a side and below it is the first that is asked.
+    is_seen = [1.0, float(left_cells > 2), float(left_cells > 2), 1.0]
+    np.testing.assert_array_equal(np.roll(found.seen_share, -begin), is_seen)
+
+
 @pytest.mark.parametrize("cells_off", range(1, 8))
 def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_off: int) -> None:
     # The face is a ring of one cell, its inner border so many cells off.
@@ -290,18 +301,20 @@ def test_a_side_shorter_than_a_cell_is_seen_too(length: float) -> None:
     np.testing.assert_array_equal(shares, [1.0, 0.0, 1.0])
 
 
-@pytest.mark.parametrize(("off_cells", "n_sides"), [(0.9, 4), (1.1, 5)])
+@pytest.mark.parametrize("corners", [CORNERS, CORNERS[:3]], ids=["rectangle", "triangle"])
+@pytest.mark.parametrize(("off_cells", "is_corner"), [(0.9, False), (1.1, True)])
 def test_sides_between_which_a_corner_stands_out_by_a_cell_at_most_are_one(
-    off_cells: float, n_sides: int
+    corners: NDArray[np.float64], off_cells: float, *, is_corner: bool
 ) -> None:
-    ring = np.insert(CORNERS, 2, [80.0, BOTTOM + off_cells], axis=0)
+    ring = np.insert(corners, 2, [80.0, BOTTOM + off_cells], axis=0)
     sides = [
-        module._Side(first=k, last=(k + 1) % 5, begin=begin, end=end, scatter=2.0)
+        module._Side(first=k, last=(k + 1) % len(ring), begin=begin, end=end, scatter=2.0)
         for k, (begin, end) in enumerate(zip(ring, np.roll(ring, -1, axis=0), strict=True))
     ]
     found = module._joined(ring, sides)
-    np.testing.assert_array_equal([side.begin for side in found], CORNERS if n_sides == 4 else ring)
-    np.testing.assert_array_equal([side.end for side in found[-2:]], CORNERS[[3, 0]])
+    left = ring if is_corner else corners
+    np.testing.assert_array_equal([side.begin for side in found], left)
+    np.testing.assert_array_equal([side.end for side in found], np.roll(left, -1, axis=0))
 
 
 def test_where_the_search_for_corners_began_none_is_left() -> None:
