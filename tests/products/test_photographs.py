@@ -204,3 +204,9 @@ def test_a_lens_has_a_skew_where_its_axes_are_not_square(skew: float, kept: floa
     assert (lens.skew, lens.source, lens.width, lens.height) == (kept, "survey", 1000, 800)
     assert lens.posed().skew == skew
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (800.0, 820.0, 500.0, 400.0)
+
+
+@pytest.mark.parametrize(("wall", "number"), [(0, 7), (1, 1), (2, 2), (-1, -1)])
+def test_people_know_a_wall_of_ties_by_its_plane_where_that_is_said(wall: int, number: int) -> None:
+    said = ties(walls=(dataclasses.replace(WALL, plane_index=7), WALL))
+    assert said.number(wall) == number

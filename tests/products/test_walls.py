@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
-from orthoflow.products import Wall, Walls
+from orthoflow.products import Layers, Wall, Walls
 from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -106,3 +106,9 @@ def test_points_of_cells_that_are_not_known_do_not_count() -> None:
     assert walls(some).spacing_m() == pytest.approx(0.5 * np.sqrt(2.0))
     nothing = samples.wall(wall.frame, depth_m=np.full_like(depth_m, np.nan))
     assert walls(nothing).spacing_m() == 0.5
+
+
+def test_layers_say_how_people_call_their_walls() -> None:
+    layers = Layers(layers=(), names=("west",), plane_indices=(4, 6))
+    assert [layers.number(wall) for wall in range(3)] == [4, 6, 2]
+    assert [layers.name(wall) for wall in range(3)] == ["west", "wall 6", "wall 2"]

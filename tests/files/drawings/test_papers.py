@@ -100,3 +100,17 @@ def test_usual_scales_are_those_of_rulers(scale: int) -> None:
     assert fitting_scale([(across, down)], A3) == scale
     if scale < 10_000:
         assert fitting_scale([(1.001 * across, down)], A3) > scale
+
+
+@pytest.mark.parametrize("kinds", [("ortho",), ("ortho", "depth")])
+@pytest.mark.parametrize("size_m", [(4.0, 3.0), (11.0, 3.0)])
+def test_pictures_on_one_sheet_stand_in_the_middle_of_its_room(
+    kinds: tuple[str, ...], size_m: tuple[float, float]
+) -> None:
+    paper, (views,) = placed_views(kinds, size_m, A3, scale=50, grid_m=1.0)
+    wide, high = (20.0 * edge for edge in size_m)
+    corners = np.array([view.corner_mm for view in views])
+    low, up = corners.min(axis=0), np.add(corners.max(axis=0), (wide, high))
+    edge = MARGIN_MM + LABELS_MM
+    # As far from the labels on the left as on the right, and above as below.
+    np.testing.assert_allclose(low - edge, np.add(edge, paper.area_mm) - up)

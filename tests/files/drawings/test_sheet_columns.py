@@ -425,6 +425,10 @@ def test_notes_are_as_high_as_large_paper_wants(drawn: Page, paper: str, high_mm
     right = paper_of(paper).width_mm - 10.0
     assert all(text.left + text.width < right for text in drawn.texts)
     assert min(text.bottom for text in drawn.texts) > 10.0
+    # The seal ends as far from the frame as the texts begin.
+    dots = [box.sides for box in drawn.boxes if box.sides[2] < 1.2]
+    quiet = 4.0 * dots[0][2]
+    assert min(bottom for _, bottom, *_ in dots) - quiet == pytest.approx(13.0)
 
 
 def test_walls_that_are_short_or_close_have_no_number(drawn: Page) -> None:
