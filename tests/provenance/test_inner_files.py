@@ -73,10 +73,15 @@ def test_ordinary_names_are_taken_as_they_are(tmp_path: Path, name: str) -> None
         ("products//a.tif", "has a part that is empty"),
         ("products/../../a.tif", "has a part that is . or .."),
         ("products/a.tif/", "has a part that is empty"),
-        ("/".join(["a" * 200] * 21), "is longer than 4095 bytes"),
+        # Letters of two bytes: seventeen parts of 240 bytes, and the slashes between them.
+        ("/".join(["ö" * 120] * 16 + ["a" * 240]), "is longer than 4095 bytes"),
+        ("/".join(["ö" * 120] * 16 + ["a" * 239]), ""),
+        ("ö" * 127 + "a", ""),
+        ("ö" * 128, "is longer than 255 bytes"),
+        ("products/" + "ö" * 128, "has a part that is longer than 255 bytes"),
     ],
 )
-def test_paths_that_lead_elsewhere_are_refused(path: str, problem: str) -> None:
+def test_paths_that_lead_elsewhere_or_are_too_long_are_refused(path: str, problem: str) -> None:
     assert path_problem(path) == problem
 
 

@@ -110,6 +110,9 @@ def test_photos_without_focal_length_are_taken_with_a_warning(tmp_path: Path, re
         "and no calibration): the orientation has to find it, needs more ties for that and may "
         "refuse; a calibration file helps"
     )
+    # Of three each is named.
+    read(*(tmp_path / name for name in list(files)[:3]))
+    assert "of 3 photos (0.jpg, 1.jpg, 2.jpg) is unknown" in read.warnings
 
 
 def test_a_cut_photo_does_not_keep_the_focal_length_of_the_whole(
