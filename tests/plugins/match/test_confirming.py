@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -31,11 +32,16 @@ CAMERAS = [
     ms.camera_before(SCENE, centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
     ms.camera_before(SCENE, centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
 ]
-PHOTOS = Photos(
-    photos=tuple(
-        replace(ms.photo_of(SCENE, camera), name=f"{nth}.png") for nth, camera in enumerate(CAMERAS)
+
+
+@cache
+def photos() -> Photos:
+    return Photos(
+        photos=tuple(
+            replace(ms.photo_of(SCENE, camera), name=f"{nth}.png")
+            for nth, camera in enumerate(CAMERAS)
+        )
     )
-)
 
 
 def place(
@@ -67,8 +73,8 @@ def chosen(places: dict[int, Sequence[Placed]], recognised: Sequence[int] = ()) 
     """Metres that the chosen places are aside, by photo."""
     rule = USUAL_RULE
     features = [wall_features(WALLS.walls[0], rule)]
-    pairs = {k: pair_photo(photo_grey(PHOTOS.photos[k]), features, rule) for k in recognised}
-    found = confirmed(PHOTOS, places, pairs, PlacedWalls(walls=WALLS.walls))
+    pairs = {k: pair_photo(photo_grey(photos().photos[k]), features, rule) for k in recognised}
+    found = confirmed(photos(), places, pairs, PlacedWalls(walls=WALLS.walls))
     return {
         k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
         for k, place in found.items()
@@ -115,7 +121,7 @@ def sifted(
         scratch=folder,
         listen=lambda event: said.append(event.text) if event.kind == "warning" else None,
     )
-    inputs = MatchSift.In(photos=Photos(photos=PHOTOS.photos[:2]), walls=WALLS)
+    inputs = MatchSift.In(photos=Photos(photos=photos().photos[:2]), walls=WALLS)
     ties = MatchSift().run(inputs, MatchSift.Params(structure=structure), ctx).ties
     return ties, said
 
@@ -341,7 +347,7 @@ def test_shared_key_points_are_given_in_pixels_of_both_photos(
 
     monkeypatch.setattr(confirming, "_small", small)
     monkeypatch.setattr(confirming, "pair_photo", pair_photo)
-    found = confirming._shared(PHOTOS, [(2, 5), (5, 7)], 1)
+    found = confirming._shared(photos(), [(2, 5), (5, 7)], 1)
     # Each photo is looked at once.
     assert sorted(asked) == [2, 5, 7]
     np.testing.assert_allclose(
@@ -360,7 +366,7 @@ def test_photos_are_compared_at_sixteen_hundred_pixels(
 ) -> None:
     grey = np.random.default_rng(1).integers(0, 255, (width // 8, width), dtype=np.uint8)
     monkeypatch.setattr(confirming, "photo_grey", lambda _: grey)
-    found = confirming._small(PHOTOS, 0)
+    found = confirming._small(photos(), 0)
     assert found.scale == scale
     assert found.grey.shape == (round(width // 8 * scale), round(width * scale))
     # Key points lie in the shrunk picture.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,18 @@ from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Ties, Walls
+from orthoflow.products import Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
 
 SCENE = ms.textured_wall(0)
 CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
-PHOTOS = ms.photos(ms.photo_of(SCENE, CAMERA))
+
+
+@cache
+def photos() -> Photos:
+    return ms.photos(ms.photo_of(SCENE, CAMERA))
 
 
 def measured(*names: str) -> Ties:
@@ -41,7 +46,7 @@ def context(folder: Path) -> StepContext:
 
 def sift(folder: Path, walls: Walls, hand: Ties | None) -> tuple[Ties, list[str]]:
     ctx = context(folder)
-    inputs = MatchSift.In(photos=PHOTOS, walls=walls, hand=hand)
+    inputs = MatchSift.In(photos=photos(), walls=walls, hand=hand)
     return MatchSift().run(inputs, MatchSift.Params(), ctx).ties, list(ctx.warnings)
 
 
@@ -85,7 +90,7 @@ def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
     assert len(ties.walls) == 1
     assert any("only the ties measured by hand are used" in text for text in warnings)
     guided = MatchGuided.In(
-        photos=PHOTOS,
+        photos=photos(),
         walls=bare,
         cameras=ms.cameras(ms.oriented(CAMERA)),
         hand=measured("a.png"),

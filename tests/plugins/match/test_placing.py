@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,7 +23,11 @@ from orthoflow.products import Photo, Wall
 from orthoflow.testing import photographed as ms
 
 CAMERA = ms.camera_before(ms.textured_wall(1))
-PHOTO = ms.photo_of(ms.textured_wall(1), CAMERA)
+
+
+@cache
+def usual_photo() -> Photo:
+    return ms.photo_of(ms.textured_wall(1), CAMERA)
 
 
 def patchy_wall() -> Wall:
@@ -47,7 +52,7 @@ def off_cells(found: Placed, seen_px: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def test_a_photo_is_placed_where_contrast_is_inverted_here_and_there() -> None:
-    found = placed(PHOTO)
+    found = placed(usual_photo())
     assert found is not None
     off = off_cells(found, CAMERA.project(found.piece.points_world)[:, :2])
     assert np.median(off) < 1.0
@@ -59,7 +64,9 @@ def test_neither_a_lens_nor_how_the_camera_was_held_needs_to_be_known() -> None:
     camera = ms.camera_before(scene, centre=(3.4, -1.9, 1.2), towards=(1.6, 0.0, 1.0))
     upright = decode_image(ms.photo_of(scene, camera).encoded, "a.png")
     turned = np.ascontiguousarray(np.rot90(upright))
-    photo = replace(PHOTO, encoded=encode_png(turned), width=640, height=900, intrinsics=None)
+    photo = replace(
+        usual_photo(), encoded=encode_png(turned), width=640, height=900, intrinsics=None
+    )
     assert photo.exif_focal_px is None
     found = placed(photo)
     assert found is not None
@@ -84,18 +91,19 @@ def test_a_photo_held_at_an_odd_angle_is_placed(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_turns_go_all_around_near_each_other_where_nobody_says_how_a_photo_was_held() -> None:
-    bare = replace(PHOTO, intrinsics=None)
+    bare = replace(usual_photo(), intrinsics=None)
     first, then = placing._turns_deg(bare)
     turns = np.sort(np.mod([*first, *then], 360.0))
     np.testing.assert_array_equal(np.diff([*turns, turns[0] + 360.0]), 15.0)
     # As cameras are held, before all other ways.
     assert first == (0.0, 90.0, -90.0, 180.0)
-    assert placing._turns_deg(PHOTO) == placing._turns_deg(bare)
+    assert placing._turns_deg(usual_photo()) == placing._turns_deg(bare)
     assert placing._turns_deg(replace(bare, exif_focal_px=840.0)) == ((0.0,),)
     assert placing._turns_deg(replace(bare, exif_orientation=6)) == ((0.0,),)
     # A face of a panorama.
-    assert PHOTO.intrinsics is not None
-    face = replace(PHOTO, intrinsics=replace(PHOTO.intrinsics, source="given"))
+    intrinsics = usual_photo().intrinsics
+    assert intrinsics is not None
+    face = replace(usual_photo(), intrinsics=replace(intrinsics, source="given"))
     assert placing._turns_deg(face) == (first,)
 
 
@@ -123,16 +131,18 @@ def test_a_turned_photo_says_where_its_places_are(
 
 
 def test_exif_says_how_a_photo_was_held() -> None:
-    turned = np.ascontiguousarray(np.rot90(decode_image(PHOTO.encoded, "a.png")))
-    shot = replace(PHOTO, encoded=encode_png(turned), width=640, height=900, intrinsics=None)
+    turned = np.ascontiguousarray(np.rot90(decode_image(usual_photo().encoded, "a.png")))
+    shot = replace(
+        usual_photo(), encoded=encode_png(turned), width=640, height=900, intrinsics=None
+    )
     # Told how it was held, no other way is tried; told wrong, it shows no wall.
     assert placed(replace(shot, exif_orientation=6)) is not None
     assert placed(replace(shot, exif_orientation=1, exif_focal_px=840.0)) is None
 
 
 def test_a_mirrored_photo_is_placed_nowhere() -> None:
-    mirrored = np.ascontiguousarray(decode_image(PHOTO.encoded, "a.png")[:, ::-1])
-    assert placed(replace(PHOTO, encoded=encode_png(mirrored), exif_focal_px=840.0)) is None
+    mirrored = np.ascontiguousarray(decode_image(usual_photo().encoded, "a.png")[:, ::-1])
+    assert placed(replace(usual_photo(), encoded=encode_png(mirrored), exif_focal_px=840.0)) is None
 
 
 def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
@@ -142,13 +152,15 @@ def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
 
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
-    assert places_of(0, PHOTO, PlacedWalls(walls=[blind])) == []
+    assert places_of(0, usual_photo(), PlacedWalls(walls=[blind])) == []
 
 
 # --- how places are judged ---
 
 
-BARE = replace(PHOTO, intrinsics=None)
+@cache
+def bare_photo() -> Photo:
+    return replace(usual_photo(), intrinsics=None)
 
 
 def placed_at(
@@ -198,14 +210,14 @@ def test_poses_are_one_place_where_most_of_a_photo_lies_in_one() -> None:
 
 
 def test_a_lens_is_what_is_known_of_it_beforehand() -> None:
-    shot = replace(PHOTO, intrinsics=None, width=3000, height=4000)
+    shot = replace(usual_photo(), intrinsics=None, width=3000, height=4000)
     for exif_px, focal_px, sigma in ((None, 3200.0, 0.3), (2500.0, 2500.0, 0.05)):
         lens, freedom = placing._lens_before(replace(shot, exif_focal_px=exif_px))
         assert (lens.width, lens.height, lens.cx, lens.cy) == (3000, 4000, 1500.0, 2000.0)
         assert (lens.fx, lens.fy, lens.skew) == (focal_px, focal_px, 0.0)
         assert not lens.distortion.any()
         assert freedom.focal_sigma == sigma
-    lens, freedom = placing._lens_before(PHOTO)
+    lens, freedom = placing._lens_before(usual_photo())
     assert lens.fx == CAMERA.fx
     np.testing.assert_array_equal(lens.distortion, CAMERA.distortion)
     assert not freedom.sigmas.size
@@ -246,7 +258,7 @@ def walls_seen(
 def test_the_four_places_that_stand_out_most_are_tried_and_sorted_by_what_agrees(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    upright = replace(PHOTO, exif_focal_px=840.0)
+    upright = replace(usual_photo(), exif_focal_px=840.0)
     found = {
         7.0: placed_at(n=50, share=0.2),
         6.0: placed_at(200.0, n=50, share=0.3),
@@ -366,7 +378,7 @@ class Looks:
 
 def test_turns_are_tried_until_a_place_is_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = Looks(leads={-90.0: (7.0,), 15.0: (9.0,)}, found={7.0: placed_at()})
-    places = looks.of(BARE, monkeypatch)
+    places = looks.of(bare_photo(), monkeypatch)
     assert [(place.lead, place.is_clear) for place in places] == [(7.0, True)]
     assert looks.turns == [(degrees, False) for degrees in placing._QUARTERS_DEG]
     assert (looks.closer, looks.patches) == ([], [7.0])
@@ -383,7 +395,7 @@ def test_of_places_in_all_other_turns_the_best_are_seen_closer(
         leads={0.0: (4.0,), **leads},
         found={4.0: placed_at(300.0, share=0.1), rough[11] + 100.0: placed_at()},
     )
-    places = looks.of(BARE, monkeypatch)
+    places = looks.of(bare_photo(), monkeypatch)
     assert looks.turns == [
         *((degrees, False) for degrees in placing._QUARTERS_DEG),
         *((degrees, True) for degrees in turns),
@@ -399,7 +411,7 @@ def test_exif_turns_a_photo_as_a_camera_held_so_turns_the_picture(
 ) -> None:
     for orientation, degrees in enumerate((0.0, 0.0, 180.0, 180.0, 270.0, 270.0, 90.0, 90.0), 1):
         looks = Looks(leads={}, found={})
-        shot = replace(BARE, exif_orientation=orientation, exif_focal_px=840.0)
+        shot = replace(bare_photo(), exif_orientation=orientation, exif_focal_px=840.0)
         assert looks.of(shot, monkeypatch) == []
         assert looks.turns == [(degrees, False)]
 
@@ -420,7 +432,9 @@ def test_a_photo_is_shrunk_to_what_is_needed_and_never_enlarged(
 ) -> None:
     looks = Looks(leads={0.0: (7.0,)}, found={})
     encoded = encode_png(np.zeros((*shape, 3), dtype=np.uint8))
-    photo = replace(BARE, encoded=encoded, height=shape[0], width=shape[1], exif_focal_px=840.0)
+    photo = replace(
+        bare_photo(), encoded=encoded, height=shape[0], width=shape[1], exif_focal_px=840.0
+    )
     looks.of(photo, monkeypatch)
     assert looks.shapes == [(*laid, 3), (*tied, 3)]
 
@@ -428,7 +442,7 @@ def test_a_photo_is_shrunk_to_what_is_needed_and_never_enlarged(
 def test_from_where_nine_parts_of_a_photo_lie_its_pose_follows() -> None:
     wall = ms.walls_of(ms.textured_wall(1)).walls[0]
     structure: Any = SimpleNamespace(wall=wall, usual_spread_m=0.001)
-    middle = placing.turned(decode_image(PHOTO.encoded, "a.png"), 0.0)
+    middle = placing.turned(decode_image(usual_photo().encoded, "a.png"), 0.0)
     shares = np.array([[a, b] for b in (0.25, 0.5, 0.75) for a in (0.25, 0.5, 0.75)])
     rays = CAMERA.rays_world(middle.pixels_photo(shares))
     # Where the rays of the parts meet the wall's surface, by steps of Newton.
@@ -447,7 +461,7 @@ def test_from_where_nine_parts_of_a_photo_lie_its_pose_follows() -> None:
         parts_photo=shares,
         parts_m=at,
     )
-    lens, _ = placing._lens_before(PHOTO)
+    lens, _ = placing._lens_before(usual_photo())
     found = placing._camera_at(place, structure, lens, middle)
     assert found is not None
     assert np.linalg.norm(found.centre_world - CAMERA.centre_world) < 0.02
@@ -511,7 +525,7 @@ def tied(
 
     monkeypatch.setattr(placing, "_measured", measured)
     small = np.zeros((640, 900, 3), dtype=np.uint8)
-    _, freedom = placing._lens_before(PHOTO)
+    _, freedom = placing._lens_before(usual_photo())
     found = placing._tied((4, 7), small, (CAMERA, freedom), structure)
     return found, radii, structure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -51,12 +52,14 @@ def surface_of(depths: NDArray[np.float32]) -> Surface:
     )
 
 
-PLAIN: Final = surface_of(np.zeros(scenes.SHAPE, dtype=np.float32))
+@cache
+def plain() -> Surface:
+    return surface_of(np.zeros(scenes.SHAPE, dtype=np.float32))
 
 
 def view() -> WallView:
     params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
-    return view_of(CAMERA, PLAIN, params, is_exact=False)
+    return view_of(CAMERA, plain(), params, is_exact=False)
 
 
 def nodes_of(

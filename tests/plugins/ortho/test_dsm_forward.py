@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,7 +34,9 @@ def surface_of(depths: np.ndarray) -> Surface:
     )
 
 
-FLAT = surface_of(np.zeros(scenes.SHAPE, dtype=np.float32))
+@cache
+def flat() -> Surface:
+    return surface_of(np.zeros(scenes.SHAPE, dtype=np.float32))
 
 
 def sized(width: int, height: int) -> ViewingCamera:
@@ -43,7 +46,7 @@ def sized(width: int, height: int) -> ViewingCamera:
 @pytest.mark.parametrize("size", [(160, 128), (100, 90), (177, 113), (33, 15)], ids=str)
 def test_rays_between_those_of_the_lattice_are_those_of_the_camera(size: tuple[int, int]) -> None:
     camera = sized(*size)
-    lattice = dsm_forward._ray_lattice(camera, FLAT)
+    lattice = dsm_forward._ray_lattice(camera, flat())
     assert lattice.shape == (size[1] // 16 + 2, size[0] // 16 + 2, 3)
 
     def between(u: float, v: float) -> np.ndarray:
