@@ -135,15 +135,18 @@ class _Examples:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the longest modules, and with what a second process can do meanwhile.
+    """Start with the longest modules, and with what other processes can do meanwhile.
 
-    Two modules need no kernels: they run while the first process compiles those for tests/road.
+    The others need no kernels: they run while the first process compiles those for tests/road.
     What takes longest else comes next, so that in the end no process waits for the other.
     """
-    first = [("road", "test_direct.py"), ("cli", "test_running.py")]
+    first = [
+        *(("road", "test_direct.py"), ("cli", "test_running.py")),
+        *(("engine", "test_surroundings.py"), ("engine", "test_dask.py")),
+    ]
     soon = [
         *(("plane", "test_detectors.py"), ("testing", "test_conformance.py")),
-        *(("engine", "test_surroundings.py"), ("orient", "test_pnp.py")),
+        ("orient", "test_pnp.py"),
     ]
 
     def turn(item: pytest.Item) -> int:
@@ -157,9 +160,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=turn)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look for no garbage while tests are loaded: there is hardly any."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_finish() -> None:
     """Set aside what is loaded by now, in each process: it is never garbage."""
-    gc.collect()
     gc.freeze()
 
 
