@@ -360,6 +360,8 @@ def test_workers_that_do_not_say_their_cores_get_no_work(
         ([(1, 4.0)], (1, 4, 4, 4)),
         ([(2, 4.0), (8, 16.0)], (5, 20, 16, 4)),
         ([(1, 1.0), (1, 1.0)], (2, 2, 1, 1)),
+        # Half a core is room for one task all the same.
+        ([(1, 0.5)], (1, 0, 1, 1)),
     ],
 )
 def test_workers_have_room_for_as_many_tasks_as_threads_and_cores(

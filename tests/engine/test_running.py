@@ -63,7 +63,10 @@ def test_a_result_begins_with_what_is_known_of_its_task() -> None:
         (InputError("a: wrong\nb: wrong"), "a: wrong; b: wrong"),
         (MethodError("one\ntwo"), "one two"),
         (MethodError(""), "method work.add of toys 1.0 failed without a word"),
+        (MethodError("x" * 4000), "x" * 4000),
+        (MethodError("y" * 4001), f"{'y' * 4000}... (4001 characters)"),
     ],
+    ids=["plain", "problems", "lines", "mute", "long", "longer"],
 )
 def test_a_failure_is_told_in_one_line(error: MethodError | InputError, said: str) -> None:
     failed = running.failed_result(a_task(), error, "the trace")
