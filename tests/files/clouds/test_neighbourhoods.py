@@ -128,3 +128,16 @@ def test_nine_points_beside_a_wall_are_alone_and_ten_are_not() -> None:
         alone = near.alone[near.places(offsets)]
         assert alone[: len(wall)].sum() == 0
         assert alone[len(wall) :].tolist() == [n_beside < 10] * n_beside
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("far_m", "place"), [(1e12, 2_097_144), (9e5, 1_800_000), (-1e12, 3)])
+def test_what_lies_far_away_is_in_no_voxel_of_others(axis: int, far_m: float, place: int) -> None:
+    offsets = np.full((1, 3), 5.1)
+    offsets[0, axis] = far_m
+    (key,) = module._keys(offsets, np.zeros(3), 0.5).tolist()
+    # Three numbers of 21 bits, each with room for its neighbours.
+    found = [key >> 42, key >> 21 & 0x1FFFFF, key & 0x1FFFFF]
+    expected = [10, 10, 10]
+    expected[axis] = place
+    assert found == expected
