@@ -26,6 +26,7 @@ _MARK: Final = "\0"
 _MARKS: Final = re.compile(
     rf"\[?{_MARK}(?:(?:, | and |,? or | of |/| ){_MARK}| \.\.\.| more\b)*\]?"
 )
+_FOREMOST: Final = "stand on their heads"
 # Words of sentences that say what one can do.
 _ADVICE: Final = re.compile(
     r"\b(?:set|give|check|measure|choose|turn|lower|raise|free|repeat|helps?|need(?:s|ed)?|instead)\b|--\w",
@@ -64,6 +65,11 @@ class Alike:
         return f"{self.text} ({self.count} times{'; also ' if named else ''}{named})"
 
     @property
+    def is_foremost(self) -> bool:
+        """Whether it makes every picture wrong, however good the rest is."""
+        return _FOREMOST in self.text
+
+    @property
     def is_advice(self) -> bool:
         """Whether it says what one can do."""
         return _ADVICE.search(self.text) is not None
@@ -88,7 +94,9 @@ def alike(said: Iterable[tuple[str, str]]) -> tuple[Alike, ...]:
     for place, text in said:
         groups.setdefault(sense(text), []).append((place, text))
     found = [_together(group) for group in groups.values()]
-    return tuple(sorted(found, key=lambda item: (not item.is_advice, -item.count)))
+    return tuple(
+        sorted(found, key=lambda item: (not item.is_foremost, not item.is_advice, -item.count))
+    )
 
 
 def sense(text: str) -> str:

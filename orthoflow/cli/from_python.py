@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from inspect import signature
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 # Options that are no fields of the engine's.
 _POPPED: Final = ("set_files", "embed")
+_WORD: Final = re.compile(r"-?[A-Za-z][A-Za-z0-9_.-]*")
+# What YAML of one version or another takes for something else.
+_NO_WORDS: Final = frozenset(("true", "false", "null", "yes", "no", "on", "off", "y", "n"))
 _OF_STEPS: Final = ("only", "from_", "until", "force")
 
 
@@ -62,7 +66,7 @@ def run(
     """
     given = [f"{name}={path}" for name, value in (inputs or {}).items() for path in _several(value)]
     changes = Changes(
-        sets=tuple(f"{name}={json.dumps(value)}" for name, value in (set or {}).items()),
+        sets=tuple(f"{name}={_spelt(value)}" for name, value in (set or {}).items()),
         set_files=_several(options.pop("set_files", ())),
         inputs=tuple(given),
         datasets=_datasets(datasets),
@@ -78,6 +82,13 @@ def run(
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.run.path)
+
+
+# Any: whatever a parameter may be.
+def _spelt(value: Any) -> str:
+    """A value as one writes it behind `--set`: words without quotes."""
+    is_word = isinstance(value, str) and _WORD.fullmatch(value)
+    return str(value) if is_word and value.lower() not in _NO_WORDS else json.dumps(value)
 
 
 # Any: whatever somebody calls a dataset.

@@ -126,7 +126,7 @@ def _cell_status(cell: RecordedCell) -> str:
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
     told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
     rows = [
-        (cell.address, metric.name, number(metric.value), metric.unit)
+        (cell.address, metric.name, number(metric.value), metric.unit if metric.unit != "1" else "")
         for cell, metric in first_rows(told, most, lambda one: quality_place(one[1].name))
     ]
     if rows:

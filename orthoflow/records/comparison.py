@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from orthoflow_provenance.model import (
     RunRecord,
 )
 
+from orthoflow.alike import first_few
 from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.foreign_text import shown
 from orthoflow.products.product import JsonValue
@@ -35,6 +37,7 @@ Side = TypeVar("Side")
 # Seconds and memory that methods measured themselves hang on the machine, too.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 _ROWS_MOST: Final = 60  # of a table in a notebook
+_FEW: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,12 +227,22 @@ class RunComparison:
         table = self.metric_table()
         is_cost = np.array([row.either.is_cost for row in self.metrics], dtype=np.bool_)
         moved = table[~is_cost & table.left.notna() & table.right.notna() & (table.difference != 0)]
-        said = f"<p>{escape(shown(repr(self)))}</p>"
+        said = f"<p>{escape(shown(repr(self)))}</p>{self._parameters_html()}"
         if moved.empty:
             return (
                 f"{said}<p>No number that both runs have differs, time and memory left aside.</p>"
             )
         return said + str(moved.to_html(index=False, max_rows=_ROWS_MOST))
+
+    def _parameters_html(self) -> str:
+        """The parameters in which both differ, the first few."""
+        rows = [row for row in self.shared(self.parameters) if row.is_shared and not row.is_same]
+        told = [
+            f"{row.cell}.{row.name}: {' -> '.join(json.dumps(side.value) for side in sides)}"
+            for row in rows
+            if (sides := [one for one in (row.left, row.right) if one is not None])
+        ]
+        return f"<p>{escape(shown(first_few(told, most=_FEW)))}</p>" if told else ""
 
     @property
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:

@@ -117,15 +117,18 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     wanted = [REPORT_FILE, *pages_of(run).values()]
     # Which the report leads to, where it was written with them.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
+    signed: tuple[str, ...] = ()
     if record is run and run.path.name == RECORD_FILE:
-        wanted.append(f"{RECORD_FILE}{SIGNATURE_SUFFIX}")
+        # Rasters that were made anew lie in a folder of their own.
+        signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
+        signed = copy_files(run.path.parent, folder, [signature], ())
     wanted += [
         f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/{file.name}"
         for address, files in run.files.items()
         for file in files
     ]
     wanted.append(f"{PRODUCTS_FOLDER}/{METRICS_FILE}")
-    return [RECORD_FILE, *copy_files(run.folder, folder, wanted, run.record.published)]
+    return [RECORD_FILE, *signed, *copy_files(run.folder, folder, wanted, run.record.published)]
 
 
 def crate_metadata(
@@ -447,7 +450,8 @@ def _how_to_read(record: RunRecord) -> str:
         f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
-        f"anew from the input files{where}; any HDF5 reader opens it, too."
+        f"anew from the input files{where}; any HDF5 reader opens it, too. Paths in "
+        f"{WORKFLOW_FILE} are of the machine that it ran on."
     )
 
 

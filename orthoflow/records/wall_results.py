@@ -69,6 +69,11 @@ class WallResult:
     colours: str
 
 
+_UNMEASURED: Final = (
+    "how far what is drawn from it is off was not measured; surveyed check points would tell"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RoomResults:
     """What a run gives of a room.
@@ -272,7 +277,7 @@ def _wall_result(
     index = about.get("plane_index", number)
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
-    said = list(_accuracy(inspections, number))
+    said = list(_accuracy(inspections, number)) or [_UNMEASURED] * ("ortho" in rasters)
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         said.append(

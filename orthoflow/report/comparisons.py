@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from pathlib import Path
 from string import ascii_uppercase
 from typing import Final
 
@@ -211,7 +212,8 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
     columns = comparison_columns(combinations)
     origins = Origins.of(runs)
-    rows = [_row(one, steps, columns, origins) for one in combinations]
+    labels = _run_labels(runs)
+    rows = [_row(one, steps, columns, origins, labels[_name(one.run)]) for one in combinations]
     return ComparisonTable(
         steps=steps,
         columns=columns,
@@ -278,7 +280,11 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 
 
 def _row(
-    one: Combination, steps: Sequence[str], columns: Sequence[Column], origins: Origins
+    one: Combination,
+    steps: Sequence[str],
+    columns: Sequence[Column],
+    origins: Origins,
+    label: str,
 ) -> Row:
     failed = one.failure
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
@@ -292,7 +298,7 @@ def _row(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
     )
     return Row(
-        run=_run_label(one.run),
+        run=label,
         variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
         is_baseline=one.is_baseline,
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
@@ -326,9 +332,25 @@ def _memory(mib: float, group: str) -> Value:
     return Value(text=f"{mib:.0f}", sort=mib, group=group)
 
 
-def _run_label(run: Run) -> str:
-    """The workflow with the options that it was run with, and the run's id."""
-    return f"{' '.join((run.record.name, *run.record.overrides))}, {run.record.run_id}"
+def _name(run: Run) -> tuple[Path, str]:
+    return run.path, run.record.run_id
+
+
+def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
+    """The workflow with the options that not all runs have, the run's folder and its id."""
+    shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
+    return {
+        _name(run): ", ".join(
+            (
+                " ".join(
+                    (run.record.name, *(one for one in run.record.overrides if one not in shared))
+                ),
+                run.path.absolute().parent.name,
+                run.record.run_id,
+            )
+        )
+        for run in runs
+    }
 
 
 def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:

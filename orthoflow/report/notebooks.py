@@ -128,14 +128,24 @@ class OpenedRun(Run):
             )
         return parts[data]
 
-    def compare(self, other: str | Path | Run) -> RunComparison:
+    def compare(
+        self, other: str | Path | Run, *, store: str | Path = ".orthoflow"
+    ) -> RunComparison:
         """Lay this run beside another one, see `RunComparison`.
+
+        Args:
+            other: the run, its folder or its record.
+            store: folder of stored results, for products that the records only name.
 
         Raises:
             ArgumentError: there is no such run.
             RecordError: a record is damaged.
         """
-        return compare_runs(self, other if isinstance(other, Run) else open_plain_run(other))
+        from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
+
+        stores = (Store(Path(store)),) if Path(store).is_dir() else ()
+        opened = other if isinstance(other, Run) else open_plain_run(other)
+        return compare_runs(self, opened, stores=stores)
 
     def _repr_html_(self) -> str:
         record = self.record

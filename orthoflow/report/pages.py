@@ -58,7 +58,15 @@ from orthoflow.report.pictures import (
     wall_pictures,
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
-from orthoflow.report.summaries import Answer, Limit, answers, citations, limits, results
+from orthoflow.report.summaries import (
+    Answer,
+    Limit,
+    answers,
+    citations,
+    limits,
+    results,
+    says_how_far_off,
+)
 from orthoflow.report.ways import Way, improved_on, ways
 from orthoflow.version import __version__
 
@@ -131,6 +139,7 @@ class _Section:
     title: str = ""
     whole: str = ""
     doubt: str = ""
+    is_measured: bool = True
     datasets: DatasetTable | None = None
     over: tuple[MetricOverDatasets, ...] = ()
     leads: str = ""
@@ -398,6 +407,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         run=run,
         prefix=prefix,
         answers=answers(run),
+        is_measured=says_how_far_off(run),
         limits=limits(run),
         results=results(run),
         comparison=comparison,

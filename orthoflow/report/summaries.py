@@ -40,6 +40,7 @@ QUALITY: Final[Mapping[str, str]] = {
 
 _DECLARED_MOST: Final = 3
 _IMAGE: Final = re.compile(r"/wall_(\d+)_ortho\.tif$")
+_PLACE: Final = re.compile(r"(.*\S) \(([^()]+)\)")
 _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
@@ -111,6 +112,16 @@ def answers(run: Run) -> tuple[Answer, ...]:
     return tuple(found)
 
 
+def says_how_far_off(run: Run) -> bool:
+    """Whether an inspection of the baseline measured lengths, by which its pictures are off."""
+    return any(
+        metric.unit == "mm"
+        for cell in baseline_cells(run)
+        if cell.method.startswith("inspect.")
+        for metric in cell.metrics
+    )
+
+
 def _is_of_others(run: Run, address: str) -> bool:
     """Whether a cell looks at orthoimages that were read from files."""
     makers = (
@@ -124,9 +135,9 @@ def _is_of_others(run: Run, address: str) -> bool:
 def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, those of one sense together.
 
-    Of the warnings that no later step has settled those that help stand first, of them those of
-    what was measured on the results, then the frequent ones, then the baseline's; last what speaks
-    only of planes of which no orthoimage was made.
+    Of the warnings that no later step has settled what turns every picture over stands first; then
+    those that help, of them those of what was measured on the results, then the frequent ones, then
+    the baseline's; last what speaks only of planes of which no orthoimage was made.
     """
     failures = alike(
         (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
@@ -140,6 +151,7 @@ def limits(run: Run) -> tuple[Limit, ...]:
     warnings = sorted(
         alike(standing_warnings(by_baseline)),
         key=lambda item: (
+            not item.is_foremost,
             _is_of_others_than(imaged, item.sentence),
             not item.is_advice,
             measuring.isdisjoint(item.places),
@@ -172,10 +184,14 @@ def _in_words(metric: str, value: float, unit: str) -> str:
 
 
 def citations(run: Run) -> dict[str, tuple[str, ...]]:
-    """What the methods of a run ask to be cited: text -> methods."""
+    """What the methods of a run ask to be cited: text -> methods, with what each takes of it."""
     found: dict[str, dict[str, None]] = {}
     for cell in run.record.cells:
         if cell.status != "skipped":
             for citation in cell.citations:
-                found.setdefault(citation, {})[cell.method] = None
+                # `..., doi:... (4.4, Table 2)`: one entry for a paper, wherever in it a method is.
+                placed = _PLACE.fullmatch(citation)
+                text, place = placed.groups() if placed else (citation, "")
+                method = f"{cell.method}: {place}" if place else cell.method
+                found.setdefault(text, {})[method] = None
     return {citation: tuple(methods) for citation, methods in found.items()}

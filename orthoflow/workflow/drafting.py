@@ -154,8 +154,11 @@ class _Drafting:
 
     def _place(self, path: Path) -> str:
         """A path as the workflow names it: from its folder."""
-        relative = os.path.relpath(path.resolve(), self.target.resolve().parent)
-        return Path(relative).as_posix()
+        here, place = (Path(os.path.normpath(one.absolute())) for one in (self.target.parent, path))
+        if not place.is_relative_to(here):
+            # `..` behind a link leads elsewhere than it reads.
+            here, place = here.resolve(), place.resolve()
+        return Path(os.path.relpath(place, here)).as_posix()
 
     def _heading(self, start: str, described: Mapping[str, str], left_out: Sequence[str]) -> str:
         said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]

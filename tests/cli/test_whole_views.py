@@ -46,7 +46,7 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
         "",
         f"{'step':31}  metric  value  unit",
         f"{wall}  rms_mm  1.25   mm",
-        f"{wall}  cells   5400   1",
+        f"{wall}  cells   5400",
         "",
         "environment: Python 3.11.7, Linux 6.1, A processor, 2 cores, 2 threads",
         "numpy 2.4.0, h5py 3.16.0 and 0 others (--json names them)",

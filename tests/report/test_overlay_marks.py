@@ -228,7 +228,8 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
         ("check", "compile_s", "time of loading and compiling / s", Sense.NEITHER),
     ]
     fine, coarse, broken = table.rows
-    assert {row.run for row in table.rows} == {"toy <run>, r1"}
+    here = tmp_path.name
+    assert {row.run for row in table.rows} == {f"toy <run>, {here}, r1"}
     assert [row.variants for row in table.rows] == [("fine",), ("coarse",), ("broken",)]
     assert [row.is_baseline for row in table.rows] == [True, False, False]
     assert broken.failure == "plane@plane=broken: no plane & no <wall>"

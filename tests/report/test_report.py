@@ -121,11 +121,11 @@ def test_only_a_page_beside_its_figures_leads_to_their_files(compared: Run, tmp_
 def test_what_was_skipped_asks_for_no_citation() -> None:
     cells = [
         cell("plane", citations=("Planes, 2015",)),
-        cell("wall", citations=("Planes, 2015", "Walls, 2016")),
+        cell("wall", citations=("Planes, 2015 (4, Table 2)", "Walls, 2016")),
         cell("photo", status="skipped", citations=("Photos, 2017",)),
     ]
     assert citations(run(*cells)) == {
-        "Planes, 2015": ("plane.toy", "wall.toy"),
+        "Planes, 2015": ("plane.toy", "wall.toy: 4, Table 2"),
         "Walls, 2016": ("wall.toy",),
     }
 
@@ -489,21 +489,21 @@ def test_runs_on_different_data_are_not_ranked_together() -> None:
     table = comparison_table(runs)
     assert table is not None
     assert [(row.run, row.values[0].group, row.values[0].mark) for row in table.rows] == [
-        ("toy <run>, r1", "a", Mark.NONE),
-        ("toy <run>, r2", "b", Mark.NONE),
+        (f"toy <run>, {Path.cwd().name}, r1", "a", Mark.NONE),
+        (f"toy <run>, {Path.cwd().name}, r2", "b", Mark.NONE),
     ]
 
 
 def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:
     cells = cell("plane", metrics=metrics(rms_mm=1.0))
     runs = [
-        run(cells, run_id=f"r{walls}", overrides=(f"--set wall.n={walls}",)) for walls in (1, 4)
+        run(cells, run_id=f"r{walls}", overrides=("--set all=0", f"--set wall.n={walls}"))
+        for walls in (1, 4)
     ]
     table = comparison_table(runs)
     assert table is not None
     assert [row.run for row in table.rows] == [
-        "toy <run> --set wall.n=1, r1",
-        "toy <run> --set wall.n=4, r4",
+        f"toy <run> --set wall.n={walls}, {Path.cwd().name}, r{walls}" for walls in (1, 4)
     ]
 
 

@@ -130,6 +130,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         writer="results:export_crate",
         summary="record, report and products as a Provenance Run Crate, for archives",
         options=frozenset({"license_text", "author"}),
+        takes_rasters=True,
     ),
     "sheet": Format(
         writer="drawings:export_sheets",

@@ -62,9 +62,14 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     """Write a crate, with an embedded record if wanted."""
     from orthoflow.records.crates import NO_LICENSE, write_crate
+    from orthoflow.records.runs import REPORT_FILE
+    from orthoflow.report import write_page
 
     make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
+    if run.files_folder is not None:
+        # Of a record that lies alone its rasters were made anew, in a folder of their own.
+        write_page(run, run.folder / REPORT_FILE)
     record = embedded(run, folder, chosen) if chosen.embed else None
     author = (chosen.author or "").strip()
     files = write_crate(run, folder, license_text=license_text, author=author, record=record)

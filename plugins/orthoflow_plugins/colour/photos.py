@@ -39,7 +39,10 @@ class ColourPhotos(Method):
         "n_photos",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "Skarlatos and Kiparissi 2012 (orthoimages from coloured clouds)",
+        (
+            "Skarlatos, Kiparissi, Theodoridou 2012, Direct orthophoto generation from color "
+            "point clouds of complex scenes"
+        ),
     )
 
     class Params(MethodParams):

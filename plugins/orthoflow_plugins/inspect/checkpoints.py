@@ -78,7 +78,10 @@ class InspectCheckpoints(Method):
         *of_walls(IMAGE_QUALITY),
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "Skarlatos and Kiparissi 2012 (direct orthoimages from point clouds, 4.5, Table 1)",
+        (
+            "Skarlatos, Kiparissi, Theodoridou 2012, Direct orthophoto generation from color "
+            "point clouds of complex scenes (4.5, Table 1)"
+        ),
     )
 
     class Params(MethodParams):

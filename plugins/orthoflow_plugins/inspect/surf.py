@@ -100,8 +100,8 @@ class InspectSurf(Method):
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
-        "Bay, Ess, Tuytelaars, Van Gool 2008, Speeded-Up Robust Features (SURF)",
-        "Gruen 1985, Adaptive least squares correlation (refinement)",
+        "Bay, Ess, Tuytelaars, Van Gool 2008, SURF: Speeded-Up Robust Features",
+        "Gruen 1985, Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
     )
 
     class Params(MethodParams):

@@ -132,7 +132,7 @@ class InspectTruth(Method):
         *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "Gruen 1985, Adaptive least squares correlation (patch matching)",
+        "Gruen 1985, Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
         "Hoehle and Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003 (NMAD)",
     )
 

@@ -66,10 +66,13 @@ class MatchGuided(Method):
         "n_by_hand",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
-        "gruen1985: Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
-        "shi1994: Good features to track, doi:10.1109/CVPR.1994.323794",
-        "ye2019: Fast and robust matching for multimodal images, doi:10.1109/TGRS.2019.2924684",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.3)",
+        "Gruen 1985, Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
+        "Shi, Tomasi 1994, Good features to track, doi:10.1109/CVPR.1994.323794",
+        (
+            "Ye et al. 2019, Fast and robust matching for multimodal images, "
+            "doi:10.1109/TGRS.2019.2924684"
+        ),
     )
 
     class Params(MethodParams):

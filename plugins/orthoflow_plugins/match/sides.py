@@ -59,7 +59,7 @@ class FaceByPhotos(Method):
         "n_planes_turned",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
+        "Lowe 2004, Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
     )
 
     class Params(MethodParams):

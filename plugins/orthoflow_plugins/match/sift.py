@@ -72,9 +72,12 @@ class MatchSift(Method):
         "n_by_hand",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.5, 3.6",
-        "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
-        "arandjelovic2012: Three things everyone should know, doi:10.1109/CVPR.2012.6248018",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.5, 3.6)",
+        "Lowe 2004, Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
+        (
+            "Arandjelovic, Zisserman 2012, Three things everyone should know, "
+            "doi:10.1109/CVPR.2012.6248018"
+        ),
     )
 
     class Params(MethodParams):

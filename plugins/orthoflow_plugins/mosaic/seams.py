@@ -117,7 +117,7 @@ class MosaicSeams(Method):
         "overlap_v_rms_cells",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.4",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4)",
         "Kwatra et al. 2003, doi:10.1145/882262.882264 (graph-cut seams)",
     )
 

@@ -242,6 +242,9 @@ def correlation_notes(
 ) -> list[str]:
     """Say where the photos hardly tell a lens from where they were taken."""
     notes = []
+    # Lenses of one camera, which nothing says to be one, have each to be told from its own photos.
+    shared = ", or intrinsics: shared where one camera took them all at one zoom,"
+    also = shared if len(block.lenses) > 1 else ""
     scale = np.sqrt(np.diag(cofactors))
     correlations = np.abs(cofactors / np.outer(scale, scale))
     for index, lens in enumerate(block.lenses):
@@ -256,8 +259,8 @@ def correlation_notes(
                 notes.append(
                     f"the {name} of the lens of {photos[members[0]].name} and the "
                     f"{_POSE_NAMES[worst]} of its photos correlate by {confused[worst]:.3f}: "
-                    "photos from other sides, some turned by 90 degrees, or a calibration would "
-                    "tell them apart"
+                    f"photos from other sides, some turned by 90 degrees, or a calibration{also} "
+                    "would tell them apart"
                 )
     return notes
 

@@ -69,9 +69,12 @@ class OrientColmapBundle(Method):
         *("n_photo_points", "photo_tie_rmse_px", "sigma0", "redundancy"),
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
-        "triggs2000: Bundle adjustment, a modern synthesis, doi:10.1007/3-540-44480-7_21",
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
+        (
+            "Schoenberger, Frahm 2016, Structure-from-motion revisited (COLMAP), "
+            "doi:10.1109/CVPR.2016.445"
+        ),
+        "Triggs et al. 2000, Bundle adjustment, a modern synthesis, doi:10.1007/3-540-44480-7_21",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.3)",
     )
 
     class Params(OrientParams):

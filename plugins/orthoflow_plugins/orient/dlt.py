@@ -36,9 +36,9 @@ class OrientDlt(Method):
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
-        "abdelaziz1971: Direct linear transformation, doi:10.14358/PERS.81.2.103",
-        "hartley1997: In defense of the eight-point algorithm, doi:10.1109/34.601246",
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
+        "Abdel-Aziz, Karara 1971, Direct linear transformation, doi:10.14358/PERS.81.2.103",
+        "Hartley 1997, In defense of the eight-point algorithm, doi:10.1109/34.601246",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.6, 4.3)",
     )
 
     class Params(OrientParams):

@@ -40,10 +40,10 @@ class OrientPnp(Method):
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
-        "raguram2013: USAC, universal random sample consensus, doi:10.1109/TPAMI.2012.257",
-        "torr2000: MLESAC (and MSAC), doi:10.1006/cviu.1999.0832",
-        "ke2017: An efficient algebraic solution to P3P, doi:10.1109/CVPR.2017.491",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.6, 4.3)",
+        "Raguram et al. 2013, USAC, universal random sample consensus, doi:10.1109/TPAMI.2012.257",
+        "Torr, Zisserman 2000, MLESAC (and MSAC), doi:10.1006/cviu.1999.0832",
+        "Ke, Roumeliotis 2017, An efficient algebraic solution to P3P, doi:10.1109/CVPR.2017.491",
     )
 
     class Params(OrientParams):

@@ -81,7 +81,7 @@ class DsmBackward(Method):
         "painting_s",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7, 4.4)",
     )
 
     class Params(VisibilityParams):

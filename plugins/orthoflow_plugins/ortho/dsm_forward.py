@@ -71,7 +71,7 @@ class DsmForward(Method):
         "painting_s",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7)",
     )
 
     class Params(VisibilityParams):

@@ -130,8 +130,8 @@ def warn_of_heads(
     opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
     ctx.warn(
         f"{n_down} of {len(tops)} photos stand on their heads: if the scan's vertical axis points "
-        f"down, so do walls, orthoimages and the names of floor and ceiling; set up: {opposite} "
-        "of read.scan"
+        f"down, so do walls, orthoimages and the names of floor and ceiling; set up of read.scan "
+        f"to {opposite}"
     )
 
 

@@ -67,7 +67,10 @@ class PointcloudDirect(Method):
         "filling_s",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "skarlatos2012: Direct orthophoto generation from color point clouds of complex scenes, 3",
+        (
+            "Skarlatos, Kiparissi, Theodoridou 2012, Direct orthophoto generation from color "
+            "point clouds of complex scenes (3)"
+        ),
     )
 
     class Params(MethodParams):

@@ -90,7 +90,7 @@ class RasterGrid(Method):
         "intensity_scale_spread",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.4, 4.2)",
     )
 
     class Params(MethodParams):

@@ -42,8 +42,11 @@ class ReadCameras(Method):
         "n_refused",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
-        "snavely2006: Photo tourism (Bundler), doi:10.1145/1141911.1141964",
+        (
+            "Schoenberger, Frahm 2016, Structure-from-motion revisited (COLMAP), "
+            "doi:10.1109/CVPR.2016.445"
+        ),
+        "Snavely, Seitz, Szeliski 2006, Photo tourism (Bundler), doi:10.1145/1141911.1141964",
         "Agisoft Metashape Professional user manual, camera models",
     )
 

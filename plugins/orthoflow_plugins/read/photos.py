@@ -74,10 +74,13 @@ class ReadPhotos(Method):
         "megapixels",
     )
     citations: ClassVar[tuple[str, ...]] = (
-        "CIPA DC-008, Exchangeable image file format for digital still cameras (Exif)",
+        "CIPA DC-008, Exchangeable image file format for digital still cameras, Exif",
         "CIPA DCG-001, 35 mm equivalent focal length over the diagonal",
         "Brown 1971, Close-range camera calibration, Photogrammetric Engineering 37(8)",
-        "kannala2006: A generic camera model ... for fish-eye lenses, doi:10.1109/TPAMI.2006.153",
+        (
+            "Kannala, Brandt 2006, A generic camera model ... for fish-eye lenses, "
+            "doi:10.1109/TPAMI.2006.153"
+        ),
     )
 
     class Params(MethodParams):

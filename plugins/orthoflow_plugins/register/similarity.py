@@ -45,7 +45,10 @@ class RegisterSimilarity(Method):
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",
-        "Skarlatos and Kiparissi 2012 (4.3, seven-parameter transformation)",
+        (
+            "Skarlatos, Kiparissi, Theodoridou 2012, Direct orthophoto generation from color "
+            "point clouds of complex scenes (4.3)"
+        ),
     )
 
     class Params(MethodParams):

@@ -45,7 +45,7 @@ def test_every_format_has_its_writer(target: str) -> None:
 
 def test_what_draws_or_shows_rasters_takes_those_beside_the_record() -> None:
     taking = {target for target, entry in FORMATS.items() if entry.takes_rasters}
-    assert taking == {"dxf", "geojson", "gltf", "tiles", "stac", "sheet"}
+    assert taking == {"dxf", "geojson", "gltf", "tiles", "stac", "sheet", "ro-crate"}
 
 
 @pytest.mark.parametrize("name", GIVEN)

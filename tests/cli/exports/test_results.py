@@ -16,6 +16,7 @@ class Cells(SimpleNamespace):
     """A run of three cells."""
 
     cells: Any = ("a", "b", "c")
+    files_folder: Any = None
 
     def cell(self, address: str) -> Any:
         return SimpleNamespace(address=address)

@@ -42,9 +42,9 @@ def said(folder: Path, *turns_deg: float, sign: float = 1.0) -> list[str]:
 def test_a_scan_whose_up_is_down_is_told_by_its_photos(tmp_path: Path) -> None:
     (warning,) = said(tmp_path, 0.0, 10.0, -20.0, 180.0, sign=-1.0)
     assert warning.startswith("3 of 4 photos stand on their heads")
-    assert "set up: z of read.scan" in warning
+    assert "set up of read.scan to z" in warning
     (warning,) = said(tmp_path, 180.0)
-    assert "set up: -z of read.scan" in warning
+    assert "set up of read.scan to -z" in warning
 
 
 @pytest.mark.parametrize(
