@@ -70,7 +70,7 @@ class WallResult:
 
 
 _UNMEASURED: Final = (
-    "how far what is drawn from it is off was not measured; surveyed check points would tell"
+    "how far drawings made from it are off was not measured; surveyed check points would tell"
 )
 
 
