@@ -210,11 +210,11 @@ def test_who_is_there_is_looked_up_every_two_seconds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("status", "n_running", "alone_s", "is_lost"),
     [
-        ("running", 1, 59.0, False),
-        ("running", 1, 61.0, True),
-        ("running", 0, 61.0, False),
+        ("running", 1, 54.0, False),
+        ("running", 1, 66.0, True),
+        ("running", 0, 66.0, False),
         # It looks for a scheduler that it has lost.
-        ("connecting", 1, 61.0, True),
+        ("connecting", 1, 66.0, True),
     ],
 )
 def test_without_workers_a_run_waits_a_minute(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from orthoflow.records.runs import Run
 from orthoflow.report.comparisons import Origins, _letter, comparison_table, environment_words
 from orthoflow.report.overlays import (
     Vectors,
@@ -179,6 +181,24 @@ def test_marks_are_shared_out_over_the_drawings_of_a_page(
     assert (walls_cell, list(known)) == ("wall@plane=fine", list(range(n_walls)))
     assert frames.behind("check@plane=coarse") == ("", {})
     assert frames.behind("scan") == ("", {})
+
+
+def test_orientations_and_inspections_share_the_bytes_of_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+    of = _Frames.of
+
+    def noting(run: Run, pictures: Sequence[Picture], *, share: float) -> _Frames:
+        asked.append(share)
+        return of(run, pictures, share=share)
+
+    monkeypatch.setattr(_Frames, "of", staticmethod(noting))
+    run = compared_run(tmp_path)
+    # Two orientations and two inspections, over no wall that is known.
+    assert list(overlays(run, [], share=0.5)) == []
+    assert list(overlays(run, [])) == []
+    assert asked == [0.125, 0.25]
 
 
 # --- sliders ---
