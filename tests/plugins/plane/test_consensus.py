@@ -306,3 +306,16 @@ def test_three_points_make_a_hypothesis(n_free: int, is_drawn: bool) -> None:
     left.claims[[0, 700, 1900][:n_free]] = -1
     over._draw(left)
     assert (over._pool is not None) == is_drawn
+
+
+def test_where_the_first_points_are_taken_the_others_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(consensus, "_SECOND_POINTS", 100)
+    left = unassigned()
+    over = ConsensusProposer(left, search(family="any"), np.random.default_rng(0))
+    left.claims[over._shuffled[:350]] = 0
+    over._draw(left)
+    assert over._pool is not None
+    wanted = left.sample.offsets_m[over._shuffled[350:450]] - over._centre_m
+    np.testing.assert_array_equal(over._pool.asked_m, wanted)
