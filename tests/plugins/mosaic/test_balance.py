@@ -307,6 +307,47 @@ def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere(
     assert max(np.abs(a - b).max() for a, b in zip(plain.logs, found.logs, strict=True)) > 0.03
 
 
+@pytest.mark.parametrize("apart", [0.05, -0.15, 0.3])
+def test_layers_meet_at_a_seam_by_what_each_paints_about_it(apart: float) -> None:
+    # Two layers all over a wall of 16 x 24 blocks, whose seam lies in the middle; what the second
+    # shows beyond the fourth block after the seam is not known.
+    shape = (16, 24)
+    logs = np.zeros((2, *shape, 3), dtype=np.float32)
+    logs[1] = apart
+    logs[1, :, 16:] = np.nan
+    box = (slice(0, 16), slice(0, 24))
+    found = Balance(
+        blocks=Blocks.over((160, 240), 10),
+        lights=tuple(BlockLight(box=box, log_light=one) for one in logs),
+        logs=(np.zeros((*shape, 3), np.float32),) * 2,
+        exposures=Exposures(
+            exposures=np.zeros((2, 3)), lenses=np.zeros((0, 2)), nodes=np.zeros((2, 4, 4, 3))
+        ),
+    )
+    source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
+    one, other = with_seams(found, source, None, feather_cells=40).logs
+    # As far as both show one thing, and as far as that is known within a block and a half.
+    alike = 1.0 / (1.0 + (apart / 0.15) ** 2) ** 2
+    offsets = np.arange(-5, 6)
+    bell = np.exp(-0.5 * (offsets / 1.5) ** 2)
+    for column in (8, 11, 12, 14, 15, 16, 17):
+        is_known = column + offsets < 16
+        known = alike * bell[is_known].sum() / bell.sum()
+        np.testing.assert_allclose(
+            one[8, column] - other[8, column], apart * known / (known + 0.02), rtol=1e-4
+        )
+    # Half of the width of four blocks is the deviation of who paints about a block.
+    offsets = np.arange(-6, 7)
+    bell = np.exp(-0.5 * (offsets / 2.0) ** 2)
+    for column in (8, 11, 12, 14):
+        share = bell[column + offsets >= 12].sum() / bell.sum()
+        taken = one[8, column] / (one[8, column] - other[8, column])
+        np.testing.assert_allclose(taken, share, rtol=1e-4)
+    # Farther from the seam each stays as it is.
+    assert not one[:, :6].any()
+    assert not other[:, 18:].any()
+
+
 def photographed(fx: float, width: int = 400, height: int = 300) -> Camera:
     frame = inspect_scenes.frame(shape=SHAPE)
     middle = frame.world_from_wall(np.array([[120.0, 60.0]]))[0]
