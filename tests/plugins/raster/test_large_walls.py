@@ -65,11 +65,11 @@ def mapped(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
     return array.view(np.ndarray)
 
 
-def large_inputs(folder: Path) -> DsmBackward.In:
-    """The wall of `ortho_scenes` in cells of a seventh, its rasters in files, and two photos."""
+def large_inputs(folder: Path, n: int = 7) -> DsmBackward.In:
+    """The wall of `ortho_scenes` in cells of an nth, its rasters in files, and two photos."""
     where = ortho_scenes.frame()
-    fine = dataclasses.replace(where, gsd_m=where.gsd_m / 7, width=7 * 320, height=7 * 240)
-    depths = np.repeat(np.repeat(ortho_scenes.depth_m(), 7, axis=0), 7, axis=1)
+    fine = dataclasses.replace(where, gsd_m=where.gsd_m / n, width=n * 320, height=n * 240)
+    depths = np.repeat(np.repeat(ortho_scenes.depth_m(), n, axis=0), n, axis=1)
     walls = ortho_scenes.walls(fine, depths)
     wall = dataclasses.replace(
         walls.walls[0],
@@ -93,10 +93,13 @@ def large_inputs(folder: Path) -> DsmBackward.In:
 def test_layers_are_painted_and_reported_without_memory_per_cell(
     tmp_path: Path, method: type[DsmBackward | DsmForward]
 ) -> None:
-    given = large_inputs(tmp_path)
-    inputs = method.In(walls=given.walls, photos=given.photos, cameras=given.cameras)
+    (tmp_path / "small").mkdir()
+    small, inputs = (
+        method.In(walls=made.walls, photos=made.photos, cameras=made.cameras)
+        for made in (large_inputs(tmp_path / "small", 2), large_inputs(tmp_path))
+    )
     n_cells = inputs.walls.walls[0].mask.size
-    method().run(inputs, method.Params(), context(tmp_path))  # compiled and loaded
+    method().run(small, method.Params(), context(tmp_path))  # compiled and loaded, in files too
     with peak_bytes() as peak:
         layers = method().run(inputs, method.Params(), context(tmp_path)).layers
         # A layer holds eight bytes per cell, what hides cells two more, and forward eight besides.
