@@ -13,6 +13,16 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.rotations import rotation_from_vector
 
 POSE_PARAMETERS: Final = 6
+# EXIF says the focal length to a whole number of millimetres, or of the full-frame equivalent, and
+# nothing of the focusing distance; nothing at all leaves what lenses usually are.
+_EXIF_SIGMA: Final = 0.05
+_UNKNOWN_SIGMA: Final = 0.35
+# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came
+# out wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
+_CENTRE_SHARE: Final = 0.01
+_K1_SIGMA: Final = 0.1
+_K2_SIGMA: Final = 0.1
+_TANGENTIAL_SIGMA: Final = 1e-3
 # Which of the five distortion coefficients k1, k2, p1, p2, k3 a name means.
 _COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
 
@@ -61,6 +71,22 @@ class LensFreedom:
             ("p2", self.tangential_sigma),
             ("skew", self.skew_sigma_px),
         )
+
+
+def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
+    """Give how far a lens that nobody calibrated may be from one without any errors.
+
+    Args:
+        longer_px: longer side of its photos.
+        has_exif: whether their file says the focal length.
+    """
+    return LensFreedom(
+        focal_sigma=_EXIF_SIGMA if has_exif else _UNKNOWN_SIGMA,
+        centre_sigma_px=_CENTRE_SHARE * longer_px,
+        k1_sigma=_K1_SIGMA,
+        k2_sigma=_K2_SIGMA,
+        tangential_sigma=_TANGENTIAL_SIGMA,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,7 +53,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 8
+    result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -155,7 +155,7 @@ class MatchGuided(Method):
 
     def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> TracedPhotos:
         """Trace oriented photos on the walls."""
-        from orthoflow_plugins.match.tracing import trace_photo
+        from orthoflow_plugins.match.tracing import estimated_lens, trace_photo
 
         photos, walls = inputs.photos.photos, inputs.walls
         require_photos(inputs.photos)
@@ -174,8 +174,9 @@ class MatchGuided(Method):
 
         def trace(index: int) -> Trace:
             photo = photos[index]
+            lens = estimated_lens(photo, oriented[photo.name].intrinsics)
             camera = oriented[photo.name].viewing()
-            return trace_photo(index, photo, camera, desk.targets, rule, desk.before)
+            return trace_photo(index, photo, camera, desk.targets, rule, desk.before, lens)
 
         is_any_missing = params.finds_missing and not _has_all(inputs.photos, oriented)
         traced: list[TracedPhoto] = []

@@ -17,13 +17,19 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
-from orthoflow.products import Camera, Photo, Photos, Wall
+from orthoflow.products import Camera, Intrinsics, Photo, Photos, Wall
 from orthoflow_plugins.match.channels import WallTarget
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pairing import USUAL_RULE, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.tie_pieces import key_point_ties
-from orthoflow_plugins.match.tracing import Trace, TracingRule, trace_photo
+from orthoflow_plugins.match.tracing import (
+    Trace,
+    TracingRule,
+    estimated_lens,
+    lens_by_ties,
+    trace_photo,
+)
 from orthoflow_plugins.match.warping import Before
 
 # Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
@@ -69,6 +75,7 @@ def recovered_traces(
     """
     recovered: dict[str, Trace] = {}
     known = [trace for trace in traces if trace.n_ties]
+    settled = _settled(photos, oriented, known)
     missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
     is_new = bool(known)
     while is_new and missing:
@@ -78,7 +85,7 @@ def recovered_traces(
         for index in missing:
             photo = photos.photos[index]
             found = _recovered(
-                index, photo, painted, lens_of(photo, oriented), (targets, rule, before)
+                index, photo, painted, lens_of(photo, settled), (targets, rule, before)
             )
             if found is not None:
                 recovered[photo.name] = found
@@ -87,17 +94,39 @@ def recovered_traces(
     return recovered
 
 
+def _settled(
+    photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
+) -> dict[str, Camera]:
+    """Cameras of traced photos by name, first those whose ties tell most of the focal length.
+
+    A lens that was only estimated is that by these ties.
+    """
+    cameras: list[tuple[float, Camera]] = []
+    for trace in traces:
+        photo = photos.photos[trace.view.index]
+        camera, sigma = oriented[photo.name], 0.0
+        freedom = estimated_lens(photo, camera.intrinsics)
+        if freedom is not None:
+            found, sigma = lens_by_ties(trace, freedom)
+            lens = Intrinsics.of(found, source="estimated")
+            camera = replace(camera, intrinsics=lens)
+        cameras.append((sigma, camera))
+    cameras.sort(key=lambda each: each[0])
+    return {camera.photo: camera for _, camera in cameras}
+
+
 def _recovered(
     index: int,
     photo: Photo,
     painted: Sequence[PaintedWall],
-    lens: ViewingCamera | None,
+    lens: Intrinsics | None,
     how: tuple[Sequence[WallTarget], TracingRule, Before | None],
 ) -> Trace | None:
     if lens is None:
         return None
-    pose = recovered_pose(photo_grey(photo), painted, lens)
-    found = None if pose is None else trace_photo(index, photo, pose, *how)
+    pose = recovered_pose(photo_grey(photo), painted, lens.posed())
+    freedom = estimated_lens(photo, lens)
+    found = None if pose is None else trace_photo(index, photo, pose, *how, freedom)
     return found if found is not None and found.n_ties else None
 
 
@@ -139,11 +168,11 @@ def recovered_pose(
     return _pose(pixels, points, lens, _POSE_LIMIT_SHARE * max(grey.shape))
 
 
-def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> ViewingCamera | None:
-    """Give a photo's lens: calibrated, as it came out for a photo of the same camera, or by EXIF.
+def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> Intrinsics | None:
+    """Give a photo's lens: calibrated, or as it came out for a photo of the same camera.
 
     Returns:
-        The lens at the origin; None when nothing is known of it.
+        None when nothing is known of it.
     """
     alike = [
         camera.intrinsics
@@ -152,8 +181,7 @@ def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> ViewingCamera | Non
         and (camera.intrinsics.width, camera.intrinsics.height) == (photo.width, photo.height)
         and (photo.exif_focal_px is None or _is_near(camera.intrinsics.fx, photo.exif_focal_px))
     ]
-    known = photo.intrinsics or next(iter(alike), None)
-    return None if known is None else known.posed()
+    return photo.intrinsics or next(iter(alike), None)
 
 
 def _is_near(focal_px: float, exif_focal_px: float) -> bool:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
-from orthoflow.products import Photo, Wall
+from orthoflow.products import Intrinsics, Photo, Wall
 from orthoflow_plugins.match.channels import (
     CHANNELS,
     Channels,
@@ -103,6 +103,25 @@ class _Round:
     n_outliers: int
 
 
+_Known = tuple[LensFreedom, ViewingCamera]
+"""What of a lens may be off, and a camera with the lens as it is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Refitted:
+    """A pose by the ties of a round.
+
+    Attributes:
+        camera: the pose, and the lens where it was free.
+        held_out_px: RMS of a residual coordinate of held-out ties.
+        free: what of the lens was, None where it was held.
+    """
+
+    camera: ViewingCamera
+    held_out_px: float
+    free: _Known | None
+
+
 def trace_photo(
     index: int,
     photo: Photo,
@@ -110,6 +129,7 @@ def trace_photo(
     targets: Sequence[WallTarget],
     rule: TracingRule,
     before: Before | None = None,
+    lens: LensFreedom | None = None,
 ) -> Trace:
     """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
 
@@ -121,6 +141,9 @@ def trace_photo(
         rule: how.
         before: what stands free before the walls, as far as it is known: patches keep off what it
             hides.
+        lens: how far the lens may be off, too, where it was only estimated. Held as first ties had
+            it where ties ask for another, it would bend what is searched, and leave out as wrong
+            what contradicts it.
     """
     view = view_of(index, photo, camera, [target.wall for target in targets], before)
     found: Trace | None = None
@@ -129,11 +152,38 @@ def trace_photo(
             continue
         # What one content found out about the pose is the next one's start.
         start = (view, rule.radius_cells) if found is None else (found.view, _RADIUS_LEAST)
-        tried = _traced(start, targets, rule, content)
+        tried = _traced(start, targets, rule, content, lens)
         if found is None or _is_better(tried, found):
             found = tried
     assert found is not None  # noqa: S101 - there is at least one content
     return found
+
+
+def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None:
+    """Give how far the lens of a photo may be off that its first orientation estimated.
+
+    Returns:
+        None where it was calibrated, or given from elsewhere.
+    """
+    if photo.intrinsics is not None or found is None or found.source != "estimated":
+        return None
+    longer_px = max(photo.width, photo.height)
+    return unmeasured(longer_px, has_exif=photo.exif_focal_px is not None)
+
+
+def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]:
+    """Give a camera as a photo's ties alone have it, and the standard deviation of ln f.
+
+    Args:
+        trace: of the photo.
+        lens: how far the lens may be off from that of its view, the focal length among it.
+    """
+    seen = _joined(trace.pieces)
+    try:
+        found = adjust(seen, trace.view.camera, lens=lens, soft_limit=2.0)
+    except GeometryError:
+        return trace.view.camera, math.inf
+    return found.camera, math.sqrt(found.covariance[POSE_PARAMETERS, POSE_PARAMETERS])
 
 
 def _is_doubtful(found: Trace, rule: TracingRule) -> bool:
@@ -158,28 +208,34 @@ def _promised(trace: Trace) -> float:
 
 
 def _traced(
-    start: tuple[View, int], targets: Sequence[WallTarget], rule: TracingRule, content: str
+    start: tuple[View, int],
+    targets: Sequence[WallTarget],
+    rule: TracingRule,
+    content: str,
+    lens: LensFreedom | None = None,
 ) -> Trace:
     view, radius = start
+    known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
+    free: _Known | None = None
     history: list[float] = []
     for _ in range(rule.n_rounds_most):
         found = _measured(view, targets, (rule, radius, content))
-        refitted, held_out_px = _refitted(_joined(found.pieces), view.camera)
-        if refitted is None:
+        fit = _refitted(_joined(found.pieces), view.camera, known)
+        if fit is None:
             # A round that finds too little does not spoil the one before.
             best = best or found
             break
-        improved = not history or held_out_px < (1.0 - _GAIN_LEAST) * min(history)
-        history.append(held_out_px)
-        if held_out_px <= min(history):
-            best = found
-        if not improved or _moved_cells(found, view, refitted) < _SETTLED_CELLS:
+        improved = not history or fit.held_out_px < (1.0 - _GAIN_LEAST) * min(history)
+        history.append(fit.held_out_px)
+        if fit.held_out_px <= min(history):
+            best, free = found, fit.free
+        if not improved or _moved_cells(found, view, fit.camera) < _SETTLED_CELLS:
             break
-        view = view.posed(refitted, [target.wall for target in targets])
+        view = view.posed(fit.camera, [target.wall for target in targets])
         radius = max(_RADIUS_LEAST, radius // 2)
     result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
-    cleaned = _without_misfits(result.pieces, view.camera)
+    cleaned = _without_misfits(result.pieces, view.camera, free)
     n_kept = sum(len(piece) for piece in cleaned)
     return Trace(
         pieces=tuple(cleaned),
@@ -284,29 +340,38 @@ def _piece(
     )
 
 
-def _refitted(seen: SeenPoints, camera: ViewingCamera) -> tuple[ViewingCamera | None, float]:
-    """Pose from three quarters of the ties, and how it fits the rest (RMS of a coordinate)."""
+def _refitted(
+    seen: SeenPoints, camera: ViewingCamera, known: _Known | None = None
+) -> _Refitted | None:
+    """Pose from three quarters of the ties, and how it fits the rest; None where there is none.
+
+    The lens moves with it where that fits the rest better, too.
+    """
     if len(seen) < _LEAST:
-        return None, math.inf
+        return None
     order = np.lexsort((seen.pixels_photo[:, 0], seen.pixels_photo[:, 1]))
     held_out = np.zeros(len(seen), dtype=np.bool_)
     held_out[order[::_HELD_OUT]] = True
-    try:
-        fitted = fitted_pose(seen.take(~held_out), camera)
-    except GeometryError:
-        return None, math.inf
-    residuals = misfit(seen.take(held_out), fitted).residuals_px
-    lengths = np.linalg.norm(residuals, axis=1)
-    # Outliers that are left must not decide whether to go on.
-    usual = float(np.median(lengths))
-    kept = residuals[lengths <= 3.0 * usual]
-    return fitted, float(np.sqrt(np.mean(kept**2)))
+    best: _Refitted | None = None
+    for free in (None,) if known is None else (None, known):
+        try:
+            fitted = fitted_pose(seen.take(~held_out), camera, free)
+        except GeometryError:
+            continue
+        residuals = misfit(seen.take(held_out), fitted).residuals_px
+        lengths = np.linalg.norm(residuals, axis=1)
+        # Outliers that are left must not decide whether to go on.
+        kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
+        tried = _Refitted(camera=fitted, held_out_px=float(np.sqrt(np.mean(kept**2))), free=free)
+        if best is None or tried.held_out_px < (1.0 - _GAIN_LEAST) * best.held_out_px:
+            best = tried
+    return best
 
 
 def fitted_pose(
     seen: SeenPoints,
     camera: ViewingCamera,
-    lens: tuple[LensFreedom, ViewingCamera] | None = None,
+    lens: _Known | None = None,
 ) -> ViewingCamera:
     """Give the pose that points agree with, those left out that do not.
 
@@ -329,13 +394,15 @@ def fitted_pose(
     return camera
 
 
-def _without_misfits(pieces: list[TiePiece], camera: ViewingCamera) -> list[TiePiece]:
+def _without_misfits(
+    pieces: list[TiePiece], camera: ViewingCamera, free: _Known | None = None
+) -> list[TiePiece]:
     """Ties that fit one pose; displaced neighbourhoods pass the median of their neighbours."""
     seen = _joined(pieces)
     if len(seen) < _LEAST:
         return pieces
     try:
-        lengths = misfit(seen, fitted_pose(seen, camera)).normalised
+        lengths = misfit(seen, fitted_pose(seen, camera, free)).normalised
     except GeometryError:
         return pieces
     good = lengths <= _limit(lengths)

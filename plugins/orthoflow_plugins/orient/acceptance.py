@@ -15,6 +15,7 @@ from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.estimation import Estimate
 from orthoflow_plugins.orient.layout import hull_area, image_cells, quadrant_counts
+from orthoflow_plugins.orient.lenses import UNKNOWN
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError, wall_error
 
 _TIES_LEAST: Final = 8
@@ -163,7 +164,7 @@ def warnings_for(candidate: Candidate) -> list[str]:
         notes.append(
             f"the control covers {candidate.hull_ratio:.0%} of the part that shows the walls"
         )
-    if candidate.estimate.source == "none":
+    if candidate.estimate.source == UNKNOWN:
         notes.append("neither calibration nor EXIF says its focal length, which was estimated")
     return notes
 

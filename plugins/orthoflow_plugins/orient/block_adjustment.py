@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import Misfit, Resection, misfit, moved_origin
+from orthoflow.geometry.resection import Misfit, Resection, fitted, misfit, moved_origin
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow_plugins.orient.block import (
     Block,
@@ -28,7 +29,7 @@ from orthoflow_plugins.orient.estimation import (
     unit_deviation,
     without_chance,
 )
-from orthoflow_plugins.orient.lenses import LensGroups, intrinsics_of
+from orthoflow_plugins.orient.lenses import UNKNOWN, LensGroups, focal_sigma, intrinsics_of
 from orthoflow_plugins.orient.photo_ties import PhotoTies
 from orthoflow_plugins.orient.single_photo import ByHand, TiedPhoto
 
@@ -150,16 +151,19 @@ def _start(
     groups: LensGroups,
     middle: NDArray[np.float64],
 ) -> _State:
+    alone = [item.estimate.resection.camera for item in photos]
     cameras: list[ViewingCamera] = []
     for at, item in enumerate(photos):
-        lens = groups.lenses[groups.lens_of[at]]
-        own = item.estimate.resection.camera.shifted(middle)
+        lens, own = groups.lenses[groups.lens_of[at]], alone[at]
         if not lens.freedom.sigmas.size:
             own = posed(lens.prior, own)
-        elif groups.lens_of.index(groups.lens_of[at]) != at:
+        elif lens.source == UNKNOWN:
+            best = _best_known(photos, groups, at)
+            own = own if best == at else _with_lens(item, alone[best])
+        else:
             # Photos that share a lens start from that of the first of them.
-            own = posed(cameras[groups.lens_of.index(groups.lens_of[at])], own)
-        cameras.append(own)
+            own = posed(alone[groups.lens_of.index(groups.lens_of[at])], own)
+        cameras.append(own.shifted(middle))
     return _State(
         cameras=tuple(cameras),
         tie_points=ties.points_world - middle,
@@ -168,6 +172,23 @@ def _start(
         tie_active=np.ones(len(ties.photo), dtype=np.bool_),
         tie_sigma=_TIE_SIGMA_START_PX,
     )
+
+
+def _best_known(photos: Sequence[Trusted], groups: LensGroups, at: int) -> int:
+    """Index of the photo whose own ties tell most of the focal length of a photo's lens."""
+    members = [k for k, lens in enumerate(groups.lens_of) if lens == groups.lens_of[at]]
+    return min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
+
+
+def _with_lens(item: Trusted, lens: ViewingCamera) -> ViewingCamera:
+    """Pose of a photo with another lens: with another focal length it stands elsewhere."""
+    estimate = item.estimate
+    control = item.tied.seen.take(estimate.agreeing & ~item.tied.is_check)
+    start = posed(lens, estimate.resection.camera)
+    try:
+        return fitted(control, start)
+    except GeometryError:
+        return start
 
 
 def _block(

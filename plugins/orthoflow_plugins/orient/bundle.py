@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from importlib.metadata import version
 from typing import ClassVar, Final
 
@@ -34,6 +34,7 @@ from orthoflow_plugins.orient.photo_ties import (
     tie_photos,
 )
 from orthoflow_plugins.orient.reporting import hand_over
+from orthoflow_plugins.orient.shared_lenses import of_another_lens
 from orthoflow_plugins.orient.single_photo import (
     Oriented,
     TiedPhoto,
@@ -48,6 +49,8 @@ from orthoflow_plugins.orient.single_photo import (
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
+# So shared, a lens is asked of each of its photos whether it can be its own.
+_TESTED: Final = "focal-group"
 
 
 class OrientColmapBundle(Method):
@@ -58,11 +61,12 @@ class OrientColmapBundle(Method):
     and the Ceres solver then adjust poses, lenses and points together: every tie with a wall pulls
     with the standard deviation that its matcher gives, ties between photos with the one that their
     residuals show. Lenses without calibration start from EXIF and are refined, common to the photos
-    that share a focal length. Photos are judged as in `orient.pnp`, by the same withheld ties.
+    that share a focal length, or without EXIF to those whose ties do not contradict that. Photos
+    are judged as in `orient.pnp`, by the same withheld ties.
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 7
+    result_version: ClassVar[int] = 8
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         *ORIENTATION_METRICS,
@@ -82,8 +86,9 @@ class OrientColmapBundle(Method):
 
         intrinsics: Sharing = Field(
             default="focal-group",
-            description="Which photos share a lens: those of one size and one known focal length "
-            "(focal-group), all of one size (shared), or none (per-photo).",
+            description="Which photos share a lens: those of one size and one focal length, or of "
+            "one size where no file says it and their ties do not contradict (focal-group), "
+            "all of one size (shared), or none (per-photo).",
         )
         refine: Refined = Field(
             default="uncalibrated",
@@ -171,11 +176,22 @@ def _adjusted(
 ) -> Adjusted | None:
     photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
-    groups = lens_groups(photos, cameras, params.intrinsics, params.refine)
     between = _photo_ties(block, params, ctx)
     ctx.progress(_SHARE_FEATURES, "bundle adjustment")
+    apart: Set[int] = frozenset()
     try:
-        return adjust_block(block, between, groups)
+        while True:
+            groups = lens_groups(photos, cameras, params.intrinsics, params.refine, apart)
+            adjusted = adjust_block(block, between, groups)
+            others = of_another_lens(block, adjusted) if params.intrinsics == _TESTED else apart
+            if others <= apart:
+                return adjusted
+            for at in sorted(others):
+                ctx.log(
+                    f"photo {photos[at].name}: its ties contradict the lens of the other photos of "
+                    "its size, so it gets one of its own"
+                )
+            apart |= others
     except GeometryError as error:
         ctx.warn(f"the photos stay as each was oriented by itself: {error}")
         return None

@@ -28,7 +28,7 @@ from orthoflow.geometry.resection import (
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Intrinsics, Photo
 from orthoflow_plugins.orient.layout import GROUPS, image_cells
-from orthoflow_plugins.orient.lenses import intrinsics_of, lens_prior
+from orthoflow_plugins.orient.lenses import UNKNOWN, intrinsics_of, lens_prior
 
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
@@ -153,7 +153,7 @@ def robust_start(
     prior, control = lens_prior(photo), seen.take(~is_check)
     if rule.threshold_px is None:
         # A lens known only roughly misplaces even right ties.
-        slack = 1.0 if prior.source not in ("exif", "none") else 2.0
+        slack = 1.0 if prior.source not in ("exif", UNKNOWN) else 2.0
         rule = replace(rule, threshold_px=slack * rule.rejection_sigma * expected_px(control))
     best: _RobustPose | None = None
     for intrinsics in prior.guesses:

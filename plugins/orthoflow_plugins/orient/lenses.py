@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -10,23 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera, undistorted
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
 from orthoflow.geometry.resection import Resection
 from orthoflow.products import Intrinsics, Photo
 
 Sharing = Literal["focal-group", "shared", "per-photo"]
 Refined = Literal["uncalibrated", "all", "none"]
+UNKNOWN: Final = "none"
+"""Source of a lens of which neither a calibration nor EXIF says anything."""
 
-# EXIF says the focal length to a whole number of millimetres, or of the full-frame equivalent, and
-# nothing of the focusing distance; nothing at all leaves what lenses usually are.
-_EXIF_SIGMA: Final = 0.05
-_UNKNOWN_SIGMA: Final = 0.35
-# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came
-# out wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
-_CENTRE_SHARE: Final = 0.01
-_K1_SIGMA: Final = 0.1
-_K2_SIGMA: Final = 0.1
-_TANGENTIAL_SIGMA: Final = 1e-3
 _EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
 _UNKNOWN_FACTORS: Final = (0.6, 0.75, 0.95, 1.2, 1.6, 2.2)
 # How far a calibration may be off where it is refined all the same.
@@ -43,7 +36,7 @@ class LensPrior:
     Attributes:
         guesses: interior orientations to try, the likeliest first.
         freedom: what the adjustment may change.
-        source: `calibration`, `exif` or `none`.
+        source: `calibration`, `exif` or `UNKNOWN`.
     """
 
     guesses: tuple[Intrinsics, ...]
@@ -85,24 +78,32 @@ def lens_prior(photo: Photo) -> LensPrior:
         return LensPrior(
             guesses=(photo.intrinsics,), freedom=LensFreedom(), source=photo.intrinsics.source
         )
+    longest = max(photo.width, photo.height)
     if photo.exif_focal_px is not None:
         return LensPrior(
             guesses=tuple(_centred(photo, photo.exif_focal_px * f) for f in _EXIF_FACTORS),
-            freedom=_unmeasured(photo, _EXIF_SIGMA),
+            freedom=unmeasured(longest, has_exif=True),
             source="exif",
         )
-    longest = max(photo.width, photo.height)
     return LensPrior(
         guesses=tuple(_centred(photo, longest * f) for f in _UNKNOWN_FACTORS),
-        freedom=_unmeasured(photo, _UNKNOWN_SIGMA),
-        source="none",
+        freedom=unmeasured(longest, has_exif=False),
+        source=UNKNOWN,
     )
 
 
 def intrinsics_of(resection: Resection, source: str) -> Intrinsics:
     """Give the interior orientation after an adjustment; `source` is what it was known from."""
-    was_estimated = resection.lens.sigmas.size or source == "none"
+    was_estimated = resection.lens.sigmas.size or source == UNKNOWN
     return Intrinsics.of(resection.camera, source="estimated" if was_estimated else source)
+
+
+def focal_sigma(resection: Resection) -> float:
+    """Give the standard deviation of an adjusted ln(focal length); inf where it was held."""
+    if "focal" not in resection.lens.names:
+        return math.inf
+    column = POSE_PARAMETERS + resection.lens.names.index("focal")
+    return math.sqrt(resection.covariance[column, column])
 
 
 def lens_groups(
@@ -110,17 +111,19 @@ def lens_groups(
     cameras: Sequence[ViewingCamera],
     sharing: Sharing,
     refined: Refined,
+    apart: Set[int] = frozenset(),
 ) -> LensGroups:
     """Group photos by lens.
 
     Args:
         photos: the photos.
         cameras: each oriented by itself; where nothing is known of a lens, they start it.
-        sharing: `focal-group`: photos of one size and one known focal length share a lens;
-            `shared`: all of one size do; `per-photo`: none do.
+        sharing: `focal-group`: photos of one size and one focal length share a lens, or those of
+            one size of which no file says it; `shared`: all of one size do; `per-photo`: none do.
         refined: which lenses may change.
+        apart: photos that have a lens of their own whatever they have in common with others.
     """
-    keys = [_key(index, photo, sharing) for index, photo in enumerate(photos)]
+    keys = [_key(index, photo, sharing, apart) for index, photo in enumerate(photos)]
     names = list(dict.fromkeys(keys))
     lenses = []
     for name in names:
@@ -138,17 +141,6 @@ def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[n
     return rays
 
 
-def _unmeasured(photo: Photo, focal_sigma: float) -> LensFreedom:
-    """How far a lens without calibration may be from one without any errors."""
-    return LensFreedom(
-        focal_sigma=focal_sigma,
-        centre_sigma_px=_CENTRE_SHARE * max(photo.width, photo.height),
-        k1_sigma=_K1_SIGMA,
-        k2_sigma=_K2_SIGMA,
-        tangential_sigma=_TANGENTIAL_SIGMA,
-    )
-
-
 def _centred(photo: Photo, focal_px: float) -> Intrinsics:
     return Intrinsics(
         width=photo.width,
@@ -161,16 +153,13 @@ def _centred(photo: Photo, focal_px: float) -> Intrinsics:
     )
 
 
-def _key(index: int, photo: Photo, sharing: Sharing) -> tuple[object, ...]:
+def _key(index: int, photo: Photo, sharing: Sharing, apart: Set[int]) -> tuple[object, ...]:
     size = (photo.width, photo.height)
-    if sharing == "per-photo":
-        return (*size, index)
+    if sharing == "per-photo" or index in apart:
+        return (*size, None, index)
     if sharing == "shared":
         return size
-    if photo.intrinsics is not None:
-        return (*size, photo.intrinsics)
-    # A focal length that nobody knows may be another one for every photo.
-    return (*size, photo.exif_focal_px if photo.exif_focal_px is not None else index)
+    return (*size, photo.exif_focal_px if photo.intrinsics is None else photo.intrinsics)
 
 
 def _uncertainty(photo: Photo) -> float:
@@ -182,7 +171,7 @@ def _lens(photo: Photo, cameras: Sequence[ViewingCamera], refined: Refined) -> L
     known = lens_prior(photo)
     prior = known.guesses[0].posed()
     longest = max(photo.width, photo.height)
-    if known.source == "none":
+    if known.source == UNKNOWN:
         prior = replace(prior, fx=_median_focal(cameras), fy=_median_focal(cameras))
     if known.freedom.sigmas.size == 0:
         freedom = LensFreedom()

@@ -42,10 +42,7 @@ def test_a_calibrated_photo_keeps_its_lens() -> None:
     own = replace(VIEW, fx=777.0)
     found = lens_of(photo(intrinsics=Intrinsics.of(own)), {"old.png": oriented(500.0)})
     assert found is not None
-    assert found.fx == 777.0
-    # At the origin.
-    np.testing.assert_array_equal(found.rotation, np.eye(3))
-    np.testing.assert_array_equal(found.translation, np.zeros(3))
+    assert found == Intrinsics.of(own)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +63,37 @@ def test_photos_of_another_size_have_another_lens(size: tuple[int, int]) -> None
     cameras = {"old.png": oriented(1000.0, width=size[0], height=size[1])}
     assert lens_of(photo(), cameras) is None
     assert lens_of(photo(), {}) is None
+
+
+def test_a_missing_photo_starts_with_the_lens_that_ties_tell_best() -> None:
+    photos = ms.photos(photo(name="few.png"), photo(name="many.png"), photo())
+    rough = replace(VIEW, fx=1.1 * VIEW.fx, fy=1.1 * VIEW.fy)
+    known = {
+        name: replace(ms.oriented(rough, name=name), intrinsics=Intrinsics.of(rough, source=source))
+        for name, source in (("few.png", "estimated"), ("many.png", "estimated"))
+    }
+    traces: Any = [trace_of(at, n, rough) for at, n in ((0, 16), (1, 80))]
+    found = lens_of(photo(), recovering._settled(photos, known, traces))
+    assert found is not None
+    assert found.source == "estimated"
+    assert found.fx == pytest.approx(VIEW.fx, rel=0.01)
+    # What was given from elsewhere stays, and is known best.
+    given = Intrinsics.of(replace(rough, fx=1000.0))
+    known["few.png"] = replace(known["few.png"], intrinsics=given)
+    assert lens_of(photo(), recovering._settled(photos, known, traces)) == given
+    assert recovering._settled(photos, known, traces)["many.png"].viewing().fx == found.fx
+
+
+def trace_of(index: int, n: int, camera: ViewingCamera) -> Any:
+    """Exact ties of the view, traced from a camera."""
+    pixels, points = ties(n, seed=index)
+    piece = SimpleNamespace(
+        pixels_photo=pixels,
+        points_world=points,
+        sigma_px=np.full(len(pixels), 0.3),
+        sigma_m=np.full(len(pixels), 1e-4),
+    )
+    return SimpleNamespace(pieces=[piece], view=SimpleNamespace(index=index, camera=camera))
 
 
 def view_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,8 @@ from orthoflow_plugins.match.warping import Projection, View
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import unmeasured
+from orthoflow.products import Intrinsics, Photo
 from orthoflow.testing import photographed as ms
 from tests import samples
 
@@ -239,18 +242,65 @@ def test_too_few_ties_are_left_as_they_are() -> None:
 
 @pytest.mark.parametrize("noise_px", [0.2, 1.0])
 def test_the_ties_held_out_tell_the_error_of_a_coordinate(noise_px: float) -> None:
-    fitted, held_out_px = tracing._refitted(
+    found = tracing._refitted(
         tracing._joined([piece(400, noise_px=noise_px, wrong=(7, 100))]), camera()
     )
-    assert fitted is not None
+    assert found is not None
     # Those beyond three medians are left out; they are less than a thousandth of the others.
-    assert held_out_px == pytest.approx(noise_px, rel=0.15)
-    assert ms.wall_error_m(ms.photographed_scene(), fitted, camera()) < 0.002
+    assert found.held_out_px == pytest.approx(noise_px, rel=0.15)
+    assert ms.wall_error_m(ms.photographed_scene(), found.camera, camera()) < 0.002
 
 
 def test_of_eleven_ties_no_pose_is_refitted() -> None:
-    assert tracing._refitted(tracing._joined([piece(11)]), camera()) == (None, math.inf)
-    assert tracing._refitted(tracing._joined([piece(40)]), camera())[0] is not None
+    assert tracing._refitted(tracing._joined([piece(11)]), camera()) is None
+    assert tracing._refitted(tracing._joined([piece(40)]), camera()) is not None
+
+
+def test_a_lens_that_was_only_estimated_is_refitted_where_ties_ask_for_it() -> None:
+    """Held, it makes ties that contradict it look wrong, and what is left agrees with it."""
+    pieces, freedom = [piece(200, seed=4, noise_px=0.1)], unmeasured(900, has_exif=False)
+    seen, rough = tracing._joined(pieces), replace(camera(), distortion=np.zeros(5))
+    held = tracing._refitted(seen, rough)
+    found = tracing._refitted(seen, rough, (freedom, rough))
+    assert held is not None
+    assert held.free is None
+    assert found is not None
+    assert found.free == (freedom, rough)
+    assert held.held_out_px > 3.0 * found.held_out_px
+    assert found.camera.distortion[0] == pytest.approx(camera().distortion[0], abs=0.01)
+    kept = [
+        sum(map(len, tracing._without_misfits(pieces, rough, free))) for free in (None, found.free)
+    ]
+    assert kept[0] < kept[1] == 200
+    right = tracing._refitted(seen, camera(), (freedom, camera()))
+    assert right is not None
+    assert right.free is None
+
+
+@pytest.mark.parametrize(
+    ("source", "exif_px", "is_calibrated", "focal_sigma"),
+    [
+        ("estimated", None, False, 0.35),
+        ("estimated", 840.0, False, 0.05),
+        ("estimated", None, True, None),
+        ("calibration", None, False, None),
+    ],
+)
+def test_only_a_lens_that_was_estimated_may_be_off(
+    source: str, exif_px: float | None, is_calibrated: bool, focal_sigma: float | None
+) -> None:
+    own = Intrinsics.of(camera(), source=source)
+    photo = Photo(
+        name="a.png",
+        encoded=b"",
+        width=900,
+        height=640,
+        exif_focal_px=exif_px,
+        intrinsics=own if is_calibrated else None,
+    )
+    found = tracing.estimated_lens(photo, own)
+    assert (None if found is None else found.focal_sigma) == focal_sigma
+    assert tracing.estimated_lens(photo, None) is None
 
 
 def rounds(*found: TiePiece) -> Any:
@@ -365,7 +415,8 @@ def test_colours_are_compared_only_where_grey_leaves_doubts(
 ) -> None:
     asked = []
 
-    def traced(start: tuple[Any, int], targets: object, rule: object, content: str) -> Trace:
+    def traced(start: tuple[Any, int], *how: Any) -> Trace:
+        content = how[2]
         asked.append((content, start))
         each = spread(9 if content == "gradients" else n_grey, 50.0)
         return trace(each, content=content, view=content)

@@ -129,6 +129,39 @@ def test_errors_of_the_scan_that_photos_share_are_stated(tmp_path: Path) -> None
     assert 0.7 < rms(np.array(ratios)) < 1.0
 
 
+def without_exif() -> Photos:
+    known = bs.photos(calibrated=False).photos
+    return ms.photos(*(replace(photo, exif_focal_px=None) for photo in known))
+
+
+def test_photos_of_unknown_lenses_share_one_that_their_ties_do_not_contradict(
+    tmp_path: Path,
+) -> None:
+    together = bundle(bs.scan_ties(2), without_exif(), context(tmp_path), **ALONE)
+    assert len({camera.intrinsics for camera in together.cameras}) == 1
+    # By themselves they say 812 to 856 px.
+    assert together.cameras[0].viewing().fx == pytest.approx(840.0, abs=5.0)
+    assert rms(errors_m(together) / sigmas_m(together)) < 1.5
+
+
+@pytest.mark.parametrize(("zoom", "n_lenses"), [(0.92, 1), (0.8, 4)])
+def test_photos_that_zoomed_share_no_lens_where_it_matters(
+    tmp_path: Path, zoom: float, n_lenses: int
+) -> None:
+    """One of four photos: what its ties cannot tell does not make the stated errors too small."""
+    ties, true = bs.scan_ties(2), [*bs.viewers()]
+    middle, pixels = np.array([true[3].cx, true[3].cy]), ties.pixels_photo.copy()
+    pixels[ties.photo == 3] = middle + zoom * (pixels[ties.photo == 3] - middle)
+    true[3] = replace(true[3], fx=zoom * true[3].fx, fy=zoom * true[3].fy)
+    found = bundle(
+        replace(ties, pixels_photo=pixels), without_exif(), context(tmp_path), **ALONE
+    ).cameras
+    assert len({camera.intrinsics for camera in found}) == n_lenses
+    for camera, other in zip(found, true, strict=True):
+        assert camera.status == "ok"
+        assert ms.wall_error_m(bs.SCENE, camera.viewing(), other) < 1.5 * (camera.sigma_wall_m or 0)
+
+
 def test_lenses_of_their_own_have_a_mean_and_a_spread(tmp_path: Path) -> None:
     ties, photos = bs.scan_ties(3), bs.photos(calibrated=False)
     together = bundle(ties, photos, context(tmp_path), intrinsics="per-photo", **ALONE)

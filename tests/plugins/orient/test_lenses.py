@@ -77,7 +77,7 @@ def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) 
         ("per-photo", (0, 1, 2, 3, 4, 5)),
         ("shared", (0, 0, 0, 0, 0, 1)),
         # Two of one focal length; a third of another; two of none known; another size.
-        ("focal-group", (0, 0, 1, 2, 3, 4)),
+        ("focal-group", (0, 0, 1, 2, 2, 3)),
     ],
 )
 def test_photos_share_a_lens_by_size_and_known_focal_length(
@@ -94,6 +94,14 @@ def test_photos_share_a_lens_by_size_and_known_focal_length(
     groups = lenses.lens_groups(photos, oriented(*[500.0] * 6), sharing, "uncalibrated")
     assert groups.lens_of == lens_of
     assert len(groups.lenses) == max(lens_of) + 1
+
+
+@pytest.mark.parametrize("sharing", ["focal-group", "shared"])
+def test_photos_that_are_told_apart_share_no_lens(sharing: Sharing) -> None:
+    # An index is no focal length.
+    photos = [photo("a"), photo("b"), photo("c"), photo("d", exif_px=1.0)]
+    groups = lenses.lens_groups(photos, oriented(*[500.0] * 4), sharing, "uncalibrated", {1})
+    assert groups.lens_of == ((0, 1, 0, 2) if sharing == "focal-group" else (0, 1, 0, 0))
 
 
 def test_photos_of_one_calibration_share_their_lens_whatever_exif_says() -> None:
