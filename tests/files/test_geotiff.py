@@ -174,3 +174,25 @@ def test_a_raster_lies_in_a_map_where_its_frame_says_so() -> None:
     assert module.map_place(frame) is None
     place = module.map_place(replace(frame, map_crs="EPSG:25832"))
     assert place == module.MapPlace(corner_m=(5.0, 1.0), crs="EPSG:25832")
+
+
+def test_a_part_of_a_raster_is_read_where_it_lies(tmp_path: Path) -> None:
+    values = np.arange(48, dtype=np.float32).reshape(6, 8)
+    module.write_raster(tmp_path / "a.tif", values, gsd_m=0.5, tags={})
+    with module.RasterParts(tmp_path / "a.tif") as source:
+        part, shown = source.read((2.0, 1.0, 7.0, 4.0), (3, 5))
+        halved, _ = source.read((2.0, 0.0, 6.0, 4.0), (2, 2))
+    np.testing.assert_array_equal(part, values[1:4, 2:7])
+    assert shown.all()
+    np.testing.assert_allclose(halved, values[:4, 2:6].reshape(2, 2, 2, 2).mean(axis=(1, 3)))
+
+
+def test_a_raster_of_no_system_is_read_without_one(tmp_path: Path) -> None:
+    import rasterio
+
+    path, sides = tmp_path / "a.tif", Affine(0.5, 0.0, 10.0, 0.0, -0.5, 20.0)
+    options = {"driver": "GTiff", "width": 3, "height": 2, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", transform=sides, **options) as stream:
+        stream.write(np.ones((1, 2, 3), np.float32))
+    found = module.read_raster(path)
+    assert (found.crs_wkt, found.gsd_m, found.corner_m) == ("", 0.5, (10.0, 20.0))

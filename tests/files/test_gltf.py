@@ -144,6 +144,7 @@ def test_walls_are_painted_with_colours_that_have_their_light_already(written: P
     assert (told["scene"], told["scenes"]) == (0, [{"nodes": [0]}])
     assert told["nodes"][0]["children"] == [1, 2]
     assert [node["mesh"] for node in told["nodes"][1:]] == [0, 1]
+    assert {node["extras"]["surface"] for node in told["nodes"][1:]} == {"plane"}
 
 
 @pytest.mark.parametrize("model", ["written", "carved"])
