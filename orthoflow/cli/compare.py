@@ -23,7 +23,7 @@ from orthoflow.cli.tables import (
     echo_table,
     first_rows,
     number,
-    quality_place,
+    quality_places,
     say_more,
 )
 
@@ -172,13 +172,19 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> None:
     """Print every metric that differs; times and memory, which always do, apart and last."""
+    place = quality_places((_step(row), row.name) for row in rows)
     for title, is_cost in (("metrics", False), ("times and memory", True)):
         chosen = [row for row in rows if row.either.is_cost == is_cost]
         different = [row for row in chosen if not row.is_same]
         echo("", f"{title}: {_counts(chosen)}")
         if different:
-            _print_numbers(first_rows(different, most, lambda row: quality_place(row.name)))
+            _print_numbers(first_rows(different, most, lambda row: place((_step(row), row.name))))
         say_more(len(different), most)
+
+
+def _step(row: Pair[ComparedMetric]) -> str:
+    """The step of a row, from its address."""
+    return row.cell.partition("@")[0].partition("#")[0]
 
 
 def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:

@@ -24,7 +24,7 @@ from orthoflow.cli.tables import (
     echo_warnings,
     first_rows,
     number,
-    quality_place,
+    quality_places,
     say_more,
     size,
 )
@@ -125,9 +125,10 @@ def _cell_status(cell: RecordedCell) -> str:
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
     told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
+    place = quality_places((cell.step, metric.name) for cell, metric in told)
     rows = [
         (cell.address, metric.name, number(metric.value), metric.unit if metric.unit != "1" else "")
-        for cell, metric in first_rows(told, most, lambda one: quality_place(one[1].name))
+        for cell, metric in first_rows(told, most, lambda one: place((one[0].step, one[1].name)))
     ]
     if rows:
         echo()

@@ -115,7 +115,9 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
     echo(verdict_counts(distances))
 
 
-def first_rows(rows: Sequence[Row], most: int | None, place: Callable[[Row], int]) -> Sequence[Row]:
+def first_rows(
+    rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, int]]
+) -> Sequence[Row]:
     """Give the rows of a table that are printed: all, or the first by their place of too many."""
     if most is None or len(rows) <= most:
         return rows
@@ -126,6 +128,20 @@ def say_more(n_rows: int, most: int | None) -> None:
     """Say how many rows of a table were left out, and how they are had."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, which --all prints")
+
+
+def quality_places(
+    rows: Iterable[tuple[str, str]],
+) -> Callable[[tuple[str, str]], tuple[int, int]]:
+    """Give the place of step and metric: by the metric, then of the last step that has it first.
+
+    A later step takes further what an earlier one has begun, as orientations do.
+
+    Args:
+        rows: step and metric of all, in the order of the run.
+    """
+    steps = {step: place for place, step in enumerate(dict.fromkeys(step for step, _ in rows))}
+    return lambda row: (quality_place(row[1]), -steps[row[0]])
 
 
 def quality_place(metric: str) -> int:

@@ -81,6 +81,8 @@ def answers(run: Run) -> tuple[Answer, ...]:
         for row in rows
         if row.metric == "main_found" and row.method.startswith("inspect.") and row.value == 0
     ]
+    # The one number that comes from outside stands before what the run says of itself.
+    at_points = len(found)
     # What a stranger's method says to be good or bad is what its workflow is about.
     found += [
         Answer(what=row.words, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
@@ -108,7 +110,12 @@ def answers(run: Run) -> tuple[Answer, ...]:
                 n_points = int(values.get((row.cell, "n_points"), n_found))
                 of_all = f"{n_found} of {n_points}" if n_points > n_found else f"{n_found}"
                 not_held = f"{of_all} {'point' if n_points == 1 else 'points'}"
-            found.append(Answer(what=what, value=value, cell=row.cell, not_held=not_held))
+            answer = Answer(what=what, value=value, cell=row.cell, not_held=not_held)
+            if wanted == "rms_mm" and row.method.startswith("inspect."):
+                found.insert(at_points, answer)
+                at_points += 1
+            else:
+                found.append(answer)
     return tuple(found)
 
 

@@ -91,15 +91,16 @@ def _array_differences(
         yield _unlike(name, tolerance, problem)
         return
     limit, unit = tolerance
-    largest, n_values = 0.0, 0
+    largest, total, n_values = 0.0, 0.0, 0
     for index in block_indices(left.shape, left.dtype.itemsize):
         distances = _distances(np.ravel(left[index]), np.ravel(right[index]))
         largest = max(largest, float(distances.max()))
+        total += float(distances[np.isfinite(distances)].sum())
         n_values += int(np.count_nonzero(distances > limit))
     if largest:
         problem = (
             f"{n_values} of {left.size} values differ by more than {_amount(limit, unit)}, the "
-            f"largest by {largest:g}"
+            f"largest by {largest:g}; the mean of all is {total / left.size:.3g}"
             if n_values
             else f"differs by {_amount(largest, unit)} at most, {limit:g} are allowed"
         )
