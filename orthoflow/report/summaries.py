@@ -45,6 +45,7 @@ _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
+    "check_rmse_mm_worst": "mean of both axes of the photo; along one of the wall it may be more",
 }
 
 
