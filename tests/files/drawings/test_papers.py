@@ -114,3 +114,10 @@ def test_pictures_on_one_sheet_stand_in_the_middle_of_its_room(
     edge = MARGIN_MM + LABELS_MM
     # As far from the labels on the left as on the right, and above as below.
     np.testing.assert_allclose(low - edge, np.add(edge, paper.area_mm) - up)
+
+
+def test_papers_are_as_small_and_as_large_as_people_print() -> None:
+    assert (paper_of("150x5000").width_mm, paper_of("150x5000").height_mm) == (150.0, 5000.0)
+    for text in ("149.9x200", "200x5000.1"):
+        with pytest.raises(ArgumentError, match="width x height of 150 to 5000 mm"):
+            paper_of(text)

@@ -40,7 +40,7 @@ def test_las_leaves_out_points_marked_as_deleted(
     path = scan_files.write_las(tmp_path / "a.laz", points, withheld=withheld)
     (block,) = read_all(path)
     np.testing.assert_allclose(block.points, points[~withheld], atol=1e-9)
-    assert (block.n_read, block.n_withheld) == (40, 10)
+    assert (block.n_read, block.n_withheld, block.scan) == (40, 10, 0)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
