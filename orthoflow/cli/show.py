@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -28,11 +30,17 @@ from orthoflow.cli.tables import (
     say_more,
     size,
 )
+from orthoflow.workflow.format import DATA
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
+    from orthoflow.report.comparisons import Row
+    from orthoflow.report.paired import MethodOverDatasets
 
+# Of metrics beside each other, so that lines stay within a wide window.
+_COLUMNS_MOST: Final = 5
+_NOTHING: Final = "-"
 _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 
@@ -43,7 +51,8 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
 
-    Of many metrics those that say how good results are are printed, with --all every one. Of a
+    Of many metrics those that say how good results are are printed, with --all every one; of a
+    comparison a row per combination of variants, over datasets with their medians. Of a
     folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
     the record does not hold.
     """
@@ -65,7 +74,9 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     else:
         _print_head(opened)
         _print_cells(opened)
-        _print_metrics(opened, most=None if is_whole else ROWS_MOST)
+        is_compared = _print_comparison(opened)
+        if is_whole or not is_compared:
+            _print_metrics(opened, most=None if is_whole else ROWS_MOST)
         _print_environments(opened)
         _print_files(opened)
         verify = f"`orthoflow verify {shlex.quote(str(run))}`"
@@ -121,6 +132,56 @@ def _print_cells(run: Run) -> None:
 
 def _cell_status(cell: RecordedCell) -> str:
     return f"{cell.status} (cached from {cell.cached_from})" if cell.cached_from else cell.status
+
+
+def _print_comparison(run: Run) -> bool:
+    """Print a row per combination of variants, and who leads; whether there are several."""
+    if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
+        return False
+    from orthoflow.records.datasets import parts_of
+    from orthoflow.report.comparisons import comparison_table
+    from orthoflow.report.paired import over_datasets, who_leads
+    from orthoflow.workflow.cells import variants_text
+
+    parts = parts_of(run)
+    names: Sequence[str]
+    rows: list[tuple[str, ...]]
+    if over := over_datasets(parts):
+        names = [f"{one.step}.{one.metric}" for one in over]
+        rows = [
+            (methods[0].name, *(_median(one) for one in methods))
+            for methods in zip(*(one.methods for one in over), strict=True)
+        ]
+        said = who_leads(over, len(parts))
+        about = f"medians of {len(parts)} datasets, of repeats their mean"
+    elif table := comparison_table([run]):
+        names = [f"{one.step}.{one.metric}" for one in table.columns]
+        rows = [
+            (variants_text(dict(zip(table.steps, row.variants, strict=True))), *_texts(row))
+            for row in table.rows
+        ]
+        said, about = "", "means of the repeats, where there are some"
+    else:
+        return False
+    if not names:
+        return False
+    width = 1 + _COLUMNS_MOST
+    echo()
+    echo_table(("combination", *names)[:width], [row[:width] for row in rows])
+    n_more = len(names) - _COLUMNS_MOST
+    more = f"; {counted(n_more, 'more metric')} in the report" if n_more > 0 else ""
+    echo(f"{about}{more}; --all prints every number", *([f"{said}."] if said else []))
+    return True
+
+
+def _texts(row: Row) -> tuple[str, ...]:
+    return tuple(value.text or _NOTHING for value in row.values)
+
+
+def _median(one: MethodOverDatasets) -> str:
+    from orthoflow.report.numbers import number_with_spread
+
+    return _NOTHING if math.isnan(one.median) else number_with_spread(one.median, one.spread)
 
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:

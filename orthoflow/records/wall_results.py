@@ -26,10 +26,15 @@ _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)
 # Of the accuracy that inspections found, what a drawing says: names of two numbers, the sentence,
 # and which number says of how many of what it is.
 _ACCURACY: Final = (
-    ("rmse_x_mm", "rmse_y_mm", "RMSE x {} mm, y {} mm", ("n_found", "n_pairs")),
-    ("rmse_u_mm", "rmse_v_mm", "RMSE x {} mm, y {} mm", ()),
-    ("patch_rmse_u_mm", "patch_rmse_v_mm", "of patches RMSE x {} mm, y {} mm", ("n_patches",)),
-    ("rms_3d_mm", "max_3d_mm", "in space RMS {} mm, largest {} mm", ("n_3d",)),
+    ("rmse_x_mm", "rmse_y_mm", "RMSE sideways {} mm, up and down {} mm", ("n_found", "n_pairs")),
+    ("rmse_u_mm", "rmse_v_mm", "RMSE sideways {} mm, up and down {} mm", ()),
+    (
+        "patch_rmse_u_mm",
+        "patch_rmse_v_mm",
+        "of patches RMSE sideways {} mm, up and down {} mm",
+        ("n_patches",),
+    ),
+    ("rms_3d_mm", "max_3d_mm", "with depth RMS {} mm, largest {} mm", ("n_3d",)),
 )
 _COUNTED: Final = {
     "n_found": ("check point", "check points"),

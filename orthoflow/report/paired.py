@@ -89,12 +89,14 @@ class MetricOverDatasets:
 
     Attributes:
         step: name of the step.
+        metric: its name.
         label: the metric with its unit.
         sense: what makes a value good.
         methods: the combinations, the reference first where it is the workflow's.
     """
 
     step: str
+    metric: str
     label: str
     sense: Sense
     methods: tuple[MethodOverDatasets, ...]
@@ -129,6 +131,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     return tuple(
         MetricOverDatasets(
             step=column.step,
+            metric=column.metric,
             label=column.label,
             sense=column.sense,
             methods=_methods(found, names, partners, (column.step, column.metric, column.sense)),

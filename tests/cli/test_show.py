@@ -12,7 +12,7 @@ from orthoflow_provenance.model import Metric
 
 from orthoflow.cli import program
 from orthoflow.cli import show as module
-from tests.report_runs import cell
+from tests.report_runs import cell, compared_run
 
 
 def shown(part: Any, run: Any, capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -45,6 +45,20 @@ def test_of_many_metrics_those_that_say_how_good_results_are_stand_first(
     assert told[2].split() == ["last", "rms_mm", "1.5", "mm"]
     assert (len(told), told[-1]) == (23, "and 11 more, which --all prints")
     assert len(shown(module._print_metrics, run, capsys)) == 33
+
+
+def test_of_a_comparison_a_row_per_combination_is_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert module._print_comparison(compared_run(tmp_path))
+    told = capsys.readouterr().out.splitlines()
+    assert told[1].split()[:2] == ["combination", "plane.rms_mm"]
+    rows = {line.split("  ")[0]: line for line in told[2:5]}
+    assert list(rows) == ["plane=fine", "plane=coarse", "plane=broken"]
+    assert "1.10 ± 0.10" in rows["plane=fine"]
+    assert rows["plane=broken"].split()[1:] == ["-"] * (len(told[1].split()) - 1)
+    assert told[5].startswith("means of the repeats")
+    assert not module._print_comparison(run_of(cell("plane"), cell("a@data=b")))
 
 
 def test_cells_are_counted_by_what_became_of_them() -> None:

@@ -89,13 +89,13 @@ def test_an_inspection_says_how_exact_a_wall_is_or_all_of_them() -> None:
     half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
     found = {"check": own, "truth": every, "half": half, "first": first}
     assert list(module._accuracy(found, 3)) == [
-        "check: RMSE x 1.2 mm, y 2.0 mm; in space RMS 3.0 mm, largest 9.0 mm",
-        "truth: of patches RMSE x 1.0 mm, y 2.0 mm (all walls)",
+        "check: RMSE sideways 1.2 mm, up and down 2.0 mm; with depth RMS 3.0 mm, largest 9.0 mm",
+        "truth: of patches RMSE sideways 1.0 mm, up and down 2.0 mm (all walls)",
     ]
     assert list(module._accuracy(found, 0)) == [
-        "check: RMSE x 8.0 mm, y 8.0 mm (all walls)",
-        "truth: of patches RMSE x 1.0 mm, y 2.0 mm (all walls)",
-        "first: RMSE x 4.0 mm, y 5.0 mm",
+        "check: RMSE sideways 8.0 mm, up and down 8.0 mm (all walls)",
+        "truth: of patches RMSE sideways 1.0 mm, up and down 2.0 mm (all walls)",
+        "first: RMSE sideways 4.0 mm, up and down 5.0 mm",
     ]
 
 
