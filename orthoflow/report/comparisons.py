@@ -169,7 +169,7 @@ class ComparisonTable:
 
     @property
     def glance(self) -> tuple[Standing, ...]:
-        """How often each combination leads; the one that is best most often first."""
+        """How often each combination leads; who is best, then near the best most often first."""
         labels = [*(f"{one.step}: {one.label}" for one in self.columns), "time", "memory"]
         marked = [
             [value.mark for value in (*row.values, row.time, row.memory)] for row in self.rows
@@ -197,7 +197,11 @@ class ComparisonTable:
                     time=row.time,
                 )
             )
-        return tuple(sorted(found, key=lambda one: (bool(one.shortfall), -one.n_best, one.n_worst)))
+
+        def place(one: Standing) -> tuple[bool, int, int, int]:
+            return bool(one.shortfall), -one.n_best, -one.n_near, one.n_worst
+
+        return tuple(sorted(found, key=place))
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
