@@ -9,6 +9,7 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import Final
 
+from orthoflow.alike import first_few
 from orthoflow.records import COSTS, RecordedEnvironment
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
@@ -29,6 +30,8 @@ FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean"
 # other work is known by.
 _BUSY_S: Final = 5.0
 _BUSY_TIMES: Final = 3.0
+# Seconds of loading and compiling in which a compiler was at work.
+_COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
 _TIMED_S: Final = 0.1
 _NAMED: Final = 3  # numbers that a combination is best in
@@ -70,6 +73,7 @@ class Row:
         time: seconds of the cells that the variants have a part in.
         memory: largest memory of these cells.
         is_busy: the time hangs on what else the machine did, so that no times are ranked.
+        has_compiler: the memory is also that of compiling, so that no memory is ranked.
         remark: what was cached and what else to know, in words.
     """
 
@@ -83,6 +87,7 @@ class Row:
     memory: Value
     is_busy: bool
     remark: str
+    has_compiler: bool = False
 
     @property
     def shortfall(self) -> str:
@@ -298,6 +303,7 @@ def _row(
     cpu_s = sum(cell.cpu_s for cell in varied)
     # Old records do not know the seconds of the processor.
     is_busy = has_cost and cpu_s > 0.0 and max(cpu_s + _BUSY_S, _BUSY_TIMES * cpu_s) < time_s
+    has_compiler = has_cost and max(cell.compile_s or 0.0 for cell in varied) > _COMPILING_S
     cost_group = "".join(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
     )
@@ -313,6 +319,7 @@ def _row(
         time=_time(time_s, cost_group) if has_cost else Value(),
         memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
         is_busy=is_busy,
+        has_compiler=has_compiler,
         remark="; ".join(
             part
             for part in (
@@ -320,6 +327,7 @@ def _row(
                 "time is ranked"
                 if is_busy
                 else "",
+                "a step compiled, which takes memory, too: none is ranked" if has_compiler else "",
                 _remark(one),
             )
             if part
@@ -399,7 +407,9 @@ def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
     ]
     is_busy = any(row.is_busy for row in rows)
     times = rank([row.time for row in rows], Sense.NEITHER if is_busy else Sense.LESS, "wall_s")
-    memories = rank([row.memory for row in rows], Sense.LESS, "peak_rss_mib")
+    has_compiler = any(row.has_compiler for row in rows)
+    memory_sense = Sense.NEITHER if has_compiler else Sense.LESS
+    memories = rank([row.memory for row in rows], memory_sense, "peak_rss_mib")
     return tuple(
         replace(
             row,
@@ -437,8 +447,9 @@ class Origins:
         small = {key: _letter(index).lower() for index, key in enumerate(sources)}
         legend: dict[str, str] = {}
         if len(environments) > 1:
+            first = next(iter(environments.values()))
             legend |= {
-                letters[key]: environment_words(environment)
+                letters[key]: environment_words(environment) + _other_packages(environment, first)
                 for key, environment in environments.items()
             }
         if len(sources) > 1:
@@ -463,6 +474,14 @@ def environment_words(environment: RecordedEnvironment) -> str:
         f"Python {environment.python}, {environment.os}, {environment.cpu}, "
         f"{environment.cores} processors, {environment.threads} threads{commit}"
     )
+
+
+def _other_packages(environment: RecordedEnvironment, first: RecordedEnvironment) -> str:
+    """Say in which packages an environment differs from another; empty where in none."""
+    own, others = dict(environment.packages), dict(first.packages)
+    said = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
+    said += [f"no {name}" for name in others if name not in own]
+    return f"; unlike the first with {first_few(said)}" if said else ""
 
 
 def _letter(index: int) -> str:

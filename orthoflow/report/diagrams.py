@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -11,6 +12,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.numbers import seconds_in_words
+from orthoflow.workflow.format import DATA
 
 _BOX_WIDTH: Final = 220
 _BOX_HEIGHT: Final = 46
@@ -19,7 +21,10 @@ _GAP_LEVELS: Final = 44
 _LANE_FIRST, _LANE_STEP = 14.0, 9.0  # how far from boxes that they pass arrows go down
 _ABREAST_MOST: Final = 5  # boxes of a level that a page holds side by side, at letters one can read
 _CELLS_MOST: Final = 24
-_LETTERS: Final = 30  # that fit a box at this size
+_DATA: Final = re.compile(r"@data=[^,#]*$|(?<=@)data=[^,#]*,|@data=[^,#]*(?=#)")
+_LETTERS: Final = 30  # that fit a box at the size of its second line
+_LETTERS_ABOVE: Final = 26  # and of its first
+_LETTERS_END: Final = 5  # of these: the last ones have the number of a repeat
 
 # On white paper; the page brings its own for light and dark.
 _STYLE: Final = (
@@ -88,12 +93,14 @@ def _boxes(run: Run) -> dict[str, _Box]:
     groups: dict[str, list[RecordedCell]] = {}
     of_cell: dict[str, str] = {}
     is_crowded = len(run.cells) > _CELLS_MOST
+    # The page of one dataset says which it is.
+    is_alone = len({cell.assignment.get(DATA) for cell in run.cells.values()} - {None}) == 1
     for address, cell in run.cells.items():
         of_cell[address] = cell.step if is_crowded else address
         groups.setdefault(of_cell[address], []).append(cell)
     return {
         name: _Box(
-            title=name,
+            title=_DATA.sub("", name) if is_alone else name,
             below=_state_words(cells),
             state=_state(cells),
             before=tuple(
@@ -228,10 +235,16 @@ def _draw(box: _Box, place: _Place) -> str:
         f'<rect x="{place.x:.0f}" y="{place.y:.0f}" width="{_BOX_WIDTH}" '
         f'height="{_BOX_HEIGHT}" rx="6"/>'
         f'<text x="{place.x + 10:.0f}" y="{place.y + 19:.0f}">'
-        f"{escape(_short(shown(box.title)))}</text>"
+        f"{escape(_short_name(shown(box.title)))}</text>"
         f'<text class="small" x="{place.x + 10:.0f}" y="{place.y + 36:.0f}">'
         f"{escape(_short(shown(box.below)))}</text></g>"
     )
+
+
+def _short_name(text: str) -> str:
+    if len(text) <= _LETTERS_ABOVE:
+        return text
+    return f"{text[: _LETTERS_ABOVE - _LETTERS_END - 1]}…{text[-_LETTERS_END:]}"
 
 
 def _short(text: str) -> str:

@@ -108,7 +108,7 @@ def test_a_drawing_is_as_wide_as_its_boxes_and_lanes() -> None:
     }  # fmt: skip
     cells = {
         name: SimpleNamespace(
-            status="ok", method="m.n", wall_s=1.0, cached_from="", step=name,
+            status="ok", method="m.n", wall_s=1.0, cached_from="", step=name, assignment={},
             inputs={other: SimpleNamespace(source=f"{other}.out") for other in before},
         )
         for name, before in sources.items()
@@ -149,3 +149,11 @@ def test_cells_that_all_came_from_the_store_are_cached() -> None:
 def test_long_names_are_cut_at_thirty_letters() -> None:
     assert diagrams._short("a" * 30) == "a" * 30
     assert diagrams._short("a" * 31) == "a" * 29 + "\N{HORIZONTAL ELLIPSIS}"
+    # The number of a repeat is at the end of its name, and that of the only dataset is told above.
+    assert diagrams._short_name("check@plane=ransac-tolerance_m-0_02#2").endswith("0_02#2"[-5:])
+    for name, said in (
+        ("plane@data=r1,plane=ransac#2", "plane@plane=ransac#2"),
+        ("room@data=r1", "room"),
+        ("room@data=r1#1", "room#1"),
+    ):
+        assert diagrams._DATA.sub("", name) == said

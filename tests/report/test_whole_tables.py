@@ -414,7 +414,7 @@ def test_the_graph_is_drawn_downwards_where_its_levels_are_narrow() -> None:
         '<text class="small" x="11" y="127">plane.toy, 1.00 s</text></g>'
         '<g class="cell failed"><title>a-name-of-thirty-one-characters: failed</title>'
         '<rect x="239" y="91" width="220" height="46" rx="6"/>'
-        '<text x="249" y="110">a-name-of-thirty-one-characte…</text>'
+        '<text x="249" y="110">a-name-of-thirty-one…cters</text>'
         '<text class="small" x="249" y="127">failed</text></g>'
         '<g class="cell skipped"><title>w: skipped</title>'
         '<rect x="120" y="181" width="220" height="46" rx="6"/>'
