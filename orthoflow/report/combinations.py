@@ -24,6 +24,7 @@ class Measured:
         value: the mean over the repeats.
         spread: standard deviation over the repeats, NaN without repeats.
         n_repeats: how many values there are.
+        n_all: how many runs of the step came to their end, with a value or without.
         unit: `1` for counts and shares.
         environment: id of the environment that it was computed in.
     """
@@ -31,6 +32,7 @@ class Measured:
     value: float
     spread: float
     n_repeats: int
+    n_all: int
     unit: str
     environment: str
 
@@ -94,6 +96,7 @@ class Combination:
             value=float(values.mean()),
             spread=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
             n_repeats=len(values),
+            n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
             unit=found[0][0].unit,
             environment=found[0][1],
         )

@@ -369,12 +369,17 @@ def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:
     if measured is None:
         return Value()
     repeated = measured.n_repeats > 1
+    text = (
+        number_with_spread(measured.value, measured.spread) if repeated else number(measured.value)
+    )
+    # Of a repeat that missed the wall there is no error of it, and the others look as good as any.
+    of_all = (
+        f" ({measured.n_repeats} of {measured.n_all} repeats)"
+        if measured.n_repeats < measured.n_all
+        else ""
+    )
     return Value(
-        text=(
-            number_with_spread(measured.value, measured.spread)
-            if repeated
-            else number(measured.value)
-        ),
+        text=f"{text}{of_all}",
         sort=measured.value,
         spread=measured.spread,
         group=origins.letters(run, measured.environment),

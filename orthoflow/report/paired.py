@@ -216,16 +216,22 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     said = []
     for name, against in dict.fromkeys((one.name, one.against) for one in tested):
         shown = [
-            one.paired.effect
-            for one in tested
+            (metric.label.partition(" / ")[0], one.paired.effect)
+            for metric in judged
+            for one in metric.methods
             if one.name == name and one.paired is not None and one.paired.p < _SHOWN_P
         ]
-        n_better = sum(effect > 0 for effect in shown)
-        n_worse = len(shown) - n_better
-        if shown:
-            counts = ((n_better, "better"), (n_worse, "worse"))
-            how = " and ".join(f"{word} in {count}" for count, word in counts if count)
-            said.append(f"{name} against {against}: {how} of {len(judged)} numbers")
+        sides = (
+            ("better", [label for label, effect in shown if effect > 0]),
+            ("worse", [label for label, effect in shown if effect <= 0]),
+        )
+        how = " and ".join(
+            f"{word} in {len(labels)} of {len(judged)} numbers ({', '.join(labels)})"
+            for word, labels in sides
+            if labels
+        )
+        if how:
+            said.append(f"{name} against {against}: {how}")
     if not said:
         return f"Nobody is shown to lead in any of {len(judged)} numbers (p below {_SHOWN_P:g})"
     others = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""

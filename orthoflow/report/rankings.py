@@ -54,7 +54,7 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     A value whose distance from the best is not above both their standard deviations together (in
     quadrature), or without repeats not above a hundredth of the best (repeats or not a tenth of a
     memory, three tenths of a time), is marked as near the best and never as worst; the best is then
-    only among the best, too.
+    only among the best, too, as are several that are alike.
 
     Args:
         values: a column.
@@ -74,6 +74,8 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         if len(set(scores.values())) < 2:
             continue
         best = min(members, key=scores.__getitem__)
+        # What several share nobody leads in.
+        n_first = sum(scores[index] == scores[best] for index in members)
         near = {
             index
             for index in members
@@ -86,7 +88,7 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         for index in members:
             mark = Mark.NONE
             if scores[index] == scores[best]:
-                mark = Mark.NEAR if near else Mark.BEST
+                mark = Mark.NEAR if near or n_first > 1 else Mark.BEST
             elif index in near:
                 mark = Mark.NEAR
             elif scores[index] == max(scores.values()):

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 from orthoflow.foreign_text import Value
 from orthoflow.records import RecordedCell
+from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps
+from orthoflow.report.paired import over_datasets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,30 @@ def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
             status = _status(one, cells)
             values = (found.get(metric) for metric in metrics)
             yield (*varied.values(one.assignment), repeat, status, *values)
+
+
+def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
+    """Give a header, then a row per metric and combination of what holds over all datasets."""
+    yield (
+        *("step", "metric", "combination", "against", "datasets", "failed", "absent"),
+        *("median", "spread", "pairs", "better", "worse", "median_difference", "p", "effect"),
+        "deciding",
+    )
+    for metric in over_datasets(parts_of(run)):
+        for one in metric.methods:
+            paired = one.paired
+            yield (
+                *(metric.step, metric.metric, one.name, one.against),
+                *(one.n, len(one.failed), one.n_absent, one.median, one.spread),
+                *(
+                    ("",) * 7
+                    if paired is None
+                    else (
+                        *(paired.n, paired.wins, paired.losses, paired.median),
+                        *(paired.p, paired.effect, " ".join(paired.deciding)),
+                    )
+                ),
+            )
 
 
 def _status(one: Combination, cells: Sequence[RecordedCell]) -> str:

@@ -115,7 +115,7 @@ def leading(n_methods: int, p: float) -> Any:
         )
         for k in range(n_methods + 1)
     ]
-    return SimpleNamespace(sense=Sense.LESS, methods=methods)
+    return SimpleNamespace(sense=Sense.LESS, methods=methods, label="error / mm")
 
 
 def test_who_leads_is_said_of_six_at_most() -> None:
@@ -129,8 +129,8 @@ def test_who_leads_is_said_of_six_at_most() -> None:
         "Nobody is shown to lead in any of 3 numbers (p below 0.05)"
     )
     said = module.who_leads([leading(2, 0.049), leading(2, 0.5)], 9)
-    assert "m1 against m0: better in 1 of 2 numbers" in said
-    assert "m2 against m0: worse in 1 of 2 numbers" in said
+    assert "m1 against m0: better in 1 of 2 numbers (error)" in said
+    assert "m2 against m0: worse in 1 of 2 numbers (error)" in said
     six, seven = (module.who_leads([leading(n, 0.01)], 9) for n in (6, 7))
     assert (six.count(" against "), "more" in six) == (6, False)
     assert (seven.count(" against "), seven.endswith("; and 1 more")) == (6, True)

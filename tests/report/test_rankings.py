@@ -29,10 +29,10 @@ def test_a_ratio_is_best_at_one_and_as_bad_at_half_as_at_double() -> None:
     assert found == ["NONE", "BEST", "NONE", "WORST"]
 
 
-def test_what_is_alike_has_neither_and_equal_bests_are_all_best() -> None:
+def test_what_is_alike_has_neither_and_nobody_leads_in_what_several_share() -> None:
     assert marks(of(1.0), of(1.0)) == ["NONE", "NONE"]
     assert marks(of(1.0), of(-1.0)) == ["NONE", "NONE"]
-    assert marks(of(1.0), of(1.0), of(2.0)) == ["BEST", "BEST", "WORST"]
+    assert marks(of(1.0), of(1.0), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0)) == ["NONE"]
     assert marks(of(1.0), of(2.0), sense=Sense.NEITHER) == ["NONE", "NONE"]
 

@@ -352,12 +352,20 @@ def test_a_busy_machine_ranks_no_times() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_repeats", "text", "note"),
-    [(1, "2", ""), (2, "2.00 ± 0.50", "mean and standard deviation of 2 repeats")],
+    ("n_repeats", "n_all", "text", "note"),
+    [
+        (1, 1, "2", ""),
+        (2, 2, "2.00 ± 0.50", "mean and standard deviation of 2 repeats"),
+        (1, 3, "2 (1 of 3 repeats)", ""),
+    ],
 )
-def test_a_value_says_what_it_is_the_mean_of(n_repeats: int, text: str, note: str) -> None:
+def test_a_value_says_what_it_is_the_mean_of(
+    n_repeats: int, n_all: int, text: str, note: str
+) -> None:
     told = run(cell("plane"))
-    measured = Measured(value=2.0, spread=0.5, n_repeats=n_repeats, unit="", environment="e1")
+    measured = Measured(
+        value=2.0, spread=0.5, n_repeats=n_repeats, n_all=n_all, unit="", environment="e1"
+    )
     value = comparisons._value(measured, told, comparisons.Origins.of([told]))
     assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
     assert comparisons._value(None, told, comparisons.Origins.of([told])) == Value()

@@ -32,15 +32,18 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
     from orthoflow.records.spreadsheets import write_csv_tables
-    from orthoflow.report.tidy_tables import combination_rows
+    from orthoflow.report.tidy_tables import combination_rows, dataset_rows
 
     make_empty(folder)
     written = [path.name for path in write_csv_tables(run, folder)]
-    text = csv_text(combination_rows(run))
-    (folder / "combinations.csv").write_text(
-        text, encoding="utf-8", errors="backslashreplace", newline=""
-    )
-    return ", ".join([*written, "combinations.csv"])
+    tables = {"combinations.csv": list(combination_rows(run)), "datasets.csv": [*dataset_rows(run)]}
+    # A header alone says nothing: of one dataset, or of none.
+    told = {name: rows for name, rows in tables.items() if name != "datasets.csv" or len(rows) > 1}
+    for name, rows in told.items():
+        (folder / name).write_text(
+            csv_text(rows), encoding="utf-8", errors="backslashreplace", newline=""
+        )
+    return ", ".join([*written, *told])
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
