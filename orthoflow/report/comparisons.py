@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from string import ascii_uppercase
-from typing import Final
+from typing import Final, TypeAlias
 
 from orthoflow.alike import first_few
 from orthoflow.records import COSTS, RecordedEnvironment
@@ -19,6 +19,7 @@ from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
 from orthoflow.workflow.cells import variants_text
+from orthoflow.workflow.format import DATA
 
 _NOTHING: Final = "-"
 # Distances to a plane are of the points that its tolerances let in.
@@ -297,16 +298,14 @@ def _row(
 ) -> Row:
     failed = one.failure
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
-    group = origins.letters(one.run, varied[0].environment if varied else "")
+    group = origins.letters(one, varied[0].environment if varied else "")
     has_cost = failed is None and not one.missing and bool(varied)
     time_s = sum(cell.wall_s for cell in varied)
     cpu_s = sum(cell.cpu_s for cell in varied)
     # Old records do not know the seconds of the processor.
     is_busy = has_cost and cpu_s > 0.0 and max(cpu_s + _BUSY_S, _BUSY_TIMES * cpu_s) < time_s
     has_compiler = has_cost and max(cell.compile_s or 0.0 for cell in varied) > _COMPILING_S
-    cost_group = "".join(
-        dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
-    )
+    cost_group = "".join(dict.fromkeys(origins.letters(one, cell.environment) for cell in varied))
     return Row(
         run=label,
         variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
@@ -314,7 +313,7 @@ def _row(
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
         missing=tuple(cell.address for cell in one.missing),
         values=tuple(
-            _value(one.measured(column.step, column.metric), one.run, origins) for column in columns
+            _value(one.measured(column.step, column.metric), one, origins) for column in columns
         ),
         time=_time(time_s, cost_group) if has_cost else Value(),
         memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
@@ -344,6 +343,10 @@ def _memory(mib: float, group: str) -> Value:
     return Value(text=f"{mib:.0f}", sort=mib, group=group)
 
 
+# Record, id of the run, and name of the dataset.
+_Place: TypeAlias = tuple[Path, str, str]
+
+
 def _name(run: Run) -> tuple[Path, str]:
     return run.path, run.record.run_id
 
@@ -365,7 +368,7 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     }
 
 
-def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:
+def _value(measured: Measured | None, one: Combination, origins: Origins) -> Value:
     if measured is None:
         return Value()
     repeated = measured.n_repeats > 1
@@ -382,7 +385,7 @@ def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:
         text=f"{text}{of_all}",
         sort=measured.value,
         spread=measured.spread,
-        group=origins.letters(run, measured.environment),
+        group=origins.letters(one, measured.environment),
         note=(f"mean and standard deviation of {measured.n_repeats} repeats" if repeated else ""),
     )
 
@@ -432,12 +435,12 @@ class Origins:
 
     Attributes:
         environments: id -> letter.
-        data: identity of a run's data -> letter.
+        data: run, and its dataset or nothing -> letter.
         legend: what each sign in use stands for; empty when all is of one kind.
     """
 
     environments: Mapping[str, str]
-    data: Mapping[tuple[str, ...], str]
+    data: Mapping[_Place, str]
     legend: Mapping[str, str]
 
     @staticmethod
@@ -447,9 +450,15 @@ class Origins:
             environment.id: environment for run in runs for environment in run.record.environments
         }
         letters = {key: _letter(index) for index, key in enumerate(environments)}
-        sources = dict.fromkeys(_data_of(run) for run in runs)
+        # What each run was given, or each of its datasets: digests -> places that have them.
+        named: dict[tuple[str, ...], dict[_Place, str]] = {}
+        for run in runs:
+            datasets = {cell.assignment.get(DATA, "") for cell in run.record.cells} - {""}
+            for data in sorted(datasets) if len(runs) > 1 and datasets else ("",):
+                said = f"{run.record.run_id}{f', dataset {data}' if data else ''}"
+                named.setdefault(_data_of(run, data), {})[(*_name(run), data)] = said
         # No digits: raised behind a number they would look like powers.
-        small = {key: _letter(index).lower() for index, key in enumerate(sources)}
+        small = {key: _letter(index).lower() for index, key in enumerate(named)}
         legend: dict[str, str] = {}
         if len(environments) > 1:
             first = next(iter(environments.values()))
@@ -457,19 +466,21 @@ class Origins:
                 letters[key]: environment_words(environment) + _other_packages(environment, first)
                 for key, environment in environments.items()
             }
-        if len(sources) > 1:
+        if len(named) > 1:
             legend |= {
-                small[key]: "data of run "
-                + ", ".join(run.record.run_id for run in runs if _data_of(run) == key)
-                for key in sources
+                small[key]: f"data of run {'; '.join(dict.fromkeys(said.values()))}"
+                for key, said in named.items()
             }
-        return Origins(environments=letters, data=small, legend=legend)
+        places = {place: small[key] for key, said in named.items() for place in said}
+        return Origins(environments=letters, data=places, legend=legend)
 
-    def letters(self, run: Run, environment: str) -> str:
+    def letters(self, one: Combination, environment: str) -> str:
         """Give the sign of a value; empty when all values are of one kind."""
         letter = self.environments.get(environment, "?") if len(self.environments) > 1 else ""
-        small = self.data[_data_of(run)] if len(self.data) > 1 else ""
-        return letter + small
+        if len(set(self.data.values())) < 2:
+            return letter
+        own = (*_name(one.run), one.assignment.get(DATA, ""))
+        return letter + self.data.get(own, "?")
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
@@ -495,15 +506,17 @@ def _letter(index: int) -> str:
     return (ascii_uppercase[first - 1] if first else "") + ascii_uppercase[last]
 
 
-def _data_of(run: Run) -> tuple[str, ...]:
-    """What the run's methods were given: digests of its input files, and of simulated data."""
-    return tuple(sorted(_digests(run)))
+def _data_of(run: Run, data: str) -> tuple[str, ...]:
+    """What the methods were given: digests of input files, and of simulated data."""
+    return tuple(sorted(_digests(run, data)))
 
 
-def _digests(run: Run) -> Iterator[str]:
+def _digests(run: Run, data: str) -> Iterator[str]:
     for given in run.record.inputs:
-        for file in given.files:
-            yield file.sha256
+        # `scan@hall` is that of one dataset; the others' have no part in it.
+        if not data or given.name.partition("@")[2] in {"", data}:
+            yield from (file.sha256 for file in given.files)
     for cell in run.record.cells:
-        if cell.status == "ok" and not cell.inputs:
+        is_own = not data or cell.assignment.get(DATA, data) == data
+        if is_own and cell.status == "ok" and not cell.inputs:
             yield from (product.digest for product in cell.outputs.values())

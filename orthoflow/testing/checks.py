@@ -157,7 +157,9 @@ def threads_do_not_show(subject: Subject) -> None:
     """One core or two give the same digest."""
     one, two = subject.witness.first.run, subject.witness.on_two_cores
     for name, digest in one.digests.items():
-        require(two.digests[name] == digest, f"output {name} depends on the number of cores")
+        # What differs from run to run on one core says nothing of two; the rule above has told it.
+        is_same = two.digests[name] == digest or subject.witness.again.digests[name] != digest
+        require(is_same, f"output {name} depends on the number of cores")
 
 
 def parts_do_not_show(subject: Subject) -> None:

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from orthoflow.records.runs import Run
+from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import Origins, _letter, comparison_table, environment_words
 from orthoflow.report.overlays import (
     Vectors,
@@ -32,6 +33,7 @@ from tests.report_runs import (
     cell,
     compared_run,
     environment,
+    given,
     metrics,
     record,
 )
@@ -287,12 +289,25 @@ def test_environments_and_data_have_letters_of_their_own() -> None:
         f"Python 3.11.2, Linux, toy, 2 processors, 2 threads, code at commit {40 * 'c'}+changes"
     )
     assert origins.legend == {"A": words, "B": words}
-    assert (origins.letters(one, "e1"), origins.letters(two, "e2")) == ("A", "B")
-    assert origins.letters(one, "e9") == "?"
+    (first,), (second,) = combinations_of(one), combinations_of(two)
+    assert (origins.letters(first, "e1"), origins.letters(second, "e2")) == ("A", "B")
+    assert origins.letters(first, "e9") == "?"
     bare = replace(environment(), git_commit="")
     assert environment_words(bare).endswith(", 2 threads")
     alone = Origins.of([one])
-    assert (dict(alone.legend), alone.letters(one, "e1")) == ({}, "")
+    assert (dict(alone.legend), alone.letters(first, "e1")) == ({}, "")
+    # Rooms of two runs: the same data have the same letter, whichever run they are of.
+    rooms = [
+        run(
+            name,
+            *(cell(f"room@data={room}", outputs={"c": given("", room, "cloud")}) for room in names),
+        )
+        for name, names in (("r1", ("a", "b")), ("r2", ("b",)))
+    ]
+    of_rooms = Origins.of(rooms)
+    told = [of_rooms.letters(one, "e1") for room in rooms for one in combinations_of(room)]
+    assert [sign[-1] for sign in told] == ["a", "b", "b"]
+    assert of_rooms.legend["b"] == "data of run r1, dataset b; r2, dataset b"
 
 
 def test_one_combination_is_no_comparison() -> None:

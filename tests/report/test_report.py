@@ -15,7 +15,7 @@ from orthoflow.errors import StoreError
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
-from orthoflow.report.combinations import Measured
+from orthoflow.report.combinations import Measured, combinations_of
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
@@ -366,9 +366,10 @@ def test_a_value_says_what_it_is_the_mean_of(
     measured = Measured(
         value=2.0, spread=0.5, n_repeats=n_repeats, n_all=n_all, unit="", environment="e1"
     )
-    value = comparisons._value(measured, told, comparisons.Origins.of([told]))
+    (one,) = combinations_of(told)
+    value = comparisons._value(measured, one, comparisons.Origins.of([told]))
     assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
-    assert comparisons._value(None, told, comparisons.Origins.of([told])) == Value()
+    assert comparisons._value(None, one, comparisons.Origins.of([told])) == Value()
 
 
 def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
