@@ -138,7 +138,9 @@ def _others(texts: Sequence[str]) -> tuple[str, ...]:
     parts = [_parts(text) for text in texts]
     # Sentences of one sense have equally many varying parts.
     column = next(column for column in zip(*parts, strict=True) if len(set(column)) > 1)
-    return tuple(dict.fromkeys(part for part in column[1:] if part != column[0]))
+    # A count alone would not say what it is of.
+    others = dict.fromkeys(part for part in column[1:] if part != column[0])
+    return tuple(part for part in others if not part.isdecimal())
 
 
 def _parts(text: str) -> tuple[str, ...]:

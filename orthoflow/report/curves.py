@@ -30,6 +30,7 @@ _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
 # Above, the button that enlarges lies over the drawing.
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 40.0, 46.0
+_APART: Final = 5.0  # of the lines of one drawing, whose bars stand at the same places
 _LETTER: Final = 6.2  # width of one, at the size of the drawing's text
 
 
@@ -322,7 +323,12 @@ class _Axes:
                     f'<text x="{x:.1f}" y="{floor + 17}" text-anchor="middle">{text}</text>'
                 )
                 taken = x + 0.5 * _LETTER * len(text) + 6.0
-        parts += [self._line(index, points) for index, points in enumerate(lines.values())]
+        # Bars at one place would hide each other.
+        apart = _APART if sum(_has_bars(points) for points in lines.values()) > 1 else 0.0
+        for index, points in enumerate(lines.values()):
+            aside = apart * (index - 0.5 * (len(lines) - 1))
+            line = self._line(index, points)
+            parts.append(f'<g transform="translate({aside:g} 0)">{line}</g>' if aside else line)
         # The names stand above the lines, which could be anywhere below.
         named = [(index, name) for index, name in enumerate(lines) if name]
         above = [f'<text class="beside" x="6" y="{_TOP - 14}">{escape(shown(beside))}</text>']
@@ -356,6 +362,10 @@ class _Axes:
         )
         bar = f'<path class="bar line-{index}" d="{bars}"/>' if bars else ""
         return f'<path class="line line-{index}" d="M{way}"/>{bar}{dots}'
+
+
+def _has_bars(points: Sequence[_Point]) -> bool:
+    return any(math.isfinite(point.spread) and point.spread > 0.0 for point in points)
 
 
 def _ticks(low: float, high: float) -> list[float]:

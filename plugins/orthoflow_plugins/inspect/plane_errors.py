@@ -45,8 +45,8 @@ def inspect_planes(
         findings += _plane_findings(main, 0)
     else:
         ctx.warn(
-            f"the main wall of the scene, {truth.planes.names[0]}, is none of the {len(planes)} "
-            f"planes that were found within {_FOUND_ANGLE_DEG:g} deg and {_FOUND_OFFSET_M:g} m: "
+            f"the main wall of the scene is none of the {len(planes)} planes that were found "
+            f"within {_FOUND_ANGLE_DEG:g} deg and {_FOUND_OFFSET_M:g} m: "
             "errors of planes are told without it"
         )
     seen = [distance for distance in nearest if distance is not None]

@@ -352,7 +352,7 @@ def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
     inputs = InspectTruth.In(truth=truth, planes=replace(true, offset=far))
     InspectTruth().run(inputs, InspectTruth.Params(), context)
-    assert any("the main wall of the scene, " in text for text in context.warnings)
+    assert any("the main wall of the scene is none of " in text for text in context.warnings)
 
 
 def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) -> None:
