@@ -226,7 +226,8 @@ class _MethodCheck:
                     )
         except (WorkflowError, PluginError) as error:
             origin = f"{cell.distribution} {cell.distribution_version}".strip()
-            _add(self.missing, f"method {cell.method} of {origin}: {error}")
+            install = f"; install {origin}" if origin else ""
+            _add(self.missing, f"method {cell.method} of {origin}: {error}{install}")
             return
         if cls.result_version != cell.result_version:
             _add(

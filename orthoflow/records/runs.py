@@ -19,7 +19,7 @@ from orthoflow_provenance.reader import open_outputs, read_record
 from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.engine.run_folder import RECORD_FILE, is_running
-from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
+from orthoflow.errors import ArgumentError, OrthoflowError, PluginError, RecordError
 from orthoflow.foreign_text import shown
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.metrics import MetricRow, cell_metrics
@@ -179,7 +179,13 @@ class Run:
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - only products need it
 
         payload = self.payload(address, port)
-        return discover_catalog().product_class(payload.type_name).from_payload(payload)
+        try:
+            cls = discover_catalog().product_class(payload.type_name)
+        except PluginError as error:
+            raise PluginError(
+                f"{error}; payload({address!r}, {port!r}) gives its arrays without one"
+            ) from error
+        return cls.from_payload(payload)
 
     @property
     def files(self) -> Mapping[str, tuple[Path, ...]]:

@@ -149,7 +149,9 @@ def test_a_missing_method_is_named(studio: Studio) -> None:
         )
 
     write_changed(studio, change)
-    assert "method survey.laser of far 1.0: unknown method survey.laser" in refused(studio, code=4)
+    said = refused(studio, code=4)
+    assert "method survey.laser of far 1.0: unknown method survey.laser" in said
+    assert "; install far 1.0" in said
 
 
 def test_a_parameter_that_the_method_has_lost_is_named(studio: Studio) -> None:
