@@ -15,7 +15,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.report.combinations import Combination, combinations_of, wanted_metrics
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.rankings import Sense
@@ -131,14 +131,18 @@ class _Point:
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     columns = comparison_columns(combinations)
-    chosen = [one for one in columns if one.is_key or one.sense is not Sense.NEITHER]
+    is_asked = any(wanted_metrics(part) for part in parts)
+    chosen = [one for one in columns if is_asked or one.is_key or one.sense is not Sense.NEITHER]
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}
     for sweep in sweeps(cells):
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
+    behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
     for column in sorted(chosen, key=lambda one: not one.is_key):
-        for alike in swept.values():
+        for (step, _), alike in swept.items():
+            if column.step not in behind[step]:
+                continue
             lines: dict[str, list[_Point]] = {}
             for sweep in alike:
                 own = _lines(combinations, sweep, column, is_over=len(parts) > 1)

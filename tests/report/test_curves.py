@@ -72,6 +72,24 @@ def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path)
     assert all(toy > region for toy, region in zip(high["0"], high["1"], strict=True))
 
 
+def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: Path) -> None:
+    cells = [
+        *(
+            replace(one, metrics=metrics(rms_mm=1.0, n_planes=9.0))
+            for one in swept(0.02, 0.05, 0.1)
+        ),  # type: ignore[type-var]
+        cell("apart", metrics=metrics(rms_mm=2.0)),
+    ]
+    plain = held(tmp_path, cells)
+    asked = replace(
+        plain,
+        record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
+    )
+    titles = [[one.title.partition(" over ")[0] for one in curves(run)] for run in (plain, asked)]
+    error = "points to their plane, RMS / mm, cut at its own tolerance (plane)"
+    assert titles == [[], [error, "planes found (plane)"]]
+
+
 def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
     # A record may hold any; these ended with an error, or with nan for a place.
     values = (0.02, 10**400, math.nan, 0.05, -1e308, 0.1)
