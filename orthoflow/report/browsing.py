@@ -168,6 +168,9 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     record = run.record
     failed = next((cell for cell in record.cells if cell.status == "failed"), None)
     facts: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
+    parts = parts_of(run)
+    if parts:
+        facts["datasets"] = len(parts)
     for given in record.inputs:
         facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
     # Those whose numbers are shown are named by their step, whatever their variant is called.
@@ -175,7 +178,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         cell.address: f"{cell.step}@data={cell.assignment[DATA]}"
         if DATA in cell.assignment
         else cell.step
-        for part in parts_of(run).values() or (run,)
+        for part in parts.values() or (run,)
         for cell in baseline_cells(part)
     }
     for cell in record.cells:
@@ -192,7 +195,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         run_id=record.run_id,
         started=record.started,
         metrics=_metrics(run),
-        n_datasets=len(parts_of(run)),
+        n_datasets=len(parts),
         labels=_labels(run),
         facts=facts,
     )
