@@ -180,16 +180,8 @@ class ComparisonTable:
         marked = [
             [value.mark for value in (*row.values, row.time, row.memory)] for row in self.rows
         ]
-        # What several share nobody leads in.
-        shared = [
-            sum(marks[index] is Mark.BEST for marks in marked) > 1 for index in range(len(labels))
-        ]
         found = []
-        for row, name, all_marks in zip(self.rows, self._names, marked, strict=True):
-            marks = [
-                Mark.NEAR if mark is Mark.BEST and is_shared else mark
-                for mark, is_shared in zip(all_marks, shared, strict=True)
-            ]
+        for row, name, marks in zip(self.rows, self._names, marked, strict=True):
             best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
             found.append(
                 Standing(
