@@ -346,6 +346,6 @@ def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:
         exec(shown + " ...\n" * shown.rstrip().endswith(":"), known)
     assert known["FlatWalls"].id.partition(".")[0] in discover_catalog().kinds
     assert len(known["CASES"]) > 10
-    assert known["orthoflow_kinds"]()[0].name == "segment"
-    assert known["orthoflow_products"]()[0].type_name == "segments"
+    assert known["orthoflow_kinds"]()[0].name == "mark"
+    assert known["orthoflow_products"]()[0].type_name == "marks"
     known["test_the_floor_is_found"](tmp_path)
