@@ -153,6 +153,15 @@ def test_a_mirroring_rotation_is_refused() -> None:
         )  # fmt: skip
 
 
+@pytest.mark.parametrize("stretched", [1.0 + 2e-6, np.nan])
+def test_a_rotation_that_stretches_is_refused(stretched: float) -> None:
+    with pytest.raises(GeometryError, match="orthonormal"):
+        ViewingCamera(
+            width=3, height=2, fx=1, fy=1, cx=1, cy=1, distortion=np.zeros(5),
+            rotation=np.diag([1.0, 1.0, stretched]), translation=np.zeros(3),
+        )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("distortion", "radius"),
     [

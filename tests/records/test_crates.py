@@ -260,6 +260,32 @@ def test_of_a_record_that_holds_its_input_files_nobody_looks_for_them_elsewhere(
         inputs = tuple(replace(entry, embedded=is_embedded) for entry in run.inputs)
         graph: dict[str, Any] = crate_metadata(replace(run, inputs=inputs), [], license_text="CC0")
         assert said in entities(graph, "Dataset")[0]["description"]
+        (number,) = (entity for entity in graph["@graph"] if entity.get("name") == "n.txt")
+        assert number.get("isPartOf") == ({"@id": "run.h5"} if is_embedded else None)
+
+
+def test_products_that_the_record_holds_are_part_of_it(studio: Studio) -> None:
+    run = open_run(studio.folder / "first").record
+    for is_embedded in (False, True):
+        cells = tuple(
+            replace(
+                cell,
+                outputs={
+                    port: replace(product, embedded=is_embedded)
+                    for port, product in cell.outputs.items()
+                },
+            )
+            for cell in run.cells
+        )
+        graph: dict[str, Any] = crate_metadata(replace(run, cells=cells), [], license_text="CC0")
+        found = {
+            entity["identifier"]: entity.get("isPartOf")
+            for entity in graph["@graph"]
+            if entity.get("identifier") and "additionalType" in entity
+        }
+        made = {product.digest for cell in cells for product in cell.outputs.values()}
+        parts = [found[digest] for digest in made]
+        assert parts == [{"@id": "run.h5"} if is_embedded else None] * len(made)
 
 
 def test_what_the_report_links_to_is_in_the_crate(studio: Studio, tmp_path: Path) -> None:
