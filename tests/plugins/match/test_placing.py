@@ -39,8 +39,13 @@ def patchy_wall() -> Wall:
     return replace(wall, intensity=(0.5 + sign * (wall.intensity - 0.5)).astype(np.float32))
 
 
+@cache
+def patchy_walls() -> PlacedWalls:
+    return PlacedWalls(walls=[patchy_wall()])
+
+
 def placed(photo: Photo) -> Placed | None:
-    places = places_of(0, photo, PlacedWalls(walls=[patchy_wall()]))
+    places = places_of(0, photo, patchy_walls())
     assert not any(place.is_clear for place in places[1:])
     return next((place for place in places if place.is_clear), None)
 

@@ -46,6 +46,12 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
 
 
 @pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
+    """Six photos of 150 x 112 pixels, each exposed in two parts, so that threads share it."""
+    return simulate(tmp_path_factory.mktemp("small"), photo_gsd_m=0.016)
+
+
+@pytest.fixture(scope="module")
 def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
     """The main wall as it is, in cells as large as pixels."""
     planes = room.truth.planes
@@ -234,33 +240,33 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
         assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.taken.photo
 
 
-def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(tmp_path: Path) -> None:
-    near = simulate(tmp_path / "near", photo_gsd_m=0.016)
-    far = simulate(
-        tmp_path / "far", photo_gsd_m=0.016, shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y"
-    )
-    assert [photo.encoded for photo in near.photos.photos] == [
+def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(
+    tmp_path: Path, small: SimulateRoom.Out
+) -> None:
+    far = simulate(tmp_path, photo_gsd_m=0.016, shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y")
+    assert [photo.encoded for photo in small.photos.photos] == [
         photo.encoded for photo in far.photos.photos
     ]
-    for one, other in zip(cameras_of(near.truth), cameras_of(far.truth), strict=True):
-        marks_near = one.project(near.checkpoints.points_world)
+    for one, other in zip(cameras_of(small.truth), cameras_of(far.truth), strict=True):
+        marks_near = one.project(small.checkpoints.points_world)
         marks_far = other.project(far.checkpoints.points_world)
         # Pixels; 800 km from the origin the camera's own translation steps by 1e-10 m.
         np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
 
 
-def test_threads_change_no_byte_and_seeds_move_the_cameras(tmp_path: Path) -> None:
-    one = simulate(tmp_path / "one", cores=1)
-    two = simulate(tmp_path / "two", cores=2)
-    other = simulate(tmp_path / "other", seed=2)
-    assert one.photos == two.photos
+def test_threads_change_no_byte_and_seeds_move_the_cameras(
+    tmp_path: Path, small: SimulateRoom.Out
+) -> None:
+    one = simulate(tmp_path / "one", cores=1, photo_gsd_m=0.016)
+    other = simulate(tmp_path / "other", seed=2, photo_gsd_m=0.016)
+    assert one.photos == small.photos
     for first, second in zip(cameras_of(one.truth), cameras_of(other.truth), strict=True):
         assert np.linalg.norm(first.centre_world - second.centre_world) > 0.01
 
 
-def test_calibration_is_told_only_when_it_is_known(tmp_path: Path) -> None:
-    known = simulate(tmp_path / "known", photo_gsd_m=0.03)
-    unknown = simulate(tmp_path / "unknown", photo_gsd_m=0.03, calibrated=False)
+def test_calibration_is_told_only_when_it_is_known(tmp_path: Path, small: SimulateRoom.Out) -> None:
+    known = small
+    unknown = simulate(tmp_path, photo_gsd_m=0.016, calibrated=False)
     camera = cameras_of(known.truth)[0]
     assert known.calibration.patterns == ("*",)
     assert known.calibration.intrinsics[0].fx == camera.fx
