@@ -34,6 +34,10 @@ from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.02
 
+# Made once for all tests, by the truth that a fixture holds.
+_RENDERED: dict[int, TrueOrthoimage] = {}
+_PAINTED: dict[int, Orthoimage] = {}
+
 
 def simulate(folder: Path, **params: object) -> Truth:
     folder.mkdir(parents=True, exist_ok=True)
@@ -68,6 +72,12 @@ def moved(camera: Camera, shift_world_m: np.ndarray) -> Camera:
 
 
 def rendered(truth: Truth) -> TrueOrthoimage:
+    if id(truth) not in _RENDERED:
+        _RENDERED[id(truth)] = _rendered(truth)
+    return _RENDERED[id(truth)]
+
+
+def _rendered(truth: Truth) -> TrueOrthoimage:
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=GSD_M)
     viewers = Viewers(positions_world=np.unique(truth.stations, axis=0), up=truth.planes.up)
     return render_frame(
@@ -80,8 +90,14 @@ def rendered(truth: Truth) -> TrueOrthoimage:
     )
 
 
-def painted(true: TrueOrthoimage, truth: Truth) -> Orthoimage:
+def painted(truth: Truth) -> Orthoimage:
     """Every cell that a photo sees, painted from the first photo that does."""
+    if id(truth) not in _PAINTED:
+        _PAINTED[id(truth)] = _painted(rendered(truth), truth)
+    return _PAINTED[id(truth)]
+
+
+def _painted(true: TrueOrthoimage, truth: Truth) -> Orthoimage:
     cameras = true_cameras(truth).cameras
     views = SceneCameras(truth.scene)
     rows, columns = np.nonzero(true.rectangle >= 0)
@@ -121,7 +137,7 @@ def inspect_cameras(
         sigma_m=np.full(shape, 0.001, dtype=np.float32),
         mask=np.where(true.rectangle >= 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
     )
-    shown = painted(true, truth) if image is None else image
+    shown = painted(truth) if image is None else image
     return inspect(folder, truth, shown, wall, InspectTruth.Params(supersample=1), cameras=cameras)
 
 
@@ -183,7 +199,7 @@ def test_a_wrong_depth_displaces_along_the_ray(tmp_path: Path, truth: Truth) -> 
 
 def test_a_cell_painted_from_the_object_is_a_ghost(tmp_path: Path, truth: Truth) -> None:
     true = rendered(truth)
-    fair = painted(true, truth)
+    fair = painted(truth)
     cameras = true_cameras(truth).cameras
     # The photo of the lower middle, in whose way the object stands, paints all it holds.
     middle = 1
@@ -208,8 +224,7 @@ def test_a_cell_painted_from_the_object_is_a_ghost(tmp_path: Path, truth: Truth)
 
 
 def test_a_cell_left_out_lowers_the_completeness(tmp_path: Path, truth: Truth) -> None:
-    true = rendered(truth)
-    fair = painted(true, truth)
+    fair = painted(truth)
     mask = fair.mask.copy()
     mask[:, : mask.shape[1] // 2] = OrthoMask.NONE
     metrics, _, _ = inspect_cameras(
@@ -345,7 +360,7 @@ def test_bands_of_a_large_wall_say_what_the_whole_does(
         monkeypatch.setattr(module, "IN_MEMORY_CELLS", 5000)
     monkeypatch.setattr(spreads, "_AT_ONCE", 3000)
     monkeypatch.setattr(truth_module, "_DRAWN_CELLS", max(rendered(truth).frame.shape) // 2)
-    assert len([*truth_module._bands(painted(rendered(truth), truth))]) == 2
+    assert len([*truth_module._bands(painted(truth))]) == 2
     told, banded, other = inspect_cameras(folders[1], truth, some, lift_m=0.002)
     assert told.keys() == metrics.keys()
     for name, value in metrics.items():

@@ -16,6 +16,7 @@ from orthoflow_plugins.plane.space_accumulators import (
     directions_over,
 )
 from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_planes
+from scipy.spatial import KDTree
 
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Planes, PointCloud
@@ -87,7 +88,8 @@ def test_directions_cover_the_hemisphere_evenly_and_the_pole_once(step_deg: floa
     normals = directions.normals
     wanted = np.random.default_rng(0).normal(size=(2_000, 3))
     wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
-    nearest_deg = np.degrees(np.arccos(np.clip(np.abs(wanted @ normals.T).max(axis=1), 0.0, 1.0)))
+    chords, _ = KDTree(np.vstack([normals, -normals])).query(wanted)
+    nearest_deg = np.degrees(2.0 * np.arcsin(0.5 * chords))
     assert nearest_deg.max() < 1.1 * step_deg
     assert np.count_nonzero(np.abs(normals[:, 2]) > np.cos(np.radians(0.5 * step_deg))) == 1
     # Of the hemisphere's 2 pi each direction has a square of one step.
@@ -117,7 +119,7 @@ def test_every_place_votes_once_per_direction_and_takes_its_votes_back() -> None
     weights = rng.integers(1, 9, 500).astype(np.int32)
     votes = votes_of(places, weights)
     np.testing.assert_array_equal(votes.sum(axis=1), VOTE_SHARES * weights.sum())
-    part = votes_of(places[:, :200], weights[:200])
+    part = votes_of(np.ascontiguousarray(places[:, :200]), weights[:200])
     rest = votes + votes_of(np.ascontiguousarray(places[:, 200:]), -weights[200:])
     np.testing.assert_array_equal(rest, part)
 

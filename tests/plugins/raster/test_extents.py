@@ -86,11 +86,13 @@ ROOM = (
     level(0.0, (0.0, 3.0), towards=1.0),
     level(HEIGHT_M, (0.0, 3.0), towards=-1.0),
 )
+# Of what adjoins a wall its nearest metre counts; half as much again is scanned.
+SCANNED_M = (0.0, 1.5)
 SIDES = (
-    patch((0.0, 0.0), (0.0, 3.0), (0.0, HEIGHT_M)),
-    patch((WIDTH_M, WIDTH_M), (0.0, 3.0), (0.0, HEIGHT_M)),
-    patch((0.0, WIDTH_M), (0.0, 3.0), (0.0, 0.0)),
-    patch((0.0, WIDTH_M), (0.0, 3.0), (HEIGHT_M, HEIGHT_M)),
+    patch((0.0, 0.0), SCANNED_M, (0.0, HEIGHT_M)),
+    patch((WIDTH_M, WIDTH_M), SCANNED_M, (0.0, HEIGHT_M)),
+    patch((0.0, WIDTH_M), SCANNED_M, (0.0, 0.0)),
+    patch((0.0, WIDTH_M), SCANNED_M, (HEIGHT_M, HEIGHT_M)),
 )
 # A cornice 12 cm before the wall over its topmost 30 cm, and a pilaster 10 cm before its left end.
 CORNICE = patch((0.0, WIDTH_M), (0.12, 0.12), (2.7, HEIGHT_M))

@@ -345,7 +345,7 @@ def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPa
 def test_rasters_of_large_walls_are_published_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    where = dataclasses.replace(ortho_scenes.frame(), width=600, height=1300)
+    where = dataclasses.replace(ortho_scenes.frame(), width=600, height=700)
     rng = np.random.default_rng(4)
     depths = rng.normal(0.0, 0.01, where.shape).astype(np.float32)
     depths[rng.random(where.shape) < 0.2] = np.nan
