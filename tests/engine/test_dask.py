@@ -47,9 +47,12 @@ steps:
 
 
 @contextmanager
-def cluster(n_workers: int, **resources: float) -> Iterator[LocalCluster]:
+def cluster(
+    n_workers: int, *, processes: bool = True, **resources: float
+) -> Iterator[LocalCluster]:
     with LocalCluster(  # type: ignore[no-untyped-call]
         n_workers=n_workers,
+        processes=processes,
         threads_per_worker=1,
         resources=resources,
         memory_limit=0,
@@ -348,7 +351,7 @@ def test_workers_that_do_not_say_their_cores_get_no_work(
     office: Office, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(dask_executor, "_PATIENCE_S", 1.0)
-    with cluster(1) as silent:
+    with cluster(1, processes=False) as silent:
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
         with pytest.raises(ArgumentError, match="no worker there says how many cores it has"):
             DaskExecutor(plan, tmp_path, Capacity.of_jobs(1, 1), lambda *_: None)
