@@ -277,8 +277,10 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
 
 
 def _table_text(rows: Sequence[ResidualRow]) -> str:
-    """Rows as CSV; what is absent stays empty."""
-    columns = [column.name for column in fields(ResidualRow)]
+    """Rows as CSV; what is absent stays empty. Along a wall u and v are others than in a photo."""
+    columns = [
+        "photo_axis" if column.name == "axis" else column.name for column in fields(ResidualRow)
+    ]
     return csv_text([columns, *(astuple(row) for row in rows)])
 
 

@@ -46,7 +46,7 @@ _COUNTED: Final = {
 # The same of the photos, all walls together.
 _PHOTOS: Final = {
     "sigma_wall_mm_worst": "expected error of its orientation against the scan",
-    "check_rmse_mm_worst": "ties that only check, RMS per axis",
+    "check_rmse_mm_worst": "ties that only check, RMS over both axes of the photo",
 }
 
 

@@ -43,6 +43,8 @@ class Overlay:
         cell: address of the cell that gave the vectors.
         walls_cell: address of the cell that made the wall's raster.
         wall: index of the wall.
+        name: of the wall.
+        check_rms_mm: RMS of the ties that only check along u and v, None without any.
     """
 
     svg: str
@@ -51,6 +53,8 @@ class Overlay:
     cell: str
     walls_cell: str
     wall: int
+    name: str
+    check_rms_mm: tuple[float, float] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,14 +285,21 @@ def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> 
         cell=place.cell,
         walls_cell=place.walls_cell,
         wall=place.wall,
+        name=place.known.name,
+        check_rms_mm=_rms_mm(vectors, "check") if "check" in vectors.kinds else None,
     )
+
+
+def _rms_mm(vectors: Vectors, kind: str) -> tuple[float, float]:
+    u, v = 1e3 * np.sqrt(np.mean(vectors.lengths_m[vectors.kinds == kind] ** 2, axis=0))
+    return float(u), float(v)
 
 
 def _counts(vectors: Vectors) -> str:
     parts = []
     for kind in dict.fromkeys(vectors.kinds.tolist()):
         here = vectors.kinds == kind
-        u, v = 1e3 * np.sqrt(np.mean(vectors.lengths_m[here] ** 2, axis=0))
+        u, v = _rms_mm(vectors, kind)
         rms = "" if kind == "rejected" else f" (RMS {u:.2f} mm along u, {v:.2f} mm along v)"
         parts.append(f"{int(here.sum())} {kind}{rms}")
     return ", ".join(parts)

@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -59,6 +59,7 @@ from orthoflow.report.pictures import (
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import (
+    CHECKING,
     Answer,
     Limit,
     answers,
@@ -89,6 +90,8 @@ class _Ground:
     caption: str
     ground: str
     cell: str
+    wall: str
+    check_rms_mm: tuple[float, float] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -406,7 +409,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     return _Section(
         run=run,
         prefix=prefix,
-        answers=answers(run),
+        answers=tuple(_along_the_wall_shown(answers(run), every.of(main))),
         is_measured=says_how_far_off(run),
         limits=limits(run),
         results=results(run),
@@ -434,6 +437,15 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     )
 
 
+def _along_the_wall_shown(told: Sequence[Answer], main: _Part) -> Iterator[Answer]:
+    """The numbers of the first screen, of ties along the wall whose picture is beside them."""
+    wall = main.orthoimages[0].name if main.orthoimages else ""
+    rms_mm = {one.cell: one.check_rms_mm for one in main.overlays if one.wall == wall}
+    for answer in told:
+        found = rms_mm.get(answer.cell) if answer.metric == CHECKING else None
+        yield answer if found is None else answer.along(wall, found)
+
+
 def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Ground, ...]:
     """What is drawn over pictures of walls, each with the picture that it lies over."""
     grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
@@ -444,6 +456,8 @@ def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Gro
             caption=overlay.caption,
             ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
             cell=overlay.cell,
+            wall=overlay.name,
+            check_rms_mm=overlay.check_rms_mm,
         )
         for overlay in overlays(run, walls, share=share)
     )

@@ -64,6 +64,15 @@ class PlaneTable:
         """Whether another of the tables shows what a later step made of these planes."""
         return any(self.cell in table.before for table in tables if table is not self)
 
+    def differing(self, tables: Iterable[PlaneTable]) -> str:
+        """In how many rows the last of the tables that take this one further differs, in words."""
+        last = [table for table in tables if table is not self and self.cell in table.before][-1]
+        count = sum(row not in last.rows for row in self.rows)
+        of_all = f"{count} of {len(self.rows)} rows" if count else "no row"
+        more = len(last.rows) - len(self.rows)
+        fewer = f", which has {abs(more)} {'more' if more > 0 else 'fewer'}" if more else ""
+        return f"{of_all} differ{'s' if count < 2 else ''} from {last.cell}{fewer}"
+
 
 def plane_tables(run: Run) -> tuple[PlaneTable, ...]:
     """The planes of every cell that found some; those that print alike once."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 from orthoflow.alike import alike
@@ -42,10 +42,11 @@ _DECLARED_MOST: Final = 3
 _IMAGE: Final = re.compile(r"/wall_(\d+)_ortho\.tif$")
 _PLACE: Final = re.compile(r"(.*\S) \(([^()]+)\)")
 _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
+CHECKING: Final = "check_rmse_mm_worst"
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
-    "check_rmse_mm_worst": "mean of both axes of the photo; along one of the wall it may be more",
+    CHECKING: "mean of both axes of the photo; along one of the wall it may be more",
 }
 
 
@@ -57,6 +58,25 @@ class Answer:
     value: str
     cell: str
     not_held: str = ""
+    metric: str = ""
+
+    def along(self, wall: str, check_rms_mm: tuple[float, float]) -> Answer:
+        """Say of ties that only check what they are along a wall, as their drawing does.
+
+        Args:
+            wall: its name.
+            check_rms_mm: of all photos on it, along u and v.
+        """
+        u, v = check_rms_mm
+        return replace(
+            self,
+            what=f"ties that only check, RMS on {wall} along u / along v",
+            value=f"{u:.2f} / {v:.2f} mm",
+            not_held=(
+                "u: right, v: down; of all photos. In the worst photo it is "
+                f"{self.value} in the mean of the photo's two axes"
+            ),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,13 +131,30 @@ def answers(run: Run) -> tuple[Answer, ...]:
                 n_points = int(values.get((row.cell, "n_points"), n_found))
                 of_all = f"{n_found} of {n_points}" if n_points > n_found else f"{n_found}"
                 not_held = f"{of_all} {'point' if n_points == 1 else 'points'}"
-            answer = Answer(what=what, value=value, cell=row.cell, not_held=not_held)
+            answer = Answer(what=what, value=value, cell=row.cell, not_held=not_held, metric=wanted)
             if wanted == "rms_mm" and row.method.startswith("inspect."):
-                found.insert(at_points, answer)
-                at_points += 1
+                own = {name: value for (cell, name), value in values.items() if cell == row.cell}
+                of_points = (answer, *_in_space(row.cell, own))
+                found[at_points:at_points] = of_points
+                at_points += len(of_points)
             else:
                 found.append(answer)
     return tuple(found)
+
+
+def _in_space(cell: str, values: Mapping[str, float]) -> Iterator[Answer]:
+    """How far check points are off in space, beside how far they are in the plane of the wall."""
+    if "rms_3d_mm" in values:
+        n_found = int(values.get("n_3d", 0.0))
+        yield Answer(
+            what="check point in space, off by" if n_found == 1 else WORDS["rms_3d_mm"],
+            value=_in_words("rms_3d_mm", values["rms_3d_mm"], "mm"),
+            cell=cell,
+            not_held=(
+                "with its depth" if n_found == 1 else f"of {n_found} points, with their depth"
+            ),
+            metric="rms_3d_mm",
+        )
 
 
 def says_how_far_off(run: Run) -> bool:

@@ -433,7 +433,18 @@ def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:
     publishing.publish_cameras(cameras, tmp_path, DIGEST)
     with (tmp_path / "residuals.csv").open() as table:
         found = list(csv.DictReader(table))
-    columns = ["photo", "role", "axis", "unit", "n", "mean", "shift_p", "sd", "median", "nmad"]
+    columns = [
+        "photo",
+        "role",
+        "photo_axis",
+        "unit",
+        "n",
+        "mean",
+        "shift_p",
+        "sd",
+        "median",
+        "nmad",
+    ]
     columns += ["skewness", "rmse", "p95", "max", "beyond_own", "beyond_cells", "beyond_any"]
     assert [list(line) for line in found] == [columns] * 2
     assert [line["shift_p"] for line in found] == ["", "0.25"]

@@ -120,7 +120,8 @@ def test_the_last_orientation_before_the_pictures_tells_its_worst_photo() -> Non
     (said,) = module._photo_accuracy(run, ("mosaic", "orient", "before"))
     assert said == (
         "orient, worst photo: expected error of its orientation against the scan 1.2 mm, "
-        "ties that only check, RMS per axis 3.0 mm; errors of depth and scan add to these"
+        "ties that only check, RMS over both axes of the photo 3.0 mm; errors of depth and scan "
+        "add to these"
     )
     (said,) = module._photo_accuracy(run, ("mosaic", "before"))
     assert said.startswith("before, worst photo: expected error")

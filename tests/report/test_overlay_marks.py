@@ -135,6 +135,11 @@ def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) 
     )
     assert found[0].caption.startswith("10 control (RMS ")
     assert found[0].caption.endswith(" times as long")
+    assert found[0].name == "wall 8"
+    assert found[0].check_rms_mm is not None
+    u, v = found[0].check_rms_mm
+    assert f"10 check (RMS {u:.2f} mm along u, {v:.2f} mm along v)" in found[0].caption
+    assert found[2].check_rms_mm is None
     assert found[0].svg.count("<circle") == found[0].svg.count("<rect") == 10
 
 

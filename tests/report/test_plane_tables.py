@@ -112,3 +112,11 @@ def test_planes_that_a_later_step_changed_are_taken_further() -> None:
         ("plane", True),
         ("sides", False),
     ]
+    assert tables[0].differing(tables) == "no row differs from sides"
+    changed = replace(tables[1].rows[0], offset_m=9.0)
+    later = replace(tables[1], rows=(changed, tables[1].rows[1]))
+    assert tables[0].differing((tables[0], later)) == "1 of 2 rows differs from sides"
+    fewer = replace(tables[1], rows=(changed,))
+    assert tables[0].differing((tables[0], fewer)) == (
+        "2 of 2 rows differ from sides, which has 1 fewer"
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 from orthoflow_provenance.model import Metric, PublishedFile
 
 from orthoflow.errors import StoreError
@@ -21,7 +22,7 @@ from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.overlays import magnification_for, residuals_on_wall
-from orthoflow.report.pages import cited
+from orthoflow.report.pages import _along_the_wall_shown, _Ground, _Part, cited
 from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import answers, citations, limits
@@ -221,6 +222,46 @@ def test_the_number_of_check_points_stands_beside_their_rms() -> None:
     assert told(n_found=1.0, n_points=4.0) == ("check point, residual", "1 of 4 points")
     assert told(n_found=3.0, n_points=4.0) == ("check points, RMS", "3 of 4 points")
     assert told(n_found=1.0, n_points=1.0) == ("check point, residual", "1 point")
+
+
+def test_check_points_are_told_in_the_plane_and_in_space_together() -> None:
+    plane = cell("plane", metrics=metrics(rms_mm=1.0))
+    of_one = {"rms_mm": 2.27, "n_found": 1.0, "n_3d": 1.0, "rms_3d_mm": 8.6}
+    check = cell("points", method="inspect.checkpoints", metrics=metrics(**of_one))
+    told = [(one.what, one.value, one.not_held) for one in answers(run(plane, check))]
+    assert told[:2] == [
+        ("check point, residual", "2.27 mm", "1 point"),
+        ("check point in space, off by", "8.6 mm", "with its depth"),
+    ]
+    check = replace(check, metrics=metrics(**of_one | {"n_found": 3.0, "n_3d": 2.0}))
+    (_, second, *_) = answers(run(plane, check))
+    assert (second.what, second.not_held) == (
+        "check points in space, RMS",
+        "of 2 points, with their depth",
+    )
+
+
+def test_ties_that_check_are_told_along_the_wall_beside_them() -> None:
+    orient = cell("orient", metrics=metrics(sigma_wall_mm_worst=0.5, check_rmse_mm_worst=1.95))
+    told = answers(run(orient, cell("mosaic")))
+    image = Picture(uri="", title="", caption="", cell="mosaic", name="wall 0")
+    over = [
+        _Ground(
+            svg=Markup(), title="", caption="", ground="", cell="orient", wall=wall, check_rms_mm=mm
+        )
+        for wall, mm in (("wall 0", (2.52, 1.03)), ("wall 1", (9.0, 9.0)))
+    ]
+    main = _Part(orthoimages=(image,), overlays=tuple(over))
+    expected, along = _along_the_wall_shown(told, main)
+    assert expected == told[0]
+    assert along.what == "ties that only check, RMS on wall 0 along u / along v"
+    assert along.value == "2.52 / 1.03 mm"
+    assert along.not_held.endswith(
+        "In the worst photo it is 1.95 in the mean of the photo's two axes"
+    )
+    # Without a drawing of this wall, or a picture, the number of the photo stays.
+    for less in (replace(main, overlays=tuple(over[1:])), replace(main, orthoimages=())):
+        assert tuple(_along_the_wall_shown(told, less)) == told
 
 
 def test_advice_on_what_was_measured_is_the_first_limit() -> None:

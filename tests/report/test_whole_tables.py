@@ -233,16 +233,22 @@ def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
         cell("orient", metrics=metrics(sigma_wall_mm_worst=1.5)),
     )
     assert answers(told) == (
-        Answer(what="painted, of what a station and a photo see", value="75.0 %", cell="check"),
-        Answer(what="photos oriented", value="3 of 4", cell="other"),
+        Answer(
+            what="painted, of what a station and a photo see",
+            value="75.0 %",
+            cell="check",
+            metric="completeness_seen_by_both",
+        ),
+        Answer(what="photos oriented", value="3 of 4", cell="other", metric="n_oriented"),
         Answer(
             what="expected error of the orientation on the wall, worst photo",
             value="1.5",
             cell="orient",
             not_held="against the scan; errors of depth and scan add to it",
+            metric="sigma_wall_mm_worst",
         ),
-        Answer(what="error of the depth, RMS", value="2 mm", cell="other"),
-        Answer(what="points to their plane, RMS", value="1.25 mm", cell="plane"),
+        Answer(what="error of the depth, RMS", value="2 mm", cell="other", metric="depth_rmse_mm"),
+        Answer(what="points to their plane, RMS", value="1.25 mm", cell="plane", metric="rms_mm"),
     )
 
 

@@ -171,7 +171,7 @@ def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> N
     # The column of a sheet had the plane's noise only, where the report had these.
     assert wall.accuracy[-1] == (
         "orient, worst photo: expected error of its orientation against the scan 4.0 mm, ties that "
-        "only check, RMS per axis 2.5 mm; errors of depth and scan add to these"
+        "only check, RMS over both axes of the photo 2.5 mm; errors of depth and scan add to these"
     )
 
 
