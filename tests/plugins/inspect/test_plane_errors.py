@@ -139,7 +139,7 @@ def test_a_main_wall_that_was_not_found_is_told(tmp_path: Path) -> None:
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     plane_errors.inspect_planes(floors(3.0), None, truth, ctx)
     (warning,) = ctx.warnings
-    assert "floor 0, is none of the 1 planes" in warning
+    assert "the main wall of the scene is none of the 1 planes" in warning
     told = {item.name: item.value for item in ctx.metrics}
     assert (told["main_found"], told["true_planes_found"]) == (0.0, 1.0)
     assert "plane_offset_mm" not in told

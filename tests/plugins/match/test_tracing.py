@@ -439,7 +439,7 @@ def test_ties_that_determine_no_pose_are_left_as_they_are(monkeypatch: pytest.Mo
     monkeypatch.setattr(tracing, "fitted_pose", fail)
     pieces = [piece(40, wrong=(3,))]
     assert tracing._without_misfits(pieces, camera()) is pieces
-    assert tracing._refitted(tracing._joined(pieces), camera()) == (None, math.inf)
+    assert tracing._refitted(tracing._joined(pieces), camera()) is None
 
 
 def test_ties_lie_where_patches_went_and_are_as_exact_as_the_measured_cells_of_their_grain() -> (
