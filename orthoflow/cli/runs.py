@@ -256,7 +256,8 @@ def _facts_text(facts: Mapping[str, object]) -> str:
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    del values["labels"]
+    for name in ("labels", "swept", "shared"):
+        del values[name]
     return values | {"differs": dict(differs)}
 
 

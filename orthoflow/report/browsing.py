@@ -15,6 +15,7 @@ from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.regular_files import open_file
 from orthoflow.products import JsonValue
+from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run, open_run
@@ -55,6 +56,8 @@ class RunSummary:
         facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
             baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
             version), and inputs by `input <name>`.
+        swept: of facts whose variants of the same method take several values, all of them.
+        shared: of facts of one of several datasets, their name without it.
     """
 
     folder: Path
@@ -67,6 +70,8 @@ class RunSummary:
     n_datasets: int = 0
     labels: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
+    swept: Mapping[str, str] = field(default_factory=dict)
+    shared: Mapping[str, str] = field(default_factory=dict)
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -92,17 +97,35 @@ def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
     """What of its facts tells each run from others of the same workflow, by its folder.
 
-    A fact that some of them lack differs only where two others disagree on it.
+    A fact that some of them lack differs only where two others disagree on it. Of a sweep all
+    values are told, and once what is the same on all datasets.
     """
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:
-        for name, value in run.facts.items():
+        for name, value in {**run.facts, **run.swept}.items():
             values.setdefault((run.workflow, name), set()).add(json.dumps(value, sort_keys=True))
     return {
-        run.folder: {
-            name: value for name, value in run.facts.items() if len(values[run.workflow, name]) > 1
-        }
+        run.folder: _once(
+            {
+                name: value
+                for name, value in {**run.facts, **run.swept}.items()
+                if len(values[run.workflow, name]) > 1
+            },
+            run.shared,
+        )
         for run in runs
+    }
+
+
+def _once(facts: Mapping[str, JsonValue], shared: Mapping[str, str]) -> dict[str, JsonValue]:
+    """Tell once what differs alike on all datasets."""
+    said: dict[str, list[str]] = {}
+    for name, short in shared.items():
+        told = json.dumps(facts[name], sort_keys=True) if name in facts else ""
+        said.setdefault(short, []).append(told)
+    return {
+        shared[name] if name in shared and len({*said[shared[name]]}) == 1 else name: value
+        for name, value in facts.items()
     }
 
 
@@ -181,12 +204,19 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         for part in parts.values() or (run,)
         for cell in baseline_cells(part)
     }
+    shared: dict[str, str] = {}
     for cell in record.cells:
         if cell.repeat == 0 and cell.status != "skipped":
             name = names.get(cell.address, cell.address)
-            facts |= {f"{name}.{parameter}": value for parameter, value in cell.params.items()}
+            own = {f"{name}.{parameter}": value for parameter, value in cell.params.items()}
             if cell.address in names:
-                facts[f"{name}.use"] = cell.method
+                own[f"{name}.use"] = cell.method
+                shared |= {
+                    fact: f"{cell.step}{fact.removeprefix(name)}"
+                    for fact in own
+                    if DATA in cell.assignment
+                }
+            facts |= own
     return RunSummary(
         folder=folder,
         state=record.status,
@@ -198,7 +228,33 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         n_datasets=len(parts),
         labels=_labels(run),
         facts=facts,
+        swept=_swept(record.cells, names),
+        shared=shared,
     )
+
+
+def _swept(cells: Sequence[RecordedCell], names: Mapping[str, str]) -> dict[str, str]:
+    """All values of what the variants of one method take several of.
+
+    Args:
+        cells: of the run.
+        names: address -> how the cell of the baseline is named.
+    """
+    alike: dict[tuple[str, str, str], list[RecordedCell]] = {}
+    for cell in cells:
+        if cell.repeat == 0 and cell.status != "skipped":
+            key = cell.step, cell.method, cell.assignment.get(DATA, "")
+            alike.setdefault(key, []).append(cell)
+    found = {}
+    for variants in alike.values():
+        for cell in variants:
+            for parameter in cell.params if cell.address in names and len(variants) > 1 else ():
+                values = dict.fromkeys(
+                    json.dumps(one.params.get(parameter), sort_keys=True) for one in variants
+                )
+                if len(values) > 1:
+                    found[f"{names[cell.address]}.{parameter}"] = "|".join(values)
+    return found
 
 
 def _metrics(run: Run) -> dict[str, float]:

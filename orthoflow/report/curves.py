@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from html import escape
 from typing import Final, NamedTuple
 
@@ -26,6 +27,7 @@ _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 3
+_SHARES: Final = ("label_*", "*completeness*", "*_iou*", "*_share*")
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
 # Above, the button that enlarges lies over the drawing.
@@ -242,6 +244,7 @@ def _curve(
         svg=_Axes.of(
             [point for points in lines.values() for point in points],
             is_error=column.sense is Sense.LESS,
+            is_share=any(fnmatchcase(column.metric, pattern) for pattern in _SHARES),
         ).drawn(
             lines,
             label=title,
@@ -264,21 +267,26 @@ class _Axes:
         y: least and largest.
         is_logarithmic: along x.
         floor: no bar reaches below it: sizes of errors are none.
+        ceiling: no bar reaches above it: shares are none.
     """
 
     x: tuple[float, float]
     y: tuple[float, float]
     is_logarithmic: bool
     floor: float
+    ceiling: float
 
     @classmethod
-    def of(cls, points: Sequence[_Point], *, is_error: bool) -> _Axes:
+    def of(cls, points: Sequence[_Point], *, is_error: bool, is_share: bool = False) -> _Axes:
         xs = [point.x for point in points]
         spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
-        floor = 0.0 if is_error and all(point.y >= 0.0 for point in points) else -math.inf
+        is_share = is_share and all(0.0 <= point.y <= 1.0 for point in points)
+        is_size = is_share or (is_error and all(point.y >= 0.0 for point in points))
+        floor, ceiling = 0.0 if is_size else -math.inf, 1.0 if is_share else math.inf
         low = min(point.y - spread for point, spread in zip(points, spreads, strict=True))
         low = max(low, floor)
         high = max(point.y + spread for point, spread in zip(points, spreads, strict=True))
+        high = min(high, ceiling)
         margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
         # An axis that begins near 0 begins there: half of it would show a difference too large.
         begin = 0.0 if 0.0 <= low < 0.6 * high else low - margin
@@ -288,6 +296,7 @@ class _Axes:
             y=(begin, high + margin),
             is_logarithmic=is_logarithmic,
             floor=floor,
+            ceiling=ceiling,
         )
 
     def across(self, x: float) -> float:
@@ -354,7 +363,7 @@ class _Axes:
         way = "L".join(f"{x:.1f} {y:.1f}" for x, y in at)
         bars = "".join(
             f"M{x:.1f} {self.down(max(point.y - point.spread, self.floor)):.1f}"
-            f"V{self.down(point.y + point.spread):.1f}"
+            f"V{self.down(min(point.y + point.spread, self.ceiling)):.1f}"
             for (x, _), point in zip(at, points, strict=True)
             if math.isfinite(point.spread)
         )

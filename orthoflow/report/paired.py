@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from orthoflow.alike import first_few
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
@@ -67,9 +69,11 @@ class MethodOverDatasets:
         n: datasets with a value.
         failed: datasets on which the combination failed; they have no part in any number.
         n_absent: datasets that have no value though nothing failed, or were left out.
+        partly: of datasets with a value of only some repeats, e.g. `r5 1 of 3 repeats`.
         median: over the datasets, of signed errors of their sizes; NaN without any.
         spread: 1.4826 times the median absolute deviation from it; NaN without any.
         paired: against the reference; None for itself, and where neither more nor less is better.
+        own: of the variants those that the step hangs on.
     """
 
     name: str
@@ -78,9 +82,11 @@ class MethodOverDatasets:
     n: int
     failed: tuple[str, ...]
     n_absent: int
+    partly: tuple[str, ...]
     median: float
     spread: float
     paired: Paired | None
+    own: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +110,27 @@ class MetricOverDatasets:
     @property
     def reference(self) -> str:
         """What the others are compared with, where nothing is said of them."""
-        return next((one.name for one in self.methods if one.is_reference), "")
+        return next((one.name for one in self.told if one.is_reference), "")
+
+    @property
+    def told(self) -> tuple[MethodOverDatasets, ...]:
+        """The combinations, those of the same cells as one, named by what the step hangs on."""
+        alike: dict[tuple[str, tuple[str, ...]], MethodOverDatasets] = {}
+        for one in self.methods:
+            key = one.own, one.failed
+            if key not in alike or one.is_reference:
+                alike[key] = one
+        # Where one of them failed in a step behind, only the whole name tells which.
+        times = Counter(own for own, _ in alike)
+        short = {one.name: one.own for one in self.methods if times[one.own] == 1}
+        return tuple(
+            replace(
+                one,
+                name=short.get(one.name, one.name),
+                against=short.get(one.against, one.against),
+            )
+            for one in alike.values()
+        )
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
@@ -200,7 +226,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         n_datasets: how many the run has.
     """
     judged = [metric for metric in over if metric.sense is not Sense.NEITHER]
-    rows = [one for metric in judged for one in metric.methods if one.against]
+    rows = [one for metric in judged for one in metric.told if one.against]
     if not rows:
         return ""
     tested = [one for one in rows if one.paired is not None and math.isfinite(one.paired.p)]
@@ -214,31 +240,45 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
             f"Nobody is shown to lead: {few}; it takes {_FEWEST_SHOWN} that differ to show anything"
         )
     said = []
-    for name, against in dict.fromkeys((one.name, one.against) for one in tested):
+    alike: dict[str, list[str]] = {}
+    for name, against in dict.fromkeys((one.name, one.against) for one in rows):
+        n_both = sum((one.name, one.against) == (name, against) for one in rows)
         shown = [
             (metric.label.partition(" / ")[0], one.paired.effect)
             for metric in judged
-            for one in metric.methods
-            if one.name == name and one.paired is not None and one.paired.p < _SHOWN_P
+            for one in metric.told
+            if (one.name, one.against) == (name, against)
+            and one.paired is not None
+            and one.paired.p < _SHOWN_P
         ]
         sides = (
             ("better", [label for label, effect in shown if effect > 0]),
             ("worse", [label for label, effect in shown if effect <= 0]),
         )
         how = " and ".join(
-            f"{word} in {len(labels)} of {len(judged)} numbers ({', '.join(labels)})"
+            f"{word} in {len(labels)} of {n_both} numbers ({', '.join(labels)})"
             for word, labels in sides
             if labels
         )
         if how:
             said.append(f"{name} against {against}: {how}")
+        else:
+            alike.setdefault(against, []).append(name)
     if not said:
         return f"Nobody is shown to lead in any of {len(judged)} numbers (p below {_SHOWN_P:g})"
     others = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
     return (
         f"Shown over the datasets (p below {_SHOWN_P:g}, not corrected): "
-        f"{'; '.join(said[:_NAMED])}{others}"
+        f"{'; '.join(said[:_NAMED])}{others}{_not_shown(alike)}"
     )
+
+
+def _not_shown(alike: Mapping[str, Sequence[str]]) -> str:
+    """Say who is not shown to differ from what it is compared with; empty without any."""
+    pairs = [
+        f"{first_few(names, most=_NAMED)} against {against}" for against, names in alike.items()
+    ]
+    return f". No difference is shown of {'; '.join(pairs)}" if pairs else ""
 
 
 def _methods(
@@ -274,12 +314,25 @@ def _methods(
                 n=len(values),
                 failed=failed,
                 n_absent=len(names) - len(values) - len(failed),
+                partly=tuple(
+                    f"{name} {value.n_repeats} of {value.n_all} repeats"
+                    for name, value in values.items()
+                    if value.n_repeats < value.n_all
+                ),
                 median=float(np.median(numbers)) if numbers.size else math.nan,
                 spread=median_deviation(numbers) if numbers.size else math.nan,
                 paired=_paired(values, measured[against], sense) if is_compared else None,
+                own=_own(by_name.values(), step),
             )
         )
     return tuple(rows)
+
+
+def _own(ways: Iterable[Combination], step: str) -> str:
+    """Name those variants of a combination that a step hangs on."""
+    cells = (cell for one in ways for cell in one.cells if cell.step == step)
+    found = {k: v for cell in cells for k, v in cell.assignment.items() if k != DATA}
+    return variants_text(found)
 
 
 def _paired(

@@ -83,7 +83,17 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
     """Give a header, then a row per metric and combination of what holds over all datasets."""
     yield (
         *("step", "metric", "combination", "against", "datasets", "failed", "absent"),
-        *("median", "spread", "pairs", "better", "worse", "median_difference", "p", "effect"),
+        *(
+            "partly",
+            "median",
+            "spread",
+            "pairs",
+            "better",
+            "worse",
+            "median_difference",
+            "p",
+            "effect",
+        ),
         "deciding",
     )
     for metric in over_datasets(parts_of(run)):
@@ -91,7 +101,8 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
             paired = one.paired
             yield (
                 *(metric.step, metric.metric, one.name, one.against),
-                *(one.n, len(one.failed), one.n_absent, one.median, one.spread),
+                *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
+                *(one.median, one.spread),
                 *(
                     ("",) * 7
                     if paired is None

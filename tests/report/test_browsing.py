@@ -171,6 +171,35 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     }
 
 
+def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> None:
+    def told(name: str, *tries: tuple[int, ...]) -> RunSummary:
+        cells = [
+            cell(f"check@check=v{value},data={room}", params={"tries": value})
+            for room, values in zip(("hall", "stairs"), tries, strict=True)
+            for value in values
+        ]
+        resolved = {"datasets": {room: {"inputs": {}, "set": {}} for room in ("hall", "stairs")}}
+        made = record(cells, workflow_resolved=json.dumps(resolved))
+        folder = tmp_path / name
+        return module._of_run(folder, HeldRun(path=folder / "run.h5", record=made))
+
+    swept, single, apart = (
+        told("a", (1, 2, 3), (1, 2, 3)),
+        told("b", (4,), (4,)),
+        told("c", (4,), (5,)),
+    )
+    # What is filtered by is the baseline's.
+    assert swept.facts["check@data=hall.tries"] == 1
+    assert list(differing_facts([swept, single]).values()) == [
+        {"check.tries": "1|2|3"},
+        {"check.tries": 4},
+    ]
+    assert list(differing_facts([single, apart]).values()) == [
+        {"check@data=stairs.tries": 4},
+        {"check@data=stairs.tries": 5},
+    ]
+
+
 def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "going")
     began = {"event": "run", "time": "2026-01-02T11:00:00Z", "run_id": "x", "workflow": "hall"}

@@ -386,3 +386,27 @@ def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
     found = [module._Value(value, math.nan, False) for value in (-4.0, 3.0, -2.0)]
     point = module._point(1.0, found, is_over=True, is_error=is_error)
     assert (point.y, point.n) == (y, 3)
+
+
+@pytest.mark.parametrize(("metric", "beyond"), [("label_iou", 0.0), ("rms_mm", 0.8 / 2**0.5 - 0.5)])
+def test_bars_of_shares_end_at_none_and_all(tmp_path: Path, metric: str, beyond: float) -> None:
+    cells = [
+        cell(
+            f"plane@plane=v{value}" + (f"#{repeat}" if repeat else ""),
+            params={"tolerance_m": value},
+            metrics=metrics(**{metric: 0.9 if repeat else 0.1}),
+        )
+        for value in (1, 2, 3)
+        for repeat in range(2)
+    ]
+    told = record(cells, workflow_resolved=compared_resolved(f"*.{metric}"))
+    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    svg = curve.svg
+    (low_y, low), *_, (high_y, high) = ticks(svg)
+    (bars,) = re.findall(r'class="bar line-0" d="([^"]*)"', svg)
+    # Texts of ticks stand a little below their lines.
+    ends = {
+        round(low + (low_y - 4 - float(y)) / (low_y - high_y) * (high - low), 2)
+        for y in re.findall(r"[ V]([0-9.]+)", bars)
+    }
+    assert sorted(ends) == pytest.approx([-beyond, 1.0 + beyond], abs=0.011)

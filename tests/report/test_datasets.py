@@ -214,10 +214,24 @@ def test_who_leads_over_datasets_is_said_first(
     run = swept(tmp_path, n_rooms, step_mm=step_mm)
     told = who_leads(over_datasets(parts_of(run)), n_rooms)
     assert said in told
-    assert ("ransac" in told) == (step_mm > 0 and n_rooms > 3)
+    shown, _, alike = told.partition("No difference is shown of ")
+    assert ("ransac" in shown) == (step_mm > 0 and n_rooms > 3)
+    assert ("plane=ransac-tolerance_m-0_1 against" in alike) == (step_mm == 0 and n_rooms > 3)
     write_page(run, tmp_path / "report.html")
     first_screen = (tmp_path / "report.html").read_text().partition("<h2")[0]
     assert told in html.unescape(first_screen)
+
+
+def test_of_several_runs_what_holds_over_datasets_stands_before_their_rows(
+    tmp_path: Path,
+) -> None:
+    run = swept(tmp_path, 3, step_mm=0.5)
+    write_report([run, run], tmp_path / "both.html")
+    page = (tmp_path / "both.html").read_text()
+    joint, rows = page.rindex('id="r2-over"'), page.index('id="all-comparison"')
+    assert page.index('id="all-over"') < page.index('id="r1-over"') < joint < rows
+    assert page.count('id="all-comparison"') == 1
+    assert '<details><summary>Every dataset <span class="soft">36 rows</span>' in page[rows:]
 
 
 def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:

@@ -11,7 +11,11 @@ import pytest
 from scipy.stats import wilcoxon
 
 from orthoflow.report import paired as module
-from orthoflow.report.paired import paired_differences
+from orthoflow.report.paired import (
+    MethodOverDatasets,
+    MetricOverDatasets,
+    paired_differences,
+)
 from orthoflow.report.rankings import Sense
 from tests.report_runs import HeldRun, cell, record
 
@@ -115,11 +119,11 @@ def leading(n_methods: int, p: float) -> Any:
         )
         for k in range(n_methods + 1)
     ]
-    return SimpleNamespace(sense=Sense.LESS, methods=methods, label="error / mm")
+    return SimpleNamespace(sense=Sense.LESS, told=methods, label="error / mm")
 
 
 def test_who_leads_is_said_of_six_at_most() -> None:
-    judged_not = SimpleNamespace(sense=Sense.NEITHER, methods=leading(2, 0.01).methods)
+    judged_not = SimpleNamespace(sense=Sense.NEITHER, told=leading(2, 0.01).told)
     assert module.who_leads([judged_not], 9) == ""
     assert module.who_leads([leading(0, 0.01)], 9) == ""
     few = module.who_leads([leading(2, math.nan)], 5)
@@ -131,13 +135,17 @@ def test_who_leads_is_said_of_six_at_most() -> None:
     said = module.who_leads([leading(2, 0.049), leading(2, 0.5)], 9)
     assert "m1 against m0: better in 1 of 2 numbers (error)" in said
     assert "m2 against m0: worse in 1 of 2 numbers (error)" in said
+    both = [leading(2, 0.01), leading(3, 0.5)]
+    assert module.who_leads(both, 9).endswith(
+        "m2 against m0: worse in 1 of 2 numbers (error). No difference is shown of m3 against m0"
+    )
     six, seven = (module.who_leads([leading(n, 0.01)], 9) for n in (6, 7))
     assert (six.count(" against "), "more" in six) == (6, False)
     assert (seven.count(" against "), seven.endswith("; and 1 more")) == (6, True)
 
 
-def measured(value: float, environment: str = "one") -> Any:
-    return SimpleNamespace(value=value, environment=environment)
+def measured(value: float, environment: str = "one", n_repeats: int = 3) -> Any:
+    return SimpleNamespace(value=value, environment=environment, n_repeats=n_repeats, n_all=3)
 
 
 def test_values_of_other_environments_or_of_no_size_are_not_paired() -> None:
@@ -155,15 +163,21 @@ def test_values_of_other_environments_or_of_no_size_are_not_paired() -> None:
     assert module._paired({"b": measured(1.0, "two")}, theirs, Sense.LESS) is None
 
 
-def combination(value: float | None, failure: str | None = None) -> Any:
+def combination(value: float | None, failure: str | None = None, *, n_repeats: int = 3) -> Any:
     return SimpleNamespace(
-        failure=failure, measured=lambda *_: None if value is None else measured(value)
+        failure=failure,
+        cells=(),
+        measured=lambda *_: None if value is None else measured(value, n_repeats=n_repeats),
     )
 
 
 def test_a_method_is_summed_up_over_datasets() -> None:
     found = {
-        "plane=a": {"x": combination(-2.0), "y": combination(3.0), "z": combination(10.0)},
+        "plane=a": {
+            "x": combination(-2.0),
+            "y": combination(3.0, n_repeats=1),
+            "z": combination(10.0),
+        },
         "plane=b": {
             "x": combination(1.0),
             "y": combination(9.0, "no plane"),
@@ -177,6 +191,7 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     assert (first.name, first.is_reference, first.n, first.failed, first.n_absent) == (
         "plane=a", True, 3, (), 1,
     )  # fmt: skip
+    assert (first.partly, second.partly) == (("y 1 of 3 repeats",), ())
     # Errors of both signs would make each other small.
     assert first.median == 3.0
     assert first.spread == pytest.approx(1.4826 * 1.0)
@@ -192,3 +207,29 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     )
     assert first.median == 3.0
     assert second.paired is None
+
+
+def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None:
+    def row(plane: str, corner: str, *, failed: tuple[str, ...] = ()) -> MethodOverDatasets:
+        name = f"plane={plane}, corner={corner}"
+        return MethodOverDatasets(
+            name=name, is_reference=name == "plane=a, corner=x", failed=failed, n=2, n_absent=0,
+            against="" if name == "plane=a, corner=x" else "plane=a, corner=x", partly=(),
+            median=1.0, spread=0.0, paired=None, own=f"plane={plane}",
+        )  # fmt: skip
+
+    def told(*rows: MethodOverDatasets) -> list[tuple[str, str]]:
+        metric = MetricOverDatasets(
+            step="check", metric="rms_mm", label="error", sense=Sense.LESS, methods=rows
+        )
+        return [(one.name, one.against) for one in metric.told]
+
+    every = [row(plane, corner) for plane in "ab" for corner in "yx"]
+    assert told(*every) == [("plane=a", ""), ("plane=b", "plane=a")]
+    # What failed behind the step is no part of its row: the whole names tell which.
+    broken = [*every[:3], row("b", "x", failed=("hall",))]
+    assert told(*broken) == [
+        ("plane=a", ""),
+        ("plane=b, corner=y", "plane=a"),
+        ("plane=b, corner=x", "plane=a"),
+    ]
