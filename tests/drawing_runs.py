@@ -11,6 +11,7 @@ from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
+from orthoflow.files.drawings.room_lines import DrawnWall
 from orthoflow.files.opening_files import publish_openings
 from orthoflow.files.publishing import publish_orthoimages, publish_planes, publish_walls
 from orthoflow.geometry import WallFrame
@@ -86,6 +87,17 @@ def box_planes() -> Planes:
 def wall_frame(planes: Planes) -> WallFrame:
     """Cells over the photographed wall's rectangle: 3.8 x 2.3 m."""
     return frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
+
+
+def drawn_wall(planes: Planes, *, is_known: bool) -> DrawnWall:
+    """The photographed wall without openings, whose plane is known or not."""
+    return DrawnWall(
+        number=WALL,
+        name="the wall",
+        plane_index=WALL if is_known else None,
+        frame=wall_frame(planes),
+        openings=(),
+    )
 
 
 def box_products() -> dict[str, Product]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -121,7 +121,12 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
         most,
     )
     _print_pairs("environment", comparison.environment, str, most)
-    _print_metrics(comparison.shared(comparison.metrics), most)
+    step_of = {
+        cell.address: cell.step
+        for record in (comparison.left, comparison.right)
+        for cell in record.cells
+    }
+    _print_metrics(comparison.shared(comparison.metrics), step_of, most)
     echo("", "products")
     echo_distances(comparison.products, most)
 
@@ -170,21 +175,22 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text}*" if parameter.is_set else text
 
 
-def _print_metrics(rows: Sequence[Pair[ComparedMetric]], most: int | None) -> None:
+def _print_metrics(
+    rows: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str], most: int | None
+) -> None:
     """Print every metric that differs; times and memory, which always do, apart and last."""
-    place = quality_places((_step(row), row.name) for row in rows)
+
+    def told(row: Pair[ComparedMetric]) -> tuple[str, str]:
+        return step_of[row.cell], row.name
+
+    place = quality_places(map(told, rows))
     for title, is_cost in (("metrics", False), ("times and memory", True)):
         chosen = [row for row in rows if row.either.is_cost == is_cost]
         different = [row for row in chosen if not row.is_same]
         echo("", f"{title}: {_counts(chosen)}")
         if different:
-            _print_numbers(first_rows(different, most, lambda row: place((_step(row), row.name))))
+            _print_numbers(first_rows(different, most, lambda row: place(told(row))))
         say_more(len(different), most)
-
-
-def _step(row: Pair[ComparedMetric]) -> str:
-    """The step of a row, from its address."""
-    return row.cell.partition("@")[0].partition("#")[0]
 
 
 def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:

@@ -20,29 +20,18 @@ from orthoflow.engine.results import CellResult, result_to_json
 from orthoflow.engine.tasks import Task
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
 from orthoflow.sdk.context import StepEvent
+from tests.engine_tasks import bare_task
 
 ONE = Capacity(n_tasks=1, n_cores=1, cores_of_one=1, share=1)
 
 
 def a_task(folder: Path, address: str = "step") -> Task:
     (folder / address).mkdir(exist_ok=True)
-    return Task(
-        method="work.add",
+    return bare_task(
         address=address,
-        run_id="r1",
-        target="x:Y",
-        key="k",
-        key_preimage="{}",
-        params={},
-        seed=0,
-        inputs={},
-        outputs={},
-        cores=1,
-        timeout_s=None,
         store=str(folder / "store"),
         folder=str(folder / address),
         log=str(folder / f"{address}.log"),
-        numba_folder="",
     )
 
 

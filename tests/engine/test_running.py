@@ -29,6 +29,7 @@ from orthoflow.errors import (
 )
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepEvent
+from tests.engine_tasks import bare_task
 from tests.report_runs import environment
 
 REF = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:1")
@@ -37,13 +38,11 @@ STORE = Path("/somewhere/store")
 
 def a_task(**more: Any) -> Task:
     plain: dict[str, Any] = {
-        "method": "work.add", "distribution": "toys", "distribution_version": "1.0",
-        "determinism": "seeded", "address": "step", "run_id": "r1", "target": "x:Y", "key": "k",
-        "key_preimage": "{}", "params": {}, "seed": 7, "inputs": {"numbers": TaskInput(ref=REF)},
-        "outputs": {}, "cores": 1, "timeout_s": None, "store": str(STORE), "folder": "f",
-        "log": "l", "numba_folder": "", "environment": environment(),
+        "distribution": "toys", "distribution_version": "1.0", "determinism": "seeded", "seed": 7,
+        "inputs": {"numbers": TaskInput(ref=REF)}, "store": str(STORE),
+        "environment": environment(),
     }  # fmt: skip
-    return Task(**(plain | more))
+    return bare_task(**(plain | more))
 
 
 def test_a_result_begins_with_what_is_known_of_its_task() -> None:

@@ -20,6 +20,7 @@ from orthoflow.engine.splitting import _parts, parts_folder
 from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task, TaskPart
 from orthoflow.errors import CancelledStepError, DamageError
+from tests.engine_tasks import bare_task
 from tests.engine_world import World, toy_world
 
 STEPS = """
@@ -251,23 +252,12 @@ def test_parts_fill_what_is_missing() -> None:
 
 
 def a_step(folder: Path) -> Task:
-    return Task(
+    return bare_task(
         method="work.sums",
-        address="step",
-        run_id="r1",
-        target="x:Y",
         key="key of the step",
-        key_preimage="{}",
-        params={},
-        seed=0,
-        inputs={},
-        outputs={},
-        cores=1,
-        timeout_s=None,
         store=str(folder / "store"),
         folder=str(folder / "scratch" / "whole"),
         log=str(folder / "step.log"),
-        numba_folder="",
     )
 
 

@@ -36,14 +36,15 @@ def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
 
     make_empty(folder)
     written = [path.name for path in write_csv_tables(run, folder)]
-    tables = {"combinations.csv": list(combination_rows(run)), "datasets.csv": [*dataset_rows(run)]}
-    # A header alone says nothing: of one dataset, or of none.
-    told = {name: rows for name, rows in tables.items() if name != "datasets.csv" or len(rows) > 1}
-    for name, rows in told.items():
+    tables = {"combinations.csv": [*combination_rows(run)]}
+    header, *over_datasets = dataset_rows(run)
+    if over_datasets:
+        tables["datasets.csv"] = [header, *over_datasets]
+    for name, rows in tables.items():
         (folder / name).write_text(
             csv_text(rows), encoding="utf-8", errors="backslashreplace", newline=""
         )
-    return ", ".join([*written, *told])
+    return ", ".join([*written, *tables])
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:

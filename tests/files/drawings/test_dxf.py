@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from orthoflow.files.drawings.dxf import LAYERS, _add_polygon, write_wall_dxf
-from orthoflow.files.drawings.room_lines import DrawnWall, Residuals, room_lines
-from tests.drawing_runs import WALL, box_planes, wall_frame
+from orthoflow.files.drawings.room_lines import Residuals, room_lines
+from tests.drawing_runs import WALL, box_planes, drawn_wall
 
 
 def test_layers_are_told_apart_by_their_colours() -> None:
@@ -47,13 +47,7 @@ def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
 
     planes = box_planes()
     lines = room_lines(planes, None, {})
-    wall = DrawnWall(
-        number=WALL,
-        name="the wall",
-        plane_index=WALL if is_known else None,
-        frame=wall_frame(planes),
-        openings=(),
-    )
+    wall = drawn_wall(planes, is_known=is_known)
     write_wall_dxf(tmp_path / "a.dxf", wall, lines)
     space = ezdxf.readfile(tmp_path / "a.dxf").modelspace()
     counts = Counter(entity.dxf.layer for entity in space)

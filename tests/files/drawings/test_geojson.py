@@ -13,7 +13,7 @@ import pytest
 from orthoflow.files.drawings import geojson
 from orthoflow.files.drawings.room_lines import DrawnWall, room_lines
 from tests import samples
-from tests.drawing_runs import WALL, box_openings, box_planes, wall_frame
+from tests.drawing_runs import WALL, box_openings, box_planes, drawn_wall, wall_frame
 
 
 def features(path: Path) -> list[Any]:
@@ -114,13 +114,7 @@ def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
 ) -> None:
     planes = box_planes()
     lines = room_lines(planes, None, {})
-    wall = DrawnWall(
-        number=WALL,
-        name="the wall",
-        plane_index=WALL if is_known else None,
-        frame=wall_frame(planes),
-        openings=(),
-    )
+    wall = drawn_wall(planes, is_known=is_known)
     geojson.write_wall_geojson(tmp_path / "a.geojson", wall, lines)
     kinds = [one["properties"]["kind"] for one in features(tmp_path / "a.geojson")]
     assert kinds == (["frame", "rectangle", "part", *["edge"] * 4] if is_known else ["frame"])

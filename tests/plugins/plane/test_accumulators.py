@@ -16,7 +16,7 @@ from orthoflow_plugins.plane.accumulators import (
     voters,
 )
 from orthoflow_plugins.plane.block_kernels import Boxes, PlanCounts, PlanGrid, blocked, box_blocks
-from orthoflow_plugins.plane.sample import Sample, Unassigned, prepare
+from orthoflow_plugins.plane.sample import PreparedCloud, Sample, Unassigned, prepare
 
 from orthoflow.geometry.point_kernels import read_only
 from tests import scenes
@@ -29,6 +29,18 @@ GRID = PlanGrid(
     cell_m=0.5,
     shape=(6, 4, 3),
 )
+
+
+def level_cloud(surfaces: tuple[Rectangle, ...], *, parts: int) -> PreparedCloud:
+    """Points with 2 mm of noise on some surfaces, counted in plan, z up."""
+    return prepare(
+        cloud_of(points_of(surfaces, noise_m=0.002)),
+        np.eye(3),
+        cell_m=0.05,
+        least_share=0.005,
+        parts=parts,
+        counts_plan=True,
+    )
 
 
 @pytest.mark.parametrize("half", [0, 1, 2])
@@ -166,14 +178,7 @@ def test_a_wall_lies_where_finer_angles_and_bins_put_it(turn_deg: float) -> None
     turn = np.radians(turn_deg)
     normal, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     wall = Rectangle("wall", (*(0.513 * normal), 0.0), (*(3.0 * along), 0.0), (0, 0, 1), 12_000)
-    cloud = prepare(
-        cloud_of(points_of((wall,), noise_m=0.002)),
-        np.eye(3),
-        cell_m=0.05,
-        least_share=0.005,
-        parts=1,
-        counts_plan=True,
-    )
+    cloud = level_cloud((wall,), parts=1)
     proposer = PlanProposer(
         cloud,
         Voting(angle_step_deg=5.0, least_points=1_000.0, walls=True, levels=False, is_raw=False),
@@ -192,14 +197,7 @@ def test_what_was_rejected_bars_lines_like_it_from_both_sides(turn_deg: float) -
     normal, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     u_m = (*(2.0 * along), 0.0)
     walls = [Rectangle("wall", (*(far_m * normal), 0.0), u_m, (0, 0, 1), 4_000) for far_m in (0, 1)]
-    cloud = prepare(
-        cloud_of(points_of(tuple(walls), noise_m=0.002)),
-        np.eye(3),
-        cell_m=0.05,
-        least_share=0.005,
-        parts=1,
-        counts_plan=True,
-    )
+    cloud = level_cloud(tuple(walls), parts=1)
     proposer = PlanProposer(
         cloud,
         Voting(angle_step_deg=1.0, least_points=1_000.0, walls=True, levels=False, is_raw=False),
@@ -222,14 +220,7 @@ def test_what_was_rejected_bars_lines_like_it_from_both_sides(turn_deg: float) -
 
 def test_what_was_rejected_bars_the_heights_about_it() -> None:
     floor = Rectangle("floor", (0, 0, 0.3), (2, 0, 0), (0, 2, 0), 4_000)
-    cloud = prepare(
-        cloud_of(points_of((floor,), noise_m=0.002)),
-        np.eye(3),
-        cell_m=0.05,
-        least_share=0.005,
-        parts=1,
-        counts_plan=True,
-    )
+    cloud = level_cloud((floor,), parts=1)
     proposer = PlanProposer(
         cloud,
         Voting(angle_step_deg=5.0, least_points=1_000.0, walls=False, levels=True, is_raw=False),
@@ -252,14 +243,7 @@ def test_votes_are_points_of_the_cloud_whether_cells_vote_or_points_of_a_sample(
 ) -> None:
     monkeypatch.setattr(sampling, "SAMPLE_POINTS", 1_200)
     wall = Rectangle("wall", (0.0, 0.513, 0.0), (3.0, 0, 0), (0, 0, 1), 12_000)
-    cloud = prepare(
-        cloud_of(points_of((wall,), noise_m=0.002)),
-        np.eye(3),
-        cell_m=0.05,
-        least_share=0.005,
-        parts=2,
-        counts_plan=True,
-    )
+    cloud = level_cloud((wall,), parts=2)
     proposer = PlanProposer(
         cloud,
         Voting(angle_step_deg=5.0, least_points=1_000.0, walls=True, levels=False, is_raw=is_raw),
