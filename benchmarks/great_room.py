@@ -114,7 +114,7 @@ def great_room(n_points: int, *, cores: int) -> GreatRoom:
     scanner = Scanner(scene, ERRORS)
     start = 0
     for sweep, size in zip(sweeps, sizes, strict=True):
-        part = points.part(slice(start, start + size))
+        part = points.take(slice(start, start + size))
         columns = max(1, RAYS_AT_ONCE // sweep.n_rows)
         in_runs(
             partial(_sweep, scanner, sweep, part),
