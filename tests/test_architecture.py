@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import networkx as nx
@@ -70,13 +72,40 @@ def test_geometry_keeps_only_what_two_kinds_or_the_framework_share() -> None:
         assert len(kinds) >= 2 or users > kinds, f"{module} belongs to {kinds}"
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What the tests look for in the tree of a module.
+
+    Attributes:
+        imported: modules of ours.
+        details: lines that read the details of a product.
+        arrays_in_parts: lines of kernels that put an array into a part of one.
+    """
+
+    imported: set[str]
+    details: list[int]
+    arrays_in_parts: list[int]
+
+
+@cache
+def readings() -> dict[Path, Reading]:
+    """All modules, each parsed once: their trees would take hundreds of MiB."""
+    known = {name_of(module) for module in MODULES}
+    found = {}
+    for module in MODULES:
+        tree = ast.parse((ROOT / module).read_text())
+        found[module] = Reading(
+            imported_modules(tree, known), _readings_of_details(tree), _arrays_put_into_parts(tree)
+        )
+    return found
+
+
 def import_graph() -> nx.DiGraph[str]:
     """Modules and packages by name, an edge to each one that they import."""
-    names = {name_of(module): module for module in MODULES}
     graph: nx.DiGraph[str] = nx.DiGraph()
-    for name, module in names.items():
-        imported = imported_modules(ast.parse((ROOT / module).read_text()), names.keys())
-        graph.add_edges_from((name, other) for other in imported - {name})
+    for module, read in readings().items():
+        name = name_of(module)
+        graph.add_edges_from((name, other) for other in read.imported - {name})
     return graph
 
 
@@ -159,12 +188,7 @@ def test_no_module_carries_doubts_or_leftovers(folder: str) -> None:
 
 def test_nobody_reads_the_details_of_a_product() -> None:
     """They are for people: what other code reads is a typed, documented field of the product."""
-    sources = [ROOT / module for module in MODULES]
-    found = [
-        f"{path.relative_to(ROOT)}:{line}"
-        for path in sources
-        for line in _readings_of_details(ast.parse(path.read_text()))
-    ]
+    found = [f"{module}:{line}" for module, read in readings().items() for line in read.details]
     templates = [path for package in PACKAGES for path in (ROOT / package).rglob("*.j2")]
     found += [
         f"{path.relative_to(ROOT)}:{number}"
@@ -178,9 +202,7 @@ def test_nobody_reads_the_details_of_a_product() -> None:
 def test_no_kernel_puts_an_array_into_a_part_of_one() -> None:
     """Numba would compile the sentence about shapes that differ: seconds in each process."""
     found = [
-        f"{module}:{line}"
-        for module in MODULES
-        for line in _arrays_put_into_parts(ast.parse((ROOT / module).read_text()))
+        f"{module}:{line}" for module, read in readings().items() for line in read.arrays_in_parts
     ]
     assert not found, "\n".join(found)
 

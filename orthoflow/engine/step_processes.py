@@ -65,6 +65,8 @@ _READ_AT_LOADING: Final = (
     "RAYON_",
     "VECLIB_",
 )
+# OpenCV puts it before LD_LIBRARY_PATH once it is loaded, for processes that it starts itself.
+_OF_OPENCV: Final = "/cv2/../../lib64"
 # These differ from store to store and are told to each step.
 _READ_LATER: Final = (COMPILED_CODE, "MPLCONFIGDIR", "PYTHONPATH")
 # Threads of OpenBLAS, of which numpy and scipy bring a set each, spin for 2**26 turns of the clock
@@ -274,7 +276,7 @@ def _start_server(variables: Mapping[str, str], log: int) -> _Server:
 
 def _variables(task: Task) -> dict[str, str]:
     """Environment variables for the process of a task."""
-    variables = _SLEEPS_SOON | dict(os.environ)
+    variables = _SLEEPS_SOON | _without_opencv(os.environ)
     variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
     return variables | {
         "PYTHONPATH": python_path(),
@@ -285,6 +287,16 @@ def _variables(task: Task) -> dict[str, str]:
         "MPLCONFIGDIR": str(Path(task.store) / "matplotlib"),
         "TMPDIR": str(task.scratch),
     }
+
+
+def _without_opencv(variables: Mapping[str, str]) -> dict[str, str]:
+    """Leave out what loading OpenCV here has changed: the next run needs no other server for it."""
+    kept = dict(variables)
+    folders = kept.pop("LD_LIBRARY_PATH", "").split(os.pathsep)
+    folders = [folder for folder in folders if not folder.endswith(_OF_OPENCV)]
+    if any(folders):
+        kept["LD_LIBRARY_PATH"] = os.pathsep.join(folders)
+    return kept
 
 
 def _read_at_loading(variables: Mapping[str, str]) -> frozenset[tuple[str, str]]:

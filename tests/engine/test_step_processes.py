@@ -153,6 +153,27 @@ def test_what_libraries_read_when_they_are_loaded_takes_a_server_of_its_own(
     assert len(servers()) == len(before) + 1
 
 
+@pytest.mark.parametrize("folders", [None, "/opt/a:/opt/b"])
+def test_opencv_loaded_here_takes_no_server_of_its_own(
+    world: World, monkeypatch: pytest.MonkeyPatch, folders: str | None
+) -> None:
+    monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
+    if folders:
+        monkeypatch.setenv("LD_LIBRARY_PATH", folders)
+    around(world)
+    before = servers()
+    told = subprocess.run(
+        [sys.executable, "-c", "import cv2, os; print(os.environ['LD_LIBRARY_PATH'])"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    assert told != folders
+    monkeypatch.setenv("LD_LIBRARY_PATH", told)
+    around(world)
+    assert servers() == before
+
+
 def test_a_killed_server_is_replaced(world: World) -> None:
     around(world)
     for server in servers():
