@@ -257,15 +257,15 @@ def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
         assert file["a"].shape == (80 << 20,)
 
 
-def test_sixty_thousand_groups_are_looked_at_at_once(tmp_path: Path) -> None:
+def test_twenty_thousand_groups_are_looked_at_at_once(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w", libver="v110") as file:
         cells = file.create_group("cells")
-        for index in range(60_000):
+        for index in range(20_000):
             h5py.h5g.create(cells.id, str(index).encode())
     began = time.process_time()
     with pytest.raises(RecordFormatError), open_record(tmp_path / "a.h5"):
         pass
-    assert time.process_time() - began < 20.0
+    assert time.process_time() - began < 7.0
 
 
 def test_more_objects_than_any_record_has_are_refused(
