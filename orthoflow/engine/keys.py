@@ -15,7 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final, TypeAlias, cast
 
-from orthoflow.catalog.catalog import Catalog, MethodEntry
+from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
+from orthoflow.catalog.distributions import package_path, source_files
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.kernel_sources import kernel_sources
@@ -33,6 +34,7 @@ _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
 # What a method's result can depend on in the framework; engine and command line cannot change it.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
+_FRAMEWORK: Final = "orthoflow."
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
 
 # Path, size and time of files.
@@ -193,6 +195,18 @@ def framework_tag() -> str:
     if is_framework_released():
         return metadata.version(DISTRIBUTION)
     return files_digest(framework_files())
+
+
+def publisher_tag(entry: ProductEntry) -> str:
+    """What stands for the code that writes the published files of a product type, if any does."""
+    module = entry.spec.publisher.partition(":")[0]
+    if not module:
+        return ""
+    if module.startswith(_FRAMEWORK):
+        return framework_tag()
+    own = entry.distribution
+    files = source_files((own.source_folder, package_path(module)))
+    return f"{framework_tag()} {own if own.is_released else files_digest(files)}"
 
 
 @cache

@@ -18,9 +18,9 @@ from orthoflow.engine.keys import (
     CellKey,
     MethodFacts,
     cell_key,
-    framework_tag,
     input_digest,
     method_facts,
+    publisher_tag,
     read_preimage,
 )
 from orthoflow.engine.results import CellResult, ProductRef
@@ -136,10 +136,17 @@ class PlannedInput:
 
 @dataclass(frozen=True, kw_only=True)
 class ProductTarget:
-    """Import strings of a product type: its class, and its publisher or nothing."""
+    """Import strings of a product type: its class, and its publisher or nothing.
+
+    Attributes:
+        target: of the class.
+        publisher: of the publisher.
+        publisher_tag: version of the publisher.
+    """
 
     target: str
     publisher: str
+    publisher_tag: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +159,6 @@ class RunPlan:
         inputs: workflow input -> files; None when it is optional and absent.
         methods: method id -> facts.
         products: type name -> import strings.
-        publisher_tag: version of what writes published files.
         options: as given.
     """
 
@@ -161,7 +167,6 @@ class RunPlan:
     inputs: Mapping[str, PlannedInput | None]
     methods: Mapping[str, MethodFacts]
     products: Mapping[str, ProductTarget]
-    publisher_tag: str
     options: RunOptions
 
 
@@ -197,7 +202,6 @@ def plan_run(
         inputs=inputs,
         methods=methods,
         products=_product_targets(methods, catalog),
-        publisher_tag=framework_tag(),
         options=options,
     )
 
@@ -349,7 +353,11 @@ def _product_targets(
             raise PluginError(
                 entry.problem if entry else f"no installed plugin brings the product {type_name}"
             )
-        targets[type_name] = ProductTarget(target=entry.spec.target, publisher=entry.spec.publisher)
+        targets[type_name] = ProductTarget(
+            target=entry.spec.target,
+            publisher=entry.spec.publisher,
+            publisher_tag=publisher_tag(entry),
+        )
     return targets
 
 

@@ -329,10 +329,11 @@ class _Call:
     def _keep(self, products: Mapping[str, Product]) -> dict[str, ProductRef]:
         refs: dict[str, ProductRef] = {}
         for port, product in products.items():
-            target = self.task.outputs[port].publisher
+            expected = self.task.outputs[port]
+            target = expected.publisher
             publisher = cast("Publisher", load_target(target)) if target else None
             refs[port] = self._store.put_product(
-                product, publisher, publisher_tag=self.task.publisher_tag
+                product, publisher, publisher_tag=expected.publisher_tag
             )
             self._check_output(port, product, refs[port])
         return refs

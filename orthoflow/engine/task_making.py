@@ -12,7 +12,7 @@ from pathlib import Path
 from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
 from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import CellKey, MethodFacts
-from orthoflow.engine.plan import PlannedInput, RunPlan
+from orthoflow.engine.plan import PlannedInput, ProductTarget, RunPlan
 from orthoflow.engine.results import MethodIdentity, ProductRef, shared_fields
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.engine.store import Store
@@ -64,7 +64,6 @@ class TaskMaker:
             folder=str(self.scratch / uuid.uuid4().hex[:12]),
             log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
             numba_folder=str(self._kernels(facts)),
-            publisher_tag=self.plan.publisher_tag,
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),
         )
@@ -100,9 +99,7 @@ class TaskMaker:
     def _outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
         return {
             port: TaskOutput(
-                type_name=type_name,
-                target=self.plan.products[type_name].target,
-                publisher=self.plan.products[type_name].publisher,
+                type_name=type_name, **shared_fields(self.plan.products[type_name], ProductTarget)
             )
             for port, type_name in facts.outputs.items()
         }

@@ -53,11 +53,19 @@ class TaskInput:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOutput:
-    """What an output port must carry: type, class and publisher by import string."""
+    """What an output port must carry: type, class and publisher by import string.
+
+    Attributes:
+        type_name: product type.
+        target: of its class.
+        publisher: of what writes its published files; empty when nothing does.
+        publisher_tag: version of the publisher.
+    """
 
     type_name: str
     target: str
     publisher: str = ""
+    publisher_tag: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +103,6 @@ class Task(MethodIdentity):
         folder: folder of the task, on the store's file system: scratch and unfinished objects.
         log: file that takes stdout and stderr.
         numba_folder: where compiled kernels are kept.
-        publisher_tag: version of what writes published files.
         environment: where it will run.
         is_compared: whether its times stand beside those of others.
         part: the part to compute; None for a whole step.
@@ -118,7 +125,6 @@ class Task(MethodIdentity):
     folder: str
     log: str
     numba_folder: str
-    publisher_tag: str = ""
     environment: RecordedEnvironment | None = None
     is_compared: bool = False
     part: TaskPart | None = None

@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from orthoflow.catalog.catalog import ProductEntry
+from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.engine import keys, method_versions
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.garbage import collect_garbage
@@ -22,6 +24,7 @@ from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef, RecordedFile
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
+from orthoflow.sdk.hooks import ProductSpec
 from orthoflow.system import usable_cores
 from orthoflow.workflow.cells import Cell, WorkflowInput
 from tests.engine_world import World, forget_toys
@@ -102,6 +105,29 @@ def test_a_release_stands_for_its_code_and_nothing_else_does(
     monkeypatch.setattr(keys, "is_framework_released", keys.is_framework_released.__wrapped__)
     tag = keys.framework_tag()
     assert tag == "1.2.3" if is_released else re.fullmatch(r"(sha256:)?[0-9a-f]{64}", tag)
+
+
+@pytest.mark.parametrize(
+    ("publisher", "is_released", "tag"),
+    [
+        ("", False, ""),
+        ("orthoflow.files.publishing:publish_cloud", False, "F"),
+        ("toys:publish", True, "F toys 1.5"),
+        ("orthoflow_toys:publish", False, f"F {keys.files_digest([])}"),
+    ],
+    ids=["none", "framework", "released", "source"],
+)
+def test_a_publisher_is_known_by_its_version_or_its_code(
+    monkeypatch: pytest.MonkeyPatch, publisher: str, is_released: bool, tag: str
+) -> None:
+    monkeypatch.setattr(keys, "framework_tag", lambda: "F")
+    entry = ProductEntry(
+        spec=ProductSpec(type_name="t", target="toys:T", summary="", publisher=publisher),
+        distribution=DistributionInfo(
+            name="toys", version="1.5", is_released=is_released, source_folder=None
+        ),
+    )
+    assert keys.publisher_tag(entry) == tag
 
 
 def test_code_that_changed_or_went_is_not_the_one_in_the_keys(tmp_path: Path) -> None:
@@ -433,6 +459,19 @@ def test_a_raised_result_version_counts(world: World) -> None:
     )
     forget_toys()
     assert world.status(CHAIN)["first"] == ("will run", "result_version 1 -> 2")
+
+
+def test_a_changed_publisher_writes_its_files_anew(world: World) -> None:
+    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
+    steps = "steps: {a: {use: make.range}}"
+    first = world.run(steps, into="one", executor="inline").results["a"].outputs["numbers"]
+    (file,) = world.store.published_files(first.digest)
+    products = world.site / "toy_plugin" / "products.py"
+    products.write_text(products.read_text().replace('f"{digest} {', 'f"other {'))
+    forget_toys()
+    second = world.run(steps, into="two", executor="inline").results["a"].outputs["numbers"]
+    assert second == first
+    assert file.read_text().startswith("other [")
 
 
 def test_planning_a_large_comparison_looks_earlier_results_up_once(
