@@ -1,4 +1,4 @@
-"""A dot in the place of every chart: drawing takes longer than what most tests look at."""
+"""A dot in the place of what is only drawn for a figure: that takes longer than most tests."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ _DOT: Final = b64decode(
 )
 
 
-def keep_dot(self: StepContext, name: str, content: bytes | Drawing, caption: str = "") -> None:
-    """Keep a figure as a step does, but nothing of what a chart shows."""
+def keep_dot(
+    self: StepContext, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
+) -> None:
+    """Keep a figure as a step does, but nothing of what is still to be drawn."""
     FIGURE(self, name, content if isinstance(content, bytes) else _DOT, caption)
 
 

@@ -160,13 +160,16 @@ class StepContext:
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
     @_names_the_line
-    def figure(self, name: str, content: bytes | Drawing, caption: str = "") -> None:
+    def figure(
+        self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
+    ) -> None:
         """Keep a picture for the record and the report.
 
         Args:
             name: short name, unique in the step; letters, digits, `-`, `_`.
-            content: the bytes of a PNG, WebP or SVG file, or a matplotlib figure. Charts are PNG or
-                SVG; what looks like a photo is WebP, which takes a tenth of the bytes.
+            content: the bytes of a PNG, WebP or SVG file, a function that gives them and is called
+                where figures are wanted, or a matplotlib figure. Charts are PNG or SVG; what looks
+                like a photo is WebP, which takes a tenth of the bytes.
             caption: one sentence on what it shows.
 
         Raises:
@@ -177,6 +180,8 @@ class StepContext:
         _require_room("figure", len(self.figures), _MOST_FIGURES)
         path = _path_below(self.scratch / "figures", name)
         _require_letters("figure", name)
+        if callable(content):
+            content = content()
         suffix = _suffix(content, name) if isinstance(content, bytes) else ".png"
         path = _path_below(path.parent, f"{name}{suffix}")
         if colliding([*(figure.name for figure in self.figures), name]):

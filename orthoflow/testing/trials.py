@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,9 @@ class _WatchedContext(StepContext):
     fractions: list[float] = field(default_factory=list)
     draws: bool = True
 
-    def figure(self, name: str, content: bytes | Drawing, caption: str = "") -> None:
+    def figure(
+        self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
+    ) -> None:
         if self.draws:
             super().figure(name, content, caption)
 

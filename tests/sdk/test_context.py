@@ -278,6 +278,25 @@ class NoPicture:
         path.write_bytes(b"no picture")
 
 
+def test_a_picture_is_asked_for_where_figures_are_wanted_alone(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    asked = []
+
+    def picture() -> bytes:
+        asked.append(1)
+        return PNG
+
+    ctx = context(tmp_path)
+    ctx.figure("undrawn", picture)
+    assert asked == []
+    request.getfixturevalue("charts")
+    ctx.figure("drawn", picture)
+    assert (asked, ctx.figures[1].path.read_bytes()) == ([1], PNG)
+    with pytest.raises(ProductError, match="figure other must be a PNG"):
+        ctx.figure("other", lambda: b"no picture")
+
+
 @pytest.mark.usefixtures("charts")
 def test_a_figure_that_writes_no_picture_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match="figure chart must be a PNG"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -129,7 +130,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
-            _error_map(best / high_m),
+            partial(_error_map, best / high_m),
             f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
             f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
             f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall. Bright places "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -160,7 +161,7 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
         ctx.metric("scan_step_p90_mm", 1000.0 * step.p90_m, "mm")
     ctx.figure(
         "main_wall",
-        _picture(truth, ctx.cores),
+        partial(_picture, truth, ctx.cores),
         f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm: what "
         "the run should come to; blurred or doubled edges in its orthoimage are errors.",
     )
@@ -176,7 +177,7 @@ def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> 
     ctx.metric("photo_obliquity_max_deg", max(shot.taken.obliquity_deg for shot in shots), "deg")
     ctx.figure(
         "photos",
-        _contact_sheet(photos),
+        partial(_contact_sheet, photos),
         "The photos, in the order of their names: a wall is painted well where several show it "
         "squarely; blur, or a part of it that none shows, cannot be made good later.",
     )
@@ -222,7 +223,9 @@ def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _picture(truth: Truth, cores: int) -> bytes:
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)
-    image = render_frame(truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2)
+    image = render_frame(
+        truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2, cores=cores
+    )
     return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))
 
 

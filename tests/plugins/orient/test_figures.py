@@ -148,7 +148,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     grey = np.rint(255.0 * np.minimum(np.where(seen, best, 0.0) / high, 1.0)).astype(np.uint8)
     rgb = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[:, :, ::-1].copy()
     rgb[~seen] = (20, 40, 60)
-    shown = np.array(drawings["wall_8_predicted_error"])
+    shown = np.array(drawings["wall_8_predicted_error"]())
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
     # No more pictures than enough.
     drawings.clear()

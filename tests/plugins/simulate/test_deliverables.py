@@ -127,6 +127,7 @@ def test_a_thumb_has_every_so_manieth_pixel(width: int, shown: int) -> None:
     assert sheet.shape[1] == shown
 
 
+@pytest.mark.usefixtures("charts")
 def test_photos_are_reported_by_their_shots(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     shots: Any = tuple(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from orthoflow_plugins.simulate.room import SimulateRoom
 
+from orthoflow.files.images import decode_image
 from orthoflow.geometry import UpDirection, wall_axes
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import PointCloud, Truth
@@ -183,6 +184,7 @@ def test_relief_scales_what_stands_out_of_the_walls(tmp_path: Path) -> None:
     assert points[1] > 1.5 * points[0]
 
 
+@pytest.mark.usefixtures("charts")
 def test_the_scan_step_on_the_main_wall_is_as_asked(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
     params = SimulateRoom.Params(scan_step_m=0.01, panorama_step_m=0.15)
@@ -191,7 +193,11 @@ def test_the_scan_step_on_the_main_wall_is_as_asked(tmp_path: Path) -> None:
     # Two stations look at most of the wall, so half of it is finer than one step by itself.
     assert 7.0 < metrics["scan_step_median_mm"] < 11.0
     assert metrics["scan_step_p90_mm"] < 14.0
-    assert [figure.name for figure in context.figures] == ["main_wall"]
+    (figure,) = context.figures
+    assert figure.name == "main_wall"
+    shown = decode_image(figure.path.read_bytes(), "main_wall")
+    assert shown.shape == (312, 540, 3)
+    assert shown.std() > 30.0
 
 
 def test_one_to_four_stations_give_two_scans_each(tmp_path: Path) -> None:
