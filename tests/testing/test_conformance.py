@@ -9,6 +9,7 @@ from tempfile import mkdtemp
 
 import pytest
 
+from orthoflow import testing
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.files.images import encode_jpeg
 from orthoflow.files.publishing import publish_cameras
@@ -17,11 +18,15 @@ from orthoflow.testing import ConformanceCase, conformance_cases
 from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import settled_camera
 from tests import inspect_scenes, ortho_scenes, photo_files, recess_scenes
+from tests.undrawn_charts import build_orient_charts_once, build_plane_charts_once
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
     "simulate.room": {"scan_step_m": 0.1},
     "raster.grid": {"gsd_m": 0.05},
+    "match.sift": {"n_features_max": 1000},
+    "match.guided": {"n_ties_max": 400},
+    "orient.colmap-bundle": {"n_features_max": 1000, "n_photo_points_max": 300},
 }
 
 # Check that a method cannot pass -> why; the suite says when it starts to pass.
@@ -106,18 +111,33 @@ SCENES: dict[str, Callable[[], Mapping[str, Product | InputFiles]]] = {
 
 
 def cases() -> list[ConformanceCase]:
-    return [
-        case
-        for method_id, entry in sorted(discover_catalog().methods.items())
-        if entry.distribution.name == "orthoflow-tls"
-        for case in conformance_cases(
-            method_id,
-            inputs=partial(inputs, method_id),
-            params=QUICK.get(method_id),
-            expected_failures=EXPECTED_FAILURES.get(method_id),
-            golden=None if method_id in NO_GOLDEN else GOLDEN,
-        )
-    ]
+    catalog = discover_catalog()
+    with pytest.MonkeyPatch.context() as patch:
+        # What is installed is read for all methods once.
+        patch.setattr(testing.cases, "discover_catalog", lambda: catalog)
+        return [
+            case
+            for method_id, entry in sorted(catalog.methods.items())
+            if entry.distribution.name == "orthoflow-tls"
+            for case in conformance_cases(
+                method_id,
+                inputs=partial(inputs, method_id),
+                params=QUICK.get(method_id),
+                expected_failures=EXPECTED_FAILURES.get(method_id),
+                golden=None if method_id in NO_GOLDEN else GOLDEN,
+            )
+        ]
+
+
+@pytest.fixture(autouse=True)
+def _charts_of_a_method_built_once(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method_id = request.node.callspec.params["case"].method_id
+    kind = method_id.partition(".")[0]
+    if kind in ("plane", "orient"):
+        build = build_plane_charts_once if kind == "plane" else build_orient_charts_once
+        build(request, monkeypatch, test=method_id)
 
 
 @pytest.mark.parametrize("case", cases(), ids=str)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from orthoflow_plugins.orient import figures, reporting
+from orthoflow_plugins.orient import figures
 
-from tests.undrawn_charts import build_charts_once
+from tests.undrawn_charts import build_orient_charts_once
 
 
 @pytest.fixture(autouse=True)
@@ -20,4 +20,4 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture(autouse=True)
 def _charts_built_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_charts_once(request, monkeypatch, reporting, "draw_positions", "draw_residuals")
+    build_orient_charts_once(request, monkeypatch)
