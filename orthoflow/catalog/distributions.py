@@ -6,9 +6,13 @@ import ast
 import re
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint
+from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, requires
 from importlib.util import cache_from_source, find_spec
 from pathlib import Path
+from typing import Final
+
+_REQUIREMENT: Final = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?[^;]*(.*)", re.DOTALL)
+_OF_EXTRA: Final = re.compile(r"extra\s*==\s*[\"']([\w.-]+)[\"']")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +129,49 @@ def _was_compiled(path: Path) -> bool:
         return Path(cache_from_source(path)).stat().st_mtime >= path.stat().st_mtime
     except OSError:
         return False
+
+
+def canonical_name(name: str) -> str:
+    """Spell the name of a distribution as indexes do.
+
+    >>> canonical_name("Ruamel.YAML_clib")
+    'ruamel-yaml-clib'
+    """
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+@cache
+def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
+    """Distributions and all that they require, by canonical name, whatever system that is for.
+
+    None when one of the named is not installed here: nobody can say what it requires.
+    """
+    # Name and the extras that are asked for.
+    left = [(canonical_name(name), frozenset[str]()) for name in names]
+    asked = set(left)
+    missing: set[str] = set()
+    while left:
+        name, extras = left.pop()
+        try:
+            stated = requires(name) or []
+        except PackageNotFoundError:
+            missing.add(name)
+            continue
+        for text in stated:
+            found = _REQUIREMENT.fullmatch(text)
+            if found is None:
+                continue
+            of_extra = _OF_EXTRA.search(found[3])
+            if of_extra and canonical_name(of_extra[1]) not in extras:
+                continue
+            wanted = frozenset(canonical_name(one.strip()) for one in (found[2] or "").split(","))
+            new = canonical_name(found[1]), wanted
+            if new not in asked:
+                asked.add(new)
+                left.append(new)
+    if not missing.isdisjoint(map(canonical_name, names)):
+        return None
+    return frozenset(name for name, _ in asked)
 
 
 @cache

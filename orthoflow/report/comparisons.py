@@ -9,11 +9,11 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import Final, TypeAlias
 
-from orthoflow.alike import first_few
-from orthoflow.records import COSTS, RecordedEnvironment
+from orthoflow.records import COSTS
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
+from orthoflow.report.environments import alike_environments
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
@@ -91,6 +91,16 @@ class Row:
     has_compiler: bool = False
 
     @property
+    def judged(self) -> tuple[Value, ...]:
+        """All its numbers."""
+        return *self.values, self.time, self.memory
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Signs of the environments and data of its numbers, each once."""
+        return tuple(dict.fromkeys(value.group for value in self.judged if value.group))
+
+    @property
     def shortfall(self) -> str:
         """Why it has no time and no memory, in a word or two; empty when it is whole."""
         return "failed" if self.failure else "not computed" if self.missing else ""
@@ -108,6 +118,8 @@ class Standing:
         n_near: numbers in which it is among the best, and no difference is shown.
         n_worst: numbers in which it is worst.
         best_in: what it is clearly best in, at most three.
+        groups: signs of its environments and data, where there are several.
+        is_unranked: nothing of it is ranked, as no other has a sign of it.
         time: seconds of the cells that the variants have a part in.
     """
 
@@ -118,6 +130,8 @@ class Standing:
     n_near: int
     n_worst: int
     best_in: tuple[str, ...]
+    groups: tuple[str, ...]
+    is_unranked: bool
     time: Value
 
 
@@ -138,6 +152,14 @@ class ComparisonTable:
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
+
+    @property
+    def forced(self) -> str:
+        """Options that measure all anew, in one environment; empty where there is but one."""
+        if not any(sign.isupper() for sign in self.groups):
+            return ""
+        steps = dict.fromkeys((*self.steps, *(column.step for column in self.columns)))
+        return " ".join(f"--force {step}" for step in steps if step != DATA)
 
     @property
     def n_whole(self) -> int:
@@ -177,11 +199,10 @@ class ComparisonTable:
     def glance(self) -> tuple[Standing, ...]:
         """How often each combination leads; who is best, then near the best most often first."""
         labels = [*(f"{one.step}: {one.label}" for one in self.columns), "time", "memory"]
-        marked = [
-            [value.mark for value in (*row.values, row.time, row.memory)] for row in self.rows
-        ]
         found = []
-        for row, name, marks in zip(self.rows, self._names, marked, strict=True):
+        groups = [row.groups for row in self.rows]
+        for row, name, own in zip(self.rows, self._names, groups, strict=True):
+            marks = [value.mark for value in row.judged]
             best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
             found.append(
                 Standing(
@@ -192,6 +213,8 @@ class ComparisonTable:
                     n_near=marks.count(Mark.NEAR),
                     n_worst=marks.count(Mark.WORST),
                     best_in=(*best[:_NAMED], *(["..."] if len(best) > _NAMED else [])),
+                    groups=own,
+                    is_unranked=own != () and sum(not set(own).isdisjoint(e) for e in groups) == 1,
                     time=row.time,
                 )
             )
@@ -426,7 +449,7 @@ class Origins:
     """Capital letters for the environments, small ones for the data of one or more runs.
 
     Attributes:
-        environments: id -> letter.
+        environments: id -> letter, the same for those that are alike.
         data: run, and its dataset or nothing -> letter.
         legend: what each sign in use stands for; empty when all is of one kind.
     """
@@ -438,10 +461,8 @@ class Origins:
     @staticmethod
     def of(runs: Sequence[Run]) -> Origins:
         """Look through the environments and the data of runs."""
-        environments = {
-            environment.id: environment for run in runs for environment in run.record.environments
-        }
-        letters = {key: _letter(index) for index, key in enumerate(environments)}
+        alike = alike_environments(runs)
+        signs = {key: _letter(index) for index, key in enumerate(alike.words)}
         # What each run was given, or each of its datasets: digests -> places that have them.
         named: dict[tuple[str, ...], dict[_Place, str]] = {}
         for run in runs:
@@ -452,44 +473,25 @@ class Origins:
         # No digits: raised behind a number they would look like powers.
         small = {key: _letter(index).lower() for index, key in enumerate(named)}
         legend: dict[str, str] = {}
-        if len(environments) > 1:
-            first = next(iter(environments.values()))
-            legend |= {
-                letters[key]: environment_words(environment) + _other_packages(environment, first)
-                for key, environment in environments.items()
-            }
+        if len(signs) > 1:
+            legend |= {signs[key]: words for key, words in alike.words.items()}
         if len(named) > 1:
             legend |= {
                 small[key]: f"data of run {'; '.join(dict.fromkeys(said.values()))}"
                 for key, said in named.items()
             }
         places = {place: small[key] for key, said in named.items() for place in said}
+        letters = {key: signs[first] for key, first in alike.first.items()}
         return Origins(environments=letters, data=places, legend=legend)
 
     def letters(self, one: Combination, environment: str) -> str:
         """Give the sign of a value; empty when all values are of one kind."""
-        letter = self.environments.get(environment, "?") if len(self.environments) > 1 else ""
+        has_several = len(set(self.environments.values())) > 1
+        letter = self.environments.get(environment, "?") if has_several else ""
         if len(set(self.data.values())) < 2:
             return letter
         own = (*_name(one.run), one.assignment.get(DATA, ""))
         return letter + self.data.get(own, "?")
-
-
-def environment_words(environment: RecordedEnvironment) -> str:
-    """Say in one line where something was computed."""
-    commit = f", code at commit {environment.git_commit}" if environment.git_commit else ""
-    return (
-        f"Python {environment.python}, {environment.os}, {environment.cpu}, "
-        f"{environment.cores} processors, {environment.threads} threads{commit}"
-    )
-
-
-def _other_packages(environment: RecordedEnvironment, first: RecordedEnvironment) -> str:
-    """Say in which packages an environment differs from another; empty where in none."""
-    own, others = dict(environment.packages), dict(first.packages)
-    said = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
-    said += [f"no {name}" for name in others if name not in own]
-    return f"; unlike the first with {first_few(said)}" if said else ""
 
 
 def _letter(index: int) -> str:

@@ -31,12 +31,13 @@ from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import figure_files
 from orthoflow.records.runs import FIGURES_FOLDER, Run
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
+from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.cursors import cursor_places
 from orthoflow.report.curves import Curve, curves, curves_over
 from orthoflow.report.dataset_tables import DatasetTable, dataset_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
+from orthoflow.report.environments import told_apart
 from orthoflow.report.figures import (
     FigureGroup,
     baseline_addresses,
@@ -302,7 +303,7 @@ def environment() -> jinja2.Environment:
     )
     environment.filters["with_unit"] = number_with_unit
     environment.filters["number"] = number
-    environment.filters["environment"] = environment_words
+    environment.filters["environments"] = told_apart
     environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote

@@ -15,7 +15,8 @@ from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
-from orthoflow.report.comparisons import comparison_columns
+from orthoflow.report.comparisons import Column, comparison_columns
+from orthoflow.report.environments import AlikeEnvironments, alike_environments
 from orthoflow.report.rankings import Sense, badness
 from orthoflow.workflow.cells import variants_text
 from orthoflow.workflow.format import DATA
@@ -73,6 +74,7 @@ class MethodOverDatasets:
         median: over the datasets, of signed errors of their sizes; NaN without any.
         spread: 1.4826 times the median absolute deviation from it; NaN without any.
         paired: against the reference; None for itself, and where neither more nor less is better.
+        n_unlike: datasets on which both have a value, of environments that are not alike.
         own: of the variants those that the step hangs on.
     """
 
@@ -86,6 +88,7 @@ class MethodOverDatasets:
     median: float
     spread: float
     paired: Paired | None
+    n_unlike: int
     own: str
 
 
@@ -150,6 +153,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     every = [one for by_name in found.values() for one in by_name.values()]
     if len(names) < 2 or not every:
         return ()
+    alike = alike_environments(parts.values())
     reference = next((_method(one) for one in every if one.is_baseline), next(iter(found)))
     partners = _partners(
         {method: next(iter(ways.values())) for method, ways in found.items()}, reference
@@ -160,7 +164,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
             metric=column.metric,
             label=column.label,
             sense=column.sense,
-            methods=_methods(found, names, partners, (column.step, column.metric, column.sense)),
+            methods=_methods(found, names, partners, column, alike),
         )
         for column in comparison_columns(every)
     )
@@ -234,6 +238,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         few = (
             f"{n_datasets} datasets are too few for a test"
             if n_datasets < _FEWEST_SHOWN
+            else "values of environments that are not alike are not compared"
+            if any(one.n_unlike for one in rows)
             else "too few of the datasets differ for a test"
         )
         return (
@@ -285,14 +291,15 @@ def _methods(
     found: Mapping[str, Mapping[str, Combination]],
     names: Sequence[str],
     partners: Mapping[str, str],
-    column: tuple[str, str, Sense],
+    column: Column,
+    alike: AlikeEnvironments,
 ) -> tuple[MethodOverDatasets, ...]:
-    step, metric, sense = column
+    step, sense = column.step, column.sense
     measured = {
         method: {
             name: value
             for name, one in by_name.items()
-            if one.failure is None and (value := one.measured(step, metric)) is not None
+            if one.failure is None and (value := one.measured(step, column.metric)) is not None
         }
         for method, by_name in found.items()
     }
@@ -306,6 +313,13 @@ def _methods(
             numbers = np.abs(numbers)
         against = partners[method]
         is_compared = against != "" and sense is not Sense.NEITHER
+        theirs = measured[against] if is_compared else {}
+        both = {name: value for name, value in values.items() if name in theirs}
+        ours = {
+            name: value
+            for name, value in both.items()
+            if alike.are_alike(value.environment, theirs[name].environment)
+        }
         rows.append(
             MethodOverDatasets(
                 name=method,
@@ -321,7 +335,8 @@ def _methods(
                 ),
                 median=float(np.median(numbers)) if numbers.size else math.nan,
                 spread=median_deviation(numbers) if numbers.size else math.nan,
-                paired=_paired(values, measured[against], sense) if is_compared else None,
+                paired=_paired(ours, theirs, sense),
+                n_unlike=len(both) - len(ours),
                 own=_own(by_name.values(), step),
             )
         )
@@ -338,13 +353,8 @@ def _own(ways: Iterable[Combination], step: str) -> str:
 def _paired(
     ours: Mapping[str, Measured], theirs: Mapping[str, Measured], sense: Sense
 ) -> Paired | None:
-    both = [
-        name
-        for name, value in ours.items()
-        if name in theirs and theirs[name].environment == value.environment
-    ]
     worse = {
-        name: badness(ours[name].value, sense) - badness(theirs[name].value, sense) for name in both
+        name: badness(ours[name].value, sense) - badness(theirs[name].value, sense) for name in ours
     }
     worse = {name: value for name, value in worse.items() if math.isfinite(value)}
     return paired_differences(worse, sense) if worse else None

@@ -54,7 +54,8 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     A value whose distance from the best is not above both their standard deviations together (in
     quadrature), or without repeats not above a hundredth of the best (repeats or not a tenth of a
     memory, three tenths of a time), is marked as near the best and never as worst; the best is then
-    only among the best, too, as are several that are alike.
+    only among the best, too, as are several that are alike. The worst is marked where every other
+    value is as far from it.
 
     Args:
         values: a column.
@@ -85,13 +86,21 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         }
         if len(near) == sum(scores[index] != scores[best] for index in members):
             continue
+        worst = max(members, key=scores.__getitem__)
+        is_worst = all(
+            scores[index] != scores[worst]
+            and abs(values[index].sort - values[worst].sort)
+            > _spread(values[worst], values[index], metric)
+            for index in members
+            if index != worst
+        )
         for index in members:
             mark = Mark.NONE
             if scores[index] == scores[best]:
                 mark = Mark.NEAR if near or n_first > 1 else Mark.BEST
             elif index in near:
                 mark = Mark.NEAR
-            elif scores[index] == max(scores.values()):
+            elif index == worst and is_worst:
                 mark = Mark.WORST
             marked[index] = replace(values[index], mark=mark)
     return marked

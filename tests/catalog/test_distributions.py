@@ -15,6 +15,7 @@ from orthoflow.catalog.distributions import (
     describe_distribution,
     may_define,
     package_path,
+    required_distributions,
     source_files,
 )
 
@@ -130,3 +131,20 @@ def test_python_files_of_packages_and_modules_are_listed_once(folder: Path) -> N
         folder / "regular/__init__.py",
         folder / "regular/inner/__init__.py",
     )
+
+
+def test_what_a_distribution_requires_is_followed(folder: Path) -> None:
+    """Extras count where they are asked for; what is not installed has no requirements."""
+    required = {
+        "My.Plugin": ["one[Fast, x] >=2 ; python_version > '3'", 'docs; extra == "docs"'],
+        "one": ["speed>=1 ; extra == 'fast'", "slow ; extra == 'slow'", "gone"],
+        "speed": ["one"],
+    }
+    for name, texts in required.items():
+        info = folder / f"{name}-1.dist-info"
+        info.mkdir()
+        lines = [f"Name: {name}", "Version: 1", *(f"Requires-Dist: {text}" for text in texts)]
+        (info / "METADATA").write_text("\n".join(["Metadata-Version: 2.1", *lines]))
+    found = required_distributions(frozenset({"my-plugin"}))
+    assert found == {"my-plugin", "one", "speed", "gone"}
+    assert required_distributions(frozenset({"my-plugin", "gone"})) is None

@@ -241,9 +241,9 @@ def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:
     )
     both = (environment(), environment("e2", threads=4))
     told = replace(rooms, record=replace(rooms.record, cells=cells, environments=both))
-    paired = methods(told)["plane=quick"].paired
-    assert paired is not None
-    assert (paired.n, paired.wins) == (5, 3)
+    quick = methods(told)["plane=quick"]
+    assert quick.paired is not None
+    assert (quick.paired.n, quick.paired.wins, quick.n_unlike) == (5, 3, 1)
 
 
 @pytest.mark.parametrize("n", [5, 8])

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import combinations_of
-from orthoflow.report.comparisons import Origins, _letter, comparison_table, environment_words
+from orthoflow.report.comparisons import Origins, _letter, comparison_table
+from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import (
     Vectors,
     _counts,
@@ -284,16 +285,16 @@ def test_letters_go_on_behind_z() -> None:
 
 def test_environments_and_data_have_letters_of_their_own() -> None:
     def run(name: str, *cells: object) -> HeldRun:
-        told = record(cells, run_id=name, environments=(environment(name),))  # type: ignore[arg-type]
+        told = record(cells, run_id=name, environments=(environment(name, threads=int(name[1])),))  # type: ignore[arg-type]
         return HeldRun(path=Path(f"{name}.h5"), record=told)
 
     one, two = run("e1", cell("a@b=c")), run("e2", cell("a@b=d", environment="e2"))
     origins = Origins.of([one, two])
-    words = environment_words(environment())
-    assert words == (
-        f"Python 3.11.2, Linux, toy, 2 processors, 2 threads, code at commit {40 * 'c'}+changes"
+    words = (
+        f"Python 3.11.2, Linux, toy, 2 processors, {n} threads, code at commit {40 * 'c'}+changes"
+        for n in (1, 2)
     )
-    assert origins.legend == {"A": words, "B": words}
+    assert origins.legend == dict(zip("AB", words, strict=True))
     (first,), (second,) = combinations_of(one), combinations_of(two)
     assert (origins.letters(first, "e1"), origins.letters(second, "e2")) == ("A", "B")
     assert origins.letters(first, "e9") == "?"

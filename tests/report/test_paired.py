@@ -11,6 +11,8 @@ import pytest
 from scipy.stats import wilcoxon
 
 from orthoflow.report import paired as module
+from orthoflow.report.comparisons import Column
+from orthoflow.report.environments import AlikeEnvironments
 from orthoflow.report.paired import (
     MethodOverDatasets,
     MetricOverDatasets,
@@ -18,6 +20,8 @@ from orthoflow.report.paired import (
 )
 from orthoflow.report.rankings import Sense
 from tests.report_runs import HeldRun, cell, record
+
+ALIKE = AlikeEnvironments(first={}, words={})
 
 
 def worse(*values: float) -> dict[str, float]:
@@ -115,6 +119,7 @@ def leading(n_methods: int, p: float) -> Any:
         SimpleNamespace(
             name=f"m{k}",
             against="m0" if k else "",
+            n_unlike=0,
             paired=SimpleNamespace(p=p, effect=0.5 if k % 2 else -0.5),
         )
         for k in range(n_methods + 1)
@@ -129,6 +134,9 @@ def test_who_leads_is_said_of_six_at_most() -> None:
     few = module.who_leads([leading(2, math.nan)], 5)
     assert "5 datasets are too few for a test" in few
     assert "too few of the datasets differ" in module.who_leads([leading(2, math.nan)], 6)
+    apart = leading(2, math.nan)
+    apart.told[1].n_unlike = 6
+    assert "environments that are not alike" in module.who_leads([apart], 6)
     assert module.who_leads([leading(2, 0.051)] * 3, 9) == (
         "Nobody is shown to lead in any of 3 numbers (p below 0.05)"
     )
@@ -148,19 +156,22 @@ def measured(value: float, environment: str = "one", n_repeats: int = 3) -> Any:
     return SimpleNamespace(value=value, environment=environment, n_repeats=n_repeats, n_all=3)
 
 
-def test_values_of_other_environments_or_of_no_size_are_not_paired() -> None:
+def test_values_of_no_size_are_not_paired() -> None:
     ours = {
-        "a": measured(2.0), "b": measured(2.0, "two"), "c": measured(3.0),
+        "a": measured(2.0),
         "d": measured(math.inf), "e": measured(-1.0),
     }  # fmt: skip
-    theirs = {name: measured(1.5) for name in "abde"}
+    theirs = {name: measured(1.5) for name in "ade"}
     found = module._paired(ours, theirs, Sense.LESS)
     assert found is not None
     # Of signed errors the sizes.
     assert (found.n, found.wins, found.losses) == (2, 1, 1)
     assert found.deciding == {"a": 0.5}
-    assert module._paired({"c": measured(1.0)}, theirs, Sense.LESS) is None
-    assert module._paired({"b": measured(1.0, "two")}, theirs, Sense.LESS) is None
+    assert module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, Sense.LESS) is None
+
+
+def column(sense: Sense) -> Column:
+    return Column(step="check", metric="rms_mm", label="", sense=sense)
 
 
 def combination(value: float | None, failure: str | None = None, *, n_repeats: int = 3) -> Any:
@@ -186,7 +197,7 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     }
     partners = {"plane=a": "", "plane=b": "plane=a"}
     first, second = module._methods(
-        found, ("x", "y", "z", "w"), partners, ("check", "rms_mm", Sense.LESS)
+        found, ("x", "y", "z", "w"), partners, column(Sense.LESS), ALIKE
     )
     assert (first.name, first.is_reference, first.n, first.failed, first.n_absent) == (
         "plane=a", True, 3, (), 1,
@@ -202,9 +213,7 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     )  # fmt: skip
     assert second.paired is not None
     assert (second.paired.n, second.paired.wins) == (1, 1)
-    first, second = module._methods(
-        found, ("x", "y", "z"), partners, ("check", "rms_mm", Sense.NEITHER)
-    )
+    first, second = module._methods(found, ("x", "y", "z"), partners, column(Sense.NEITHER), ALIKE)
     assert first.median == 3.0
     assert second.paired is None
 
@@ -215,7 +224,7 @@ def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None
         return MethodOverDatasets(
             name=name, is_reference=name == "plane=a, corner=x", failed=failed, n=2, n_absent=0,
             against="" if name == "plane=a, corner=x" else "plane=a, corner=x", partly=(),
-            median=1.0, spread=0.0, paired=None, own=f"plane={plane}",
+            n_unlike=0, median=1.0, spread=0.0, paired=None, own=f"plane={plane}",
         )  # fmt: skip
 
     def told(*rows: MethodOverDatasets) -> list[tuple[str, str]]:

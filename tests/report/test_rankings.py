@@ -55,12 +55,24 @@ def test_a_value_within_both_spreads_of_the_best_is_near_it(
     assert marks(of(1.0, best_spread), of(1.5, spread), of(9.0)) == [*found, "WORST"]
 
 
+@pytest.mark.parametrize(
+    ("spread", "worst_spread", "worst"),
+    [(0.3, 0.4, "NONE"), (0.3, 0.39, "WORST"), (math.nan, 0.5, "NONE")],
+)
+def test_a_value_within_both_spreads_of_another_is_not_worst(
+    spread: float, worst_spread: float, worst: str
+) -> None:
+    found = marks(of(1.0, 0.1), of(9.5, worst_spread), of(9.0, spread))
+    assert found == ["BEST", worst, "NONE"]
+    assert marks(of(1.0, 0.1), of(9.0), of(9.0)) == ["BEST", "NONE", "NONE"]
+
+
 def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() -> None:
     assert marks(of(1.238), of(1.239)) == ["NONE", "NONE"]
     assert marks(of(1.238), of(1.239), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0), of(1.011), of(2.0)) == ["BEST", "NONE", "WORST"]
     costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, "peak_rss_mib")
-    assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "WORST"]
+    assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "NONE"]
 
 
 def test_with_repeats_their_spread_alone_says_what_differs() -> None:

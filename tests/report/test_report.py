@@ -521,6 +521,12 @@ def test_values_of_different_environments_carry_letters_and_are_ranked_apart() -
         ("B", Mark.NONE),
     ]
     assert list(table.groups) == ["A", "B"]
+    assert [(one.groups, one.is_unranked) for one in table.glance] == [
+        (("A",), False),
+        (("B",), True),
+        (("A",), False),
+    ]
+    assert table.forced == "--force plane"
 
 
 def test_runs_on_different_data_are_not_ranked_together() -> None:

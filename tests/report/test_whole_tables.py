@@ -126,7 +126,7 @@ def marks(sense: Sense, *values: tuple[float, ...], groups: str = "") -> list[st
 
 
 def test_the_best_and_the_worst_are_marked() -> None:
-    assert marks(Sense.LESS, (2,), (-1,), (3,), (-3,)) == ["NONE", "BEST", "WORST", "WORST"]
+    assert marks(Sense.LESS, (2,), (-1,), (3,), (-3,)) == ["NONE", "BEST", "NONE", "NONE"]
     assert marks(Sense.MORE, (2,), (-1,), (3,)) == ["NONE", "WORST", "BEST"]
     assert marks(Sense.ONE, (2,), (0.9,), (0.0,), (4,)) == ["NONE", "BEST", "WORST", "NONE"]
     assert marks(Sense.NEITHER, (2,), (-1,)) == ["NONE", "NONE"]
@@ -141,9 +141,9 @@ def test_the_best_and_the_worst_are_marked() -> None:
 
 def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
     # 3 and 4 in quadrature are 5.
-    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "NONE"]
     assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["NEAR", "NEAR", "WORST"]
-    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["NEAR", "NEAR", "NONE"]
 
 
 def test_badness_grows_as_values_get_worse() -> None:

@@ -1,0 +1,60 @@
+"""Environments are one where they differ in nothing that the methods of a run use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import RecordedEnvironment
+from orthoflow.report import environments as module
+from orthoflow.report.environments import alike_environments, environment_words, told_apart
+from tests.report_runs import HeldRun, cell, environment, record
+
+FIRST = environment()
+
+
+def packages(name: str, **versions: str) -> RecordedEnvironment:
+    return replace(FIRST, id=name, packages={**FIRST.packages, **versions})
+
+
+def first_alike(*others: RecordedEnvironment) -> list[str]:
+    told = record([cell("a")], environments=(FIRST, *others))
+    return [*alike_environments([HeldRun(path=Path("r.h5"), record=told)]).first.values()]
+
+
+@pytest.mark.parametrize(
+    ("used", "other", "is_alike"),
+    [
+        ({"numpy"}, packages("e2", pytest="9"), True),
+        (None, packages("e2", pytest="9"), True),
+        ({"numpy"}, packages("e2", numpy="2.2"), False),
+        ({"scipy"}, packages("e2", numpy="2.2"), True),
+        (None, packages("e2", numpy="2.2"), False),
+        ({"numpy"}, replace(FIRST, id="e2", cpu="other"), False),
+    ],
+    ids=["unrelated", "one has it", "used", "unused", "nobody knows", "machine"],
+)
+def test_only_what_methods_use_sets_environments_apart(
+    monkeypatch: pytest.MonkeyPatch,
+    used: set[str] | None,
+    other: RecordedEnvironment,
+    is_alike: bool,
+) -> None:
+    monkeypatch.setattr(module, "required_distributions", lambda _: used)
+    assert first_alike(other) == ["e1", "e1" if is_alike else "e2"]
+
+
+def test_of_two_that_are_like_the_first_each_may_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "required_distributions", lambda _: {"mine"})
+    found = first_alike(packages("e2", mine="1"), packages("e3", mine="2"), packages("e4"))
+    assert found == ["e1", "e1", "e3", "e1"]
+
+
+def test_equal_words_are_told_apart_by_the_packages() -> None:
+    words = environment_words(FIRST)
+    assert told_apart([FIRST, packages("e2", mine="0.1")]) == {
+        "e1": words,
+        "e2": f"{words}; unlike the first with mine 0.1",
+    }
