@@ -14,7 +14,7 @@ from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.failures import code_for, say_error
 from orthoflow.cli.options import input_option, store_option
 from orthoflow.cli.tables import counted, echo
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, RecordError
 
 if TYPE_CHECKING:
     from orthoflow.records.runs import Run
@@ -172,13 +172,17 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
+    if (chosen.embed or chosen.split) and (doubt := broken_seal(opened, of_all=True)):
+        raise RecordError(f"{doubt}; what was changed is not sealed anew: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             said = _export_to(FORMATS[target], opened, aside, chosen)
         else:
             said = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {said}")
-    return code_for([broken_seal(opened)], f"rely on nothing in {folder}")
+    # A crate hands on the record itself, with arrays that nobody has read.
+    doubt = broken_seal(opened, of_all=target == "ro-crate")
+    return code_for([doubt], f"rely on nothing in {folder}")
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:

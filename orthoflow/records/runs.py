@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -141,7 +142,8 @@ class Run:
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such output.
-            RecordError: the record holds only the digest of an output, or is damaged.
+            RecordError: the record holds only the digest of an output, is damaged, or has an output
+                that is not what its digest says.
         """
         for address, port in places:
             self._check_embedded(address, port)
@@ -164,8 +166,9 @@ class Run:
             )
         if not outputs[port].embedded:
             raise RecordError(
-                f"{self.path} names {address}.{port} only by its digest; run the workflow with "
-                "--embed to put every product into the record"
+                f"{self.path} names {address}.{port} only by its digest: it is in the store of the "
+                f"run, from which `orthoflow export {shlex.quote(str(self.path))} --embed` puts "
+                "every product into a record"
             )
 
     def product(self, address: str, port: str) -> Product:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,13 +21,14 @@ from orthoflow.files.images import cells_webp
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
-from orthoflow.products import Orthoimage, Orthoimages, OrthoMask
+from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product
 from orthoflow.records import RecordedFigure
 from orthoflow.records.comparison import RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.runs import open_run as open_plain_run
+from orthoflow.records.verification import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
@@ -86,6 +88,37 @@ class OpenedRun(Run):
             }
         )
 
+    def product(self, address: str, port: str, *, store: str | Path = ".orthoflow") -> Product:
+        """Give an output as an object of its product class.
+
+        Args:
+            address: of the cell.
+            port: of the output.
+            store: folder of stored results, for products that the record only names.
+
+        Raises:
+            ArgumentError: the run has no such cell, or the cell no such output.
+            RecordError: neither the record nor the store has the output, or the record is damaged.
+            PluginError: no installed plugin knows the product's type.
+            DamageError: the output was damaged in the store.
+        """
+        from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
+        from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
+
+        output = self.cell(address).outputs.get(port)
+        # Asking makes the folder of a store that is not there.
+        stored = Store(Path(store)) if Path(store).is_dir() else None
+        if output is None or output.embedded or stored is None:
+            return super().product(address, port)
+        if stored.product_file(output.digest) is None:
+            return super().product(address, port)
+        cls = discover_catalog().product_class(output.type_name)
+        return stored.get_product(output.digest, cls)
+
+    def verify(self) -> Verification:
+        """Check all of the record and the published files beside it, as `orthoflow verify` does."""
+        return verify_run(self.path)
+
     def orthoimage(
         self, number: int | None = None, *, cell: str | None = None, data: str | None = None
     ) -> WallImage:
@@ -144,7 +177,7 @@ class OpenedRun(Run):
         from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
 
         stores = (Store(Path(store)),) if Path(store).is_dir() else ()
-        opened = other if isinstance(other, Run) else open_plain_run(other)
+        opened = other if isinstance(other, Run) else open_run(other)
         return compare_runs(self, opened, stores=stores)
 
     def _repr_html_(self) -> str:
@@ -171,7 +204,9 @@ class OpenedRun(Run):
 
 
 def open_run(path: str | Path) -> OpenedRun:
-    """Open a finished run.
+    """Open a finished run, with a warning where the seal of its record does not hold.
+
+    Large arrays of products are looked at when they are read; `OpenedRun.verify` looks at all.
 
     Args:
         path: a run folder, or the `run.h5` in it.
@@ -181,6 +216,8 @@ def open_run(path: str | Path) -> OpenedRun:
         RecordError: the record is damaged, no record at all, or of a newer format.
     """
     plain = open_plain_run(path)
+    if doubt := broken_seal(plain):
+        warnings.warn(f"{doubt}; rely on nothing that is said of it here", stacklevel=2)
     return OpenedRun(path=plain.path, record=plain.record)
 
 

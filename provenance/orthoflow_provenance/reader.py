@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from orthoflow_provenance import layout
+from orthoflow_provenance.digests import payload_digest
 from orthoflow_provenance.encoding import (
     dataset_of,
     int_attribute,
@@ -61,7 +62,8 @@ class OpenRecord:
         """Read an output of a cell; arrays of mapped products stay valid after closing.
 
         Raises:
-            RecordFormatError: there is no such output, it is not embedded, or it is damaged.
+            RecordFormatError: there is no such output, it is not embedded, it is damaged, or it is
+                not what its digest says.
         """
         cell = next((cell for cell in self.record.cells if cell.address == address), None)
         output = None if cell is None else cell.outputs.get(port)
@@ -83,7 +85,8 @@ def open_outputs(path: Path) -> Iterator[Callable[[str, str], StoredPayload]]:
     mapped products stay valid after closing.
 
     Raises:
-        RecordFormatError: the file is no record or damaged; of the reading, it has no such output.
+        RecordFormatError: the file is no record or damaged; of the reading, it has no such output,
+            or that is not what its digest says.
         OSError: the file cannot be opened.
     """
     with safe_open(path) as file:
@@ -119,7 +122,15 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
 
 def _payload(file: h5py.File, address: str, port: str) -> StoredPayload:
     cell = open_group(open_group(file, layout.CELLS), address)
-    return read_payload(open_group(open_group(cell, layout.CELL_OUTPUTS), port), map_arrays=True)
+    group = open_group(open_group(cell, layout.CELL_OUTPUTS), port)
+    payload = read_payload(group, map_arrays=True)
+    # Who shows or hands on arrays has looked at the smaller parts of the seal at most.
+    if (found := payload_digest(payload)) != payload.digest:
+        raise RecordFormatError(
+            f"{group.name} has the digest {found}, the record says {payload.digest}: it was "
+            "changed, or the file is damaged"
+        )
+    return payload
 
 
 def record_of(file: h5py.File) -> RunRecord:

@@ -77,7 +77,7 @@ def verify_record(path: Path) -> tuple[Finding, ...]:
         return (Finding(place="/", problem=problem),)
 
 
-def verify_seal(path: Path, *, largest_bytes: int) -> tuple[Finding, ...]:
+def verify_seal(path: Path, *, largest_bytes: float) -> tuple[Finding, ...]:
     """Check the seal of a record alone, at the cost of reading its smaller parts.
 
     Args:

@@ -6,9 +6,11 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import h5py
 import pytest
 from orthoflow_provenance.verify import verify_record
 
+from orthoflow.errors import RecordError
 from orthoflow.records.runs import open_run
 from tests.studios import Studio, open_copy, open_finished_studio
 
@@ -76,6 +78,27 @@ def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
     notes = [line for line in verified.stdout.splitlines() if line.startswith("note: ")]
     assert (verified.exit_code, len(notes)) == (0, 1), verified.stdout
     assert notes[0].startswith("note: not covered: report.html, ")
+
+
+def test_a_record_with_changed_arrays_is_not_handed_on(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As if the array were too large to be looked at by everybody.
+    monkeypatch.setattr("orthoflow.records.verification._SEALED_BYTES", 0)
+    with h5py.File(studio.folder / "first" / "run.h5", "r+") as file:
+        arrays = file["cells/survey/out/planes/arrays"]
+        names: list[str] = []
+        arrays.visititems(lambda name, item: names.append(name) if item.ndim else None)
+        arrays[names[0]][...] = 0
+    for words in (("--embed",), ("--to", "ro-crate", "--embed")):
+        refused = studio("export", "first", *words, "-o", "whole")
+        assert refused.exit_code == 3, refused.output
+        assert "; what was changed is not sealed anew: take another copy of it" in refused.stderr
+        assert not (studio.folder / "whole").exists()
+    told = studio("export", "first", "--to", "ro-crate", "-o", "crate")
+    assert (told.exit_code, "its seal does not hold for /cells/survey" in told.stderr) == (3, True)
+    with pytest.raises(RecordError, match=r"has the digest .*, the record says .* another copy"):
+        open_run("first").product("survey", "planes")
 
 
 def test_every_figure_is_written_on_demand(studio: Studio) -> None:

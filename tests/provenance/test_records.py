@@ -536,6 +536,22 @@ def _seal_again(file: h5py.File) -> None:
     seal_file(file)
 
 
+@pytest.mark.parametrize("is_sealed_again", [False, True], ids=["as it was sealed", "sealed again"])
+def test_arrays_that_are_not_what_their_digest_says_are_not_read(
+    tmp_path: Path, *, is_sealed_again: bool
+) -> None:
+    path, _, _ = write_sample(tmp_path)
+    with h5py.File(path, "r+") as file:
+        _change_array(file)
+        if is_sealed_again:
+            _seal_again(file)
+    with (
+        open_record(path) as opened,
+        pytest.raises(RecordFormatError, match=r"out/walls has the digest .* record says sha256:"),
+    ):
+        opened.payload(WALL, "walls")
+
+
 SEALED_CHANGES = {
     "array and seal": (
         _change_array,

@@ -321,7 +321,7 @@ def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
         (
             lambda run: run.payload("cloud", "cloud"),
             RecordError,
-            "names cloud.cloud only by its digest; run the workflow with --embed",
+            "names cloud.cloud only by its digest: it is in the store of the run, from which ",
         ),
         (lambda run: run.payload("roof", "x"), ArgumentError, "has no step 'roof'; it has cloud, "),
         (

@@ -8,14 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
-from orthoflow_provenance.model import RecordedFigure
+from orthoflow_provenance.model import RecordedFigure, RecordedProduct
 from orthoflow_provenance.writer import write_record
 
 import orthoflow
-from orthoflow.errors import ArgumentError, OrthoflowError, WorkflowError
-from orthoflow.products import Orthoimages
+from orthoflow.engine.store import Store
+from orthoflow.errors import ArgumentError, OrthoflowError, RecordError, WorkflowError
+from orthoflow.products import Orthoimages, PointCloud
 from orthoflow.report.notebooks import Figures, OpenedRun
 from orthoflow.report.tidy_tables import combination_rows
 from tests.provenance_records import write_sample
@@ -234,6 +236,31 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
 def test_records_of_the_command_line_open_too(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     assert "court-yard" in orthoflow.open_run(path)._repr_html_()
+
+
+def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
+    path, _, _ = write_sample(tmp_path)
+    assert orthoflow.open_run(path).verify().findings == ()
+    with h5py.File(path, "r+") as file:
+        file.attrs["seed"] = type(file.attrs["seed"])(b"8")
+    with pytest.warns(UserWarning, match="does not hold for /; rely on nothing that is said of it"):
+        run = orthoflow.open_run(path)
+    assert run.verify().findings == ("/: changed after the record was sealed",)
+
+
+def test_products_that_a_record_only_names_come_from_the_store(tmp_path: Path) -> None:
+    zeros = np.zeros(3, np.float32)
+    cloud = PointCloud(origin=np.zeros(3), x=zeros, y=zeros, z=zeros, up=np.eye(3)[2])
+    store = Store(tmp_path / "store")
+    digest = store.put_product(cloud).digest
+    output = RecordedProduct(type_name="cloud", encoding_version=1, digest=digest)
+    run = OpenedRun(
+        path=tmp_path / "run.h5", record=record([cell("scan", outputs={"cloud": output})])
+    )
+    assert len(run.product("scan", "cloud", store=tmp_path / "store")) == 3
+    with pytest.raises(RecordError, match=r"only by its digest: .* `orthoflow export .* --embed`"):
+        run.product("scan", "cloud", store=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 def test_what_is_wrong_with_a_workflow_is_raised(
