@@ -115,8 +115,11 @@ def _serve() -> None:
     import orthoflow.records.writing
     import orthoflow.workflow.document
     import orthoflow.workflow.schema
+    from orthoflow.engine.environment import cpu_name, git_commit
     from orthoflow.report.pages import environment
 
+    cpu_name()
+    git_commit()
     for name in environment().list_templates(["j2"]):
         environment().get_template(name)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

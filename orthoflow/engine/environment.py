@@ -52,14 +52,27 @@ def packages() -> dict[str, str]:
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
         try:
-            stated = distribution.metadata
+            name, version = _stated(distribution)
         except ValueError:
             # Not even text: nobody can say what it is.
             continue
-        name, version = stated["Name"], stated["Version"]
         if name and version and name not in found:
             found[name] = version
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+def _stated(distribution: metadata.Distribution) -> tuple[str, str]:
+    """Name and version of a distribution, without the long text behind them: each run reads all."""
+    files = ("METADATA", "PKG-INFO", "")  # the last where the file itself is on the path
+    text = next(filter(None, map(distribution.read_text, files)), "")
+    stated = {"name": "", "version": ""}
+    for line in text.splitlines():
+        key, _, value = line.partition(":")
+        if not line or all(stated.values()):
+            break
+        if not stated.get(key.lower(), "-"):
+            stated[key.lower()] = value.strip()
+    return stated["name"], stated["version"]
 
 
 @cache

@@ -251,13 +251,19 @@ def test_the_id_of_an_environment_is_a_digest_of_all_of_it() -> None:
 
 
 def test_the_first_of_two_distributions_of_a_name_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = [("b", "1"), ("A", "2"), ("b", "3"), (None, "4"), ("", "5")]
-    found = [
-        SimpleNamespace(metadata={"Name": name, "Version": version}) for name, version in pairs
-    ]
+    texts = (
+        {"METADATA": "Metadata-Version: 2.1\nName: b\nLicense: one\n  Name: c\nVersion: 1\n"},
+        {"PKG-INFO": "version: 2\nname:A\nName: c\n\nText: is long\n"},
+        {"METADATA": "Name: b\nVersion: 3\n"},
+        {"METADATA": "Version: 4\n\nName: behind\n"},
+        {"": "Name: \nVersion: 5\n", "METADATA": ""},
+        {},
+        {"": "Name: d\nVersion: 6\n"},
+    )
+    found = [SimpleNamespace(read_text=text.get) for text in texts]
     monkeypatch.setattr(metadata, "distributions", lambda: found)
     told = environment.packages.__wrapped__()
-    assert list(told.items()) == [("A", "2"), ("b", "1")]
+    assert list(told.items()) == [("A", "2"), ("b", "1"), ("d", "6")]
 
 
 # --- digests of files ---

@@ -1,6 +1,7 @@
 """The documents followed to the letter: every command, in its order, in a folder of its own.
 
-Rooms are small, so that a run takes a second. `.ci/run --long` follows the tutorial as it stands.
+Rooms are small, so that a run takes a second; the one of the session's store less. `.ci/run --long`
+follows the tutorial as it stands.
 What every command must look like, quick or not, says tests/test_documented.py.
 """
 
@@ -23,10 +24,8 @@ from orthoflow.products import PointCloud
 from orthoflow.testing import example_room
 from tests.documented import ROOT, blocks, commands_of, documented_commands, written_files
 from tests.long_loops import IS_LONG
-from tests.road.conftest import Ended, Shell
+from tests.road.conftest import COARSE, Ended, Shell
 from tests.scan_files import write_las
-
-COARSE: Final = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def test_the_signature(finished: Path, shell: Shell) -> None:
 
 def test_the_lines_of_python(shell: Shell) -> None:
     (block,) = blocks(ROOT / "docs" / "python.md", "python")
-    small = 'set={"room.scan_step_m": 0.05, "wall.gsd_m": 0.05}, store=STORE'
+    small = 'set={"room.scan_step_m": 0.08, "wall.gsd_m": 0.08}, store=STORE'
     shown, n_runs = re.subn(r"set=\{.*?\}", small, block.replace("quickstart", "direct"))
     assert n_runs == 1
     done = subprocess.run(
