@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from orthoflow.engine.compiled_code import VARIABLE
 from tests.forked_commands import run_command
@@ -48,16 +49,10 @@ def command(*arguments: str) -> list[str]:
 
 
 def orthoflow(
-    folder: Path, *arguments: str, plugins: Sequence[Path] = ()
+    folder: Path,
+    *arguments: str,
+    plugins: Sequence[Path] = (),
+    environment: Mapping[str, str] = MappingProxyType({}),
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder and wait for its end; `plugins` are installed besides."""
-    if not plugins:
-        return run_command(folder, arguments, workshop_environment())
-    return subprocess.run(
-        command(*arguments),
-        cwd=folder,
-        env=workshop_environment(*plugins),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return run_command(folder, arguments, {**workshop_environment(*plugins), **environment})

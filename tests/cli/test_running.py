@@ -251,14 +251,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
 def test_a_run_that_failed_for_want_of_room_goes_on_with_the_same_folder(tmp_path: Path) -> None:
     write_studio(tmp_path, "paint.room")
     arguments = ("run", "studio.yaml", "-o", "r")
-    failed = subprocess.run(
-        command(*arguments),
-        cwd=tmp_path,
-        env={**workshop_environment(), "WORKSHOP_DISK_IS_FULL": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    failed = orthoflow(tmp_path, *arguments, environment={"WORKSHOP_DISK_IS_FULL": "1"})
     assert failed.returncode == 1
     assert "with more room on the disk, the same command with -o r goes on" in failed.stderr
     assert open_run(tmp_path / "r").cells["paint"].error_type == "DiskSpaceError"
@@ -307,7 +300,7 @@ def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path: Path) -> None:
     os.close(reading)
     with os.fdopen(writing, "wb") as closed:
         done = subprocess.run(
-            command("run", "studio.yaml", "-o", "r"),
+            command("run", "studio.yaml", "-o", "r", "--executor", "inline"),
             cwd=tmp_path,
             env=workshop_environment(),
             stdout=closed,

@@ -17,13 +17,16 @@ from tests.road.conftest import Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
 SMALL = ("--set", "room.scan_step_m=0.012", "--set", "wall.gsd_m=0.018")
+# What is compared with the truth and with itself is the main wall.
+ONE_WALL = ("--set", "wall.n_walls_max=1")
+SMALL_WALL = (*SMALL, *ONE_WALL)
 
 
 @pytest.fixture(scope="module")
 def road(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `direct.yaml` ran once on the small simulated room, as `run`."""
     shell = Shell(tmp_path_factory.mktemp("road"), store)
-    ended = shell("run", "direct.yaml", *SMALL, "-o", "run")
+    ended = shell("run", "direct.yaml", *SMALL_WALL, "-o", "run")
     assert ended.code == 0, ended.said
     assert str(Path("run") / "report.html") in ended.out
     assert str(Path("run") / "run.h5") in ended.out
@@ -39,7 +42,7 @@ def planes_of(folder: Path) -> list[dict[str, object]]:
 
 
 def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
-    ended = road("run", "direct.yaml", *SMALL, "-o", "again")
+    ended = road("run", "direct.yaml", *SMALL_WALL, "-o", "again")
     assert ended.code == 0
     assert "cached" in ended.out
     for product in ("planes.json",):
@@ -85,13 +88,13 @@ def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> N
 
 
 def test_a_finished_run_folder_is_refused(road: Shell) -> None:
-    ended = road("run", "direct.yaml", *SMALL, "-o", "run")
+    ended = road("run", "direct.yaml", *SMALL_WALL, "-o", "run")
     assert ended.code == 2
     assert "run.h5" in ended.said
 
 
 def test_a_changed_parameter_reruns_only_what_depends_on_it(road: Shell) -> None:
-    ended = road("plan", "direct.yaml", *SMALL, "--set", "ortho.inpaint_radius_px=4", "--json")
+    ended = road("plan", "direct.yaml", *SMALL_WALL, "--set", "ortho.inpaint_radius_px=4", "--json")
     states = {cell["cell"]: cell for cell in json.loads(ended.out)}
     assert {address: cell["status"] for address, cell in states.items()} == {
         "cloud": "skipped",
@@ -110,7 +113,7 @@ def test_a_changed_parameter_reruns_only_what_depends_on_it(road: Shell) -> None
 def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
     shift = "[" + ", ".join(map(str, SHIFT_M)) + "]"
     ended = road(
-        *("run", "direct.yaml", "--until", "mosaic", *SMALL, "-o", "shifted"),
+        *("run", "direct.yaml", "--until", "mosaic", *SMALL_WALL, "-o", "shifted"),
         *("--set", f"room.shift_world_m={shift}", "--executor", "inline"),
     )
     assert ended.code == 0, ended.said
@@ -154,7 +157,7 @@ def _change_one_byte(record: Path, what: str) -> None:
 @pytest.mark.slow
 def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "heritage-hall-west-wall" / "west_wall.laz"
-    options = ("--set=wall.gsd_m=0.02", "--set=wall.buffer_m=0.45", "--executor=inline")
+    options = ("--set=wall.gsd_m=0.02", "--set=wall.buffer_m=0.45", *ONE_WALL, "--executor=inline")
     ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
     assert ended.code == 0, ended.said
     main = planes_of(shell.folder / "run")[0]
@@ -172,7 +175,7 @@ def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path)
 @pytest.mark.slow
 def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "pump-e57" / "pumpAVisualReferenceImage.e57"
-    options = ("--set=wall.gsd_m=0.02", "--executor=inline")
+    options = ("--set=wall.gsd_m=0.02", *ONE_WALL, "--executor=inline")
     ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
     assert ended.code == 0, ended.said
     floor = planes_of(shell.folder / "run")[0]
