@@ -55,7 +55,8 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "--where",
     metavar="'METRIC > X'",
     multiple=True,
-    help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter.",
+    help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter (of "
+    "a sweep, of one of its values).",
 )
 @click.option(
     "--sort",
@@ -190,10 +191,11 @@ class _Condition:
         return cls(name=match[1], holds=_SIGNS[match[2]], limit=float(match[3]))
 
     def is_met_by(self, run: RunSummary) -> bool:
-        value = run.metrics.get(self.name, run.facts.get(self.name))
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return self.holds(float(value), self.limit)
+        return any(
+            self.holds(float(value), self.limit)
+            for value in run.values(self.name)
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        )
 
 
 def _filtered(
@@ -229,7 +231,7 @@ def _sorted(kept: Sequence[RunSummary], key: str) -> list[RunSummary]:
 
 
 def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
-    known = {name for run in found for name in (*run.metrics, *run.facts)}
+    known = {name for run in found for name in run.names}
     if not known:
         return
     for name in names:

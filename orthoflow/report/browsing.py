@@ -70,8 +70,31 @@ class RunSummary:
     n_datasets: int = 0
     labels: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
-    swept: Mapping[str, str] = field(default_factory=dict)
+    swept: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
     shared: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What `values` knows something of."""
+        return (*self.metrics, *self.facts, *self.shared.values())
+
+    def values(self, name: str) -> tuple[JsonValue, ...]:
+        """Give a metric or a fact: of a sweep all values, without a dataset those of every one."""
+        if name in self.metrics:
+            return (self.metrics[name],)
+        facts = [name, *(fact for fact, short in self.shared.items() if short == name)]
+        return tuple(
+            value
+            for fact in facts
+            if fact in self.facts
+            for value in self.swept.get(fact, (self.facts[fact],))
+        )
+
+    @property
+    def told(self) -> dict[str, JsonValue]:
+        """The facts, of a sweep all values as one text."""
+        swept = {name: "|".join(map(_sorted_json, found)) for name, found in self.swept.items()}
+        return {**self.facts, **swept}
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -98,35 +121,35 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     """What of its facts tells each run from others of the same workflow, by its folder.
 
     A fact that some of them lack differs only where two others disagree on it. Of a sweep all
-    values are told, and once what is the same on all datasets.
+    values are told, and without the dataset what is the same on all datasets of each such run.
     """
     values: dict[tuple[str, str], set[str]] = {}
+    apart: set[tuple[str, str]] = set()
     for run in runs:
-        for name, value in {**run.facts, **run.swept}.items():
-            values.setdefault((run.workflow, name), set()).add(json.dumps(value, sort_keys=True))
+        told = run.told
+        for name, value in told.items():
+            values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
+        on_datasets: dict[str, set[str]] = {}
+        for name, short in run.shared.items():
+            on_datasets.setdefault(short, set()).add(_sorted_json(told[name]))
+        apart |= {(run.workflow, short) for short, found in on_datasets.items() if len(found) > 1}
+
+    def called(run: RunSummary, name: str) -> str:
+        short = run.shared.get(name, name)
+        return name if (run.workflow, short) in apart else short
+
     return {
-        run.folder: _once(
-            {
-                name: value
-                for name, value in {**run.facts, **run.swept}.items()
-                if len(values[run.workflow, name]) > 1
-            },
-            run.shared,
-        )
+        run.folder: {
+            called(run, name): value
+            for name, value in run.told.items()
+            if len(values[run.workflow, name]) > 1
+        }
         for run in runs
     }
 
 
-def _once(facts: Mapping[str, JsonValue], shared: Mapping[str, str]) -> dict[str, JsonValue]:
-    """Tell once what differs alike on all datasets."""
-    said: dict[str, list[str]] = {}
-    for name, short in shared.items():
-        told = json.dumps(facts[name], sort_keys=True) if name in facts else ""
-        said.setdefault(short, []).append(told)
-    return {
-        shared[name] if name in shared and len({*said[shared[name]]}) == 1 else name: value
-        for name, value in facts.items()
-    }
+def _sorted_json(value: JsonValue) -> str:
+    return json.dumps(value, sort_keys=True)
 
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
@@ -233,7 +256,9 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     )
 
 
-def _swept(cells: Sequence[RecordedCell], names: Mapping[str, str]) -> dict[str, str]:
+def _swept(
+    cells: Sequence[RecordedCell], names: Mapping[str, str]
+) -> dict[str, tuple[JsonValue, ...]]:
     """All values of what the variants of one method take several of.
 
     Args:
@@ -249,11 +274,12 @@ def _swept(cells: Sequence[RecordedCell], names: Mapping[str, str]) -> dict[str,
     for variants in alike.values():
         for cell in variants:
             for parameter in cell.params if cell.address in names and len(variants) > 1 else ():
-                values = dict.fromkeys(
-                    json.dumps(one.params.get(parameter), sort_keys=True) for one in variants
-                )
+                values = {
+                    _sorted_json(one.params.get(parameter)): one.params.get(parameter)
+                    for one in variants
+                }
                 if len(values) > 1:
-                    found[f"{names[cell.address]}.{parameter}"] = "|".join(values)
+                    found[f"{names[cell.address]}.{parameter}"] = tuple(values.values())
     return found
 
 

@@ -118,6 +118,8 @@ def test_a_sweep_differs_from_a_single_run_in_all_its_values(
         "alone": {"plane.cell_m": 0.05, "plane.use": "plane.toy"},
         "swept": {"plane.cell_m": "0.02|0.05", "plane.use": "plane.other"},
     }
+    assert folders("--where", "plane.cell_m = 0.02") == ["swept"]
+    assert folders("--where", "plane.cell_m = 0.05") == ["alone", "swept"]
 
 
 def test_json_and_csv_have_every_number(runs: Path) -> None:

@@ -173,12 +173,13 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
 
 def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> None:
     def told(name: str, *tries: tuple[int, ...]) -> RunSummary:
+        rooms = ("hall", "stairs", "court")[: len(tries)]
         cells = [
             cell(f"check@check=v{value},data={room}", params={"tries": value})
-            for room, values in zip(("hall", "stairs"), tries, strict=True)
+            for room, values in zip(rooms, tries, strict=True)
             for value in values
         ]
-        resolved = {"datasets": {room: {"inputs": {}, "set": {}} for room in ("hall", "stairs")}}
+        resolved = {"datasets": {room: {"inputs": {}, "set": {}} for room in rooms}}
         made = record(cells, workflow_resolved=json.dumps(resolved))
         folder = tmp_path / name
         return module._of_run(folder, HeldRun(path=folder / "run.h5", record=made))
@@ -198,6 +199,14 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
         {"check@data=stairs.tries": 4},
         {"check@data=stairs.tries": 5},
     ]
+    # A dataset that others lack changes no name.
+    three = told("d", (1, 2), (1, 2), (1, 2))
+    assert differing_facts([three, single])[three.folder] == {"datasets": 3, "check.tries": "1|2"}
+    # `--where` takes both names, and all values.
+    assert three.values("check@data=hall.tries") == (1, 2)
+    assert three.values("check.tries") == (1, 2, 1, 2, 1, 2)
+    assert (apart.values("check.tries"), apart.values("seed")) == ((4, 5), (1,))
+    assert "check.tries" in apart.names
 
 
 def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:
