@@ -26,7 +26,7 @@ _MOST_CURVES: Final = 12
 _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
-_FEWEST_VALUES: Final = 3
+_FEWEST_VALUES: Final = 2
 _SHARES: Final = ("label_*", "*completeness*", "*_iou*", "*_share*")
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
@@ -239,6 +239,12 @@ def _curve(
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
     if any(point.is_baseline for points in lines.values() for point in points):
         good += "; the filled point is the baseline"
+    shape = (
+        "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
+        "decides the result."
+        if max(map(len, lines.values())) > _FEWEST_VALUES
+        else "Of two values a line shows the difference alone, and nothing of what lies between."
+    )
     return Curve(
         title=title,
         svg=_Axes.of(
@@ -251,10 +257,7 @@ def _curve(
             below=f"{sweep.step}.{sweep.parameter}",
             beside=column.label,
         ),
-        caption=(
-            f"Points are {said}{good}. A flat stretch is where the parameter does not matter; at a "
-            "steep end the chosen value decides the result."
-        ),
+        caption=f"Points are {said}{good}. {shape}",
     )
 
 

@@ -43,9 +43,15 @@ def test_variants_that_differ_in_one_number_are_a_sweep(tmp_path: Path) -> None:
     assert list(found.values.values()) == [0.02, 0.05, 0.1]
 
 
-def test_two_values_other_differences_and_words_are_none(tmp_path: Path) -> None:
-    assert list(sweeps(held(tmp_path, swept(0.02, 0.05)).record.cells)) == []
-    mixed = [*swept(0.02, 0.05), *swept(0.1, other=2)]
+def test_two_values_are_a_sweep_whose_curve_says_how_little_it_shows(tmp_path: Path) -> None:
+    two, three = (curves(held(tmp_path, swept(*n)))[0] for n in ((0.02, 0.05), (0.02, 0.05, 0.1)))
+    assert [one.svg.count("<circle") for one in (two, three)] == [2, 3]
+    assert two.caption.endswith("and nothing of what lies between.")
+    assert three.caption.endswith("at a steep end the chosen value decides the result.")
+
+
+def test_one_value_other_differences_and_words_are_none(tmp_path: Path) -> None:
+    mixed = [*swept(0.02), *swept(0.1, other=2)]
     assert list(sweeps(held(tmp_path, mixed).record.cells)) == []
     words = [cell(f"plane@plane={word}", params={"mode": word}) for word in "abc"]
     assert list(sweeps(held(tmp_path, words).record.cells)) == []
