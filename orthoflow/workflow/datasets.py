@@ -172,6 +172,7 @@ class _OneFile:
             files=FILES.shape.read(item.value, join(here, item.key), self.log) or (),
             folder=self.folder,
             is_given=self.is_given,
+            place=self.log.place(item.value.position, join(here, item.key)),
             said_in=f"{self.table}:{dataset.position.line}" if self.table else "",
         )
 

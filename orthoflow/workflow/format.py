@@ -85,6 +85,8 @@ class WorkflowInputSpec:
         is_given: named with `--input`, so it must exist even when optional.
         said_in: the table of datasets and the line in it that name the files, `rooms.csv:3`; empty
             for the workflow itself.
+        place: where they are named, `hall.yaml:3:9: inputs.scan.files: `; empty for what comes from
+            no file.
     """
 
     name: str
@@ -93,6 +95,7 @@ class WorkflowInputSpec:
     folder: Path = Path()
     is_given: bool = False
     said_in: str = ""
+    place: str = field(default="", compare=False)
 
 
 # Steps --------------------------------------------------------------------------------------------

@@ -38,11 +38,13 @@ def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, Workfl
     for entry in INPUTS.shape.read(value, INPUTS.name, log) or ():
         path = join(INPUTS.name, entry.key)
         table = INPUT.read(entry.value, path, log)
+        named = table.get(FILES.name) if table else None
         specs[entry.key] = WorkflowInputSpec(
             name=entry.key,
             files=(FILES.read(table, path, log) or ()) if table else (),
             optional=bool(table and OPTIONAL.read(table, path, log)),
             folder=folder,
+            place=log.place(named.value.position, join(path, FILES.name)) if named else "",
         )
     return specs
 
@@ -198,7 +200,8 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     else:
         files, missing = [], f"there is no file {pattern}{where}{_meant(path)}"
     if not files:
-        raise InputError(f"input {spec.name}: {missing}")
+        place = "" if spec.is_given else spec.place
+        raise InputError(f"{place}input {spec.name}: {missing}")
     return [item.absolute() for item in files]
 
 

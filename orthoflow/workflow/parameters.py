@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -32,6 +32,9 @@ from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
 
 Report: TypeAlias = Callable[[str], None]
+
+# Letters of a value that a message repeats.
+_SHOWN: Final = 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +222,17 @@ class _Reporter:
                 return str(details.get("ctx", {}).get("error", details["msg"]))
         words = details["msg"][:1].lower() + details["msg"][1:]
         meant = meant_number(name, details["input"]) if "number" in words else ""
+        if len(location) == 1 and details["type"].endswith(("_type", "enum", "literal_error")):
+            meant += self._swept(details["input"])
         return f"{words}, got {_shown(details['input'])}{meant}"
+
+    def _swept(self, value: object) -> str:
+        """Say how each value of a list is tried, to who wrote it in the place of one value."""
+        is_source = self.variant.kind is not None and self.variant.kind.is_source
+        if is_source or not isinstance(value, list) or len(value) < 2:
+            return ""
+        written = json.dumps(value)
+        return f"; to try each: {{sweep: {written if len(written) <= _SHOWN else '[...]'}}}"
 
     def _position(self, location: tuple[int | str, ...]) -> Position:
         position = self.variant.position

@@ -113,6 +113,10 @@ class ProblemLog:
         """Whether there is a problem."""
         return bool(self._in_file or self._in_plugins or self._in_options)
 
+    def place(self, position: Position, path: str) -> str:
+        """Say where something stands, as problems begin; empty of what comes from no file."""
+        return f"{self.file}:{position.line}:{position.column}: {path}: " if position.line else ""
+
     def add_plugin(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of a plugin that the file needs here."""
         self._in_plugins.append(self._at(position, path, message))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -107,7 +108,21 @@ def _sweeps_of(
             continue
         found.pop(parameter, None)
         others.append(override)
-    return {name: values for name, values in found.items() if values}, tuple(others)
+    once = {name: _once(values) for name, values in found.items() if values}
+    return once, tuple(others)
+
+
+def _once(values: _Values) -> _Values:
+    """Leave out what stands there twice, and say so at its place."""
+    kept: dict[str, tuple[JsonValue, Report]] = {}
+    for value, report in values:
+        # 1 and 1.0 are the same number.
+        whole = int(value) if isinstance(value, float) and value.is_integer() else value
+        text = json.dumps(whole, sort_keys=True)
+        if text in kept:
+            report(f"{json.dumps(value)} is swept twice; leave one of them out")
+        kept.setdefault(text, (value, report))
+    return list(kept.values())
 
 
 def _is_sweep(entry: Entry) -> bool:

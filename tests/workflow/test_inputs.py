@@ -84,7 +84,10 @@ def test_absolute_patterns_work(project: Path, catalog: Catalog) -> None:
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("{files: nowhere.jpg}", "input photos: there is no file nowhere.jpg beside the workflow"),
+        (
+            "{files: nowhere.jpg}",
+            r"\.yaml:\d+:\d+: inputs.photos.files: input photos: there is no file nowhere.jpg",
+        ),
         ("{files: '*.png'}", r"input photos: no file matches \*.png beside the workflow"),
         (
             "{files: empty}",

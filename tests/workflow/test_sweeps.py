@@ -175,6 +175,8 @@ def test_a_record_holds_the_variants_that_a_sweep_became(catalog: Catalog) -> No
         ("{sweep: 0.02}", "expected a list of at least two values, got 0.02"),
         ("{sweep: [0.02, wide]}", "tolerance_m.sweep[1]: input should be a valid number, got the"),
         ("{sweep: [0.02, 0.05], step: 1}", "unknown key step"),
+        ("{sweep: [1, 0.02, 1.0]}", "tolerance_m.sweep[2]: 1.0 is swept twice; leave one of them"),
+        ("[0.02, 0.05]", "number, got a list; to try each: {sweep: [0.02, 0.05]}"),
         ("{sweep: [0.02, 0.001]}", "cell_m 0.01 must not exceed tolerance_m"),
     ],
 )
@@ -193,6 +195,8 @@ def test_what_is_wrong_with_a_sweep_is_told_once_at_its_place(
     [
         ("plane.tolerance_m={sweep: [1]}", "with 2 to 100 values and nothing beside it"),
         ("plane.tolerance_m={sweep: [1, 2], to: 3}", "nothing beside it"),
+        ("plane.tolerance_m={sweep: [1, 2, 1]}", "1 is swept twice"),
+        ("plane.tolerance_m=[1, 2]", r"to try each: {sweep: \[1, 2\]}"),
         ("cloud.up={sweep: [x, z]}", "sources take no variants, so nothing of it can be swept"),
     ],
 )
