@@ -265,7 +265,7 @@ def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None
     check_finished(desk)
 
 
-@pytest.mark.parametrize("mib", [260, 600])
+@pytest.mark.parametrize("mib", [260, 350, 600])
 def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
