@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import dask
 import pytest
 from distributed import LocalCluster
 
@@ -50,15 +51,19 @@ steps:
 def cluster(
     n_workers: int, *, processes: bool = True, **resources: float
 ) -> Iterator[LocalCluster]:
-    with LocalCluster(  # type: ignore[no-untyped-call]
-        n_workers=n_workers,
-        processes=processes,
-        threads_per_worker=1,
-        resources=resources,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=50,
-    ) as opened:
+    # Those of processes are forked from one that has loaded dask, as are those after killed ones.
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=n_workers,
+            processes=processes,
+            threads_per_worker=1,
+            resources=resources,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
+        ) as opened,
+    ):
         yield opened
 
 
