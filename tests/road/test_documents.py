@@ -49,7 +49,7 @@ class Story:
             words = [self.instead.get(word, word) for word in command.words[1:]]
             if words[0] in ("run", "plan"):
                 words += self.coarse
-            if words[0] == "run":
+            if words[0] in ("run", "replay"):
                 words += ("--executor", "inline")  # loads libraries once for all steps
             if words[0] in ("replay", "export"):
                 words += ("--store", str(shell.store))

@@ -16,7 +16,7 @@ from tests.road.test_direct import SMALL
 def road(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `openings.yaml` ran on the room of `test_direct`, as `run`."""
     shell = Shell(tmp_path_factory.mktemp("openings"), store)
-    ended = shell("run", "openings.yaml", *SMALL, "-o", "run")
+    ended = shell("run", "openings.yaml", *SMALL, "-o", "run", "--executor", "inline")
     assert ended.code == 0, ended.said
     return shell
 

@@ -26,7 +26,8 @@ NAMED = re.compile(r"\b(?:wall|floor|ceiling|level|slope) \d+\b")
 def folder(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Path:
     """A run of `direct.yaml` on some planes of the simulated room."""
     shell = Shell(tmp_path_factory.mktemp("numbers"), store)
-    ended = shell("run", "direct.yaml", *(f"--set={item}" for item in SETS), "-o", "run")
+    sets = (f"--set={item}" for item in SETS)
+    ended = shell("run", "direct.yaml", *sets, "-o", "run", "--executor", "inline")
     assert ended.code == 0, ended.said
     return shell.folder / "run"
 
