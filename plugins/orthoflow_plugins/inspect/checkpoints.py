@@ -294,8 +294,8 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
 def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
     """Write the residual of each point into the log of the step, the largest first."""
     for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_TOLD]:
-        right_mm, down_mm = 1e3 * shift_m[k]
-        ctx.log(f"check point {names[k]}: {right_mm:+.2f} mm right, {down_mm:+.2f} mm down")
+        u_mm, v_mm = 1e3 * shift_m[k]
+        ctx.log(f"check point {names[k]}: u {u_mm:+.2f} mm, v {v_mm:+.2f} mm")
 
 
 def _draw(

@@ -112,9 +112,9 @@ def test_each_point_is_told_the_farthest_off_first(tmp_path: Path) -> None:
     inputs = InspectCheckpoints.In(checkpoints=points, walls=walls)
     InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
     assert [text for text in said if text.startswith("check point ")] == [
-        "check point P1: +1.00 mm right, -8.00 mm down",
-        "check point P0: +4.00 mm right, +1.00 mm down",
-        "check point P2: -2.00 mm right, +1.00 mm down",
+        "check point P1: u +1.00 mm, v -8.00 mm",
+        "check point P0: u +4.00 mm, v +1.00 mm",
+        "check point P2: u -2.00 mm, v +1.00 mm",
     ]
 
 
@@ -373,7 +373,7 @@ def test_the_log_names_the_points_that_are_furthest_off_and_not_thousands(
     shift_m = np.column_stack([1e-5 * np.arange(300), np.full(300, -1e-3)])
     checkpoints._tell(shift_m, [f"p{k}" for k in range(300)], ctx)
     assert len(told) == 200
-    assert told[0] == "check point p299: +2.99 mm right, -1.00 mm down"
+    assert told[0] == "check point p299: u +2.99 mm, v -1.00 mm"
     assert told[-1].startswith("check point p100: ")
 
 
