@@ -72,7 +72,15 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
     return images
 
 
-def count_e57_images(path: Path) -> int:
+@dataclass(frozen=True, kw_only=True)
+class E57ImageCount:
+    """How many images an E57 file has, and how many of them it states lens and pose of."""
+
+    n_images: int = 0
+    n_posed: int = 0
+
+
+def count_e57_images(path: Path) -> E57ImageCount:
     """Count what an E57 file has of photos and panoramas, without reading them.
 
     Raises:
@@ -82,7 +90,15 @@ def count_e57_images(path: Path) -> int:
     pye57 = load_library("pye57", path)
     with reading(path, FORMAT), pye57.E57(str(path)) as file:
         root = file.image_file.root()
-        return int(root["images2D"].childCount()) if root.isDefined("images2D") else 0
+        if not root.isDefined("images2D"):
+            return E57ImageCount()
+        nodes = [pye57.libe57.StructureNode(node) for node in _children(root["images2D"])]
+        n_posed = sum(
+            node.isDefined("pose")
+            and any(node.isDefined(f"{kind}Representation") for kind in ("pinhole", "spherical"))
+            for node in nodes
+        )
+        return E57ImageCount(n_images=len(nodes), n_posed=n_posed)
 
 
 def _children(vector: Any) -> Iterator[Any]:

@@ -81,15 +81,17 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         ]
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
-    has_photos = bool(by_kind.get("photos") or own_photos)
-    chosen: Recipe = recipe or ("photos-on-scan" if has_photos else "direct")
-    if chosen == "photos-on-scan" and not has_photos:
+    has_posed = any(scan.n_posed for scan in own_photos)
+    # What has no pose is mostly a picture for people, which matching would not find on the walls.
+    is_usual = bool(by_kind.get("photos") or has_posed)
+    chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
+    if chosen == "photos-on-scan" and not (own_photos or is_usual):
         raise InputError("photos-on-scan needs photos, and there are none among the files")
     if own_photos and "photos" not in by_kind:
         # Photos that a scanner took lie in its file, with their poses.
         inside = [replace(scan, said="the photos in it") for scan in own_photos]
         by_kind["photos"] = inside
-        if len(inside) == 1:
+        if len(inside) == 1 and has_posed:
             by_kind.setdefault("cameras", [replace(inside[0], said="the poses of its photos")])
     return _Drafting(by_kind=by_kind, target=target, recipe=chosen).draft()
 

@@ -12,7 +12,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
-from orthoflow.files.e57_images import count_e57_images
+from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import HOW_TO_DEVELOP, PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
@@ -45,6 +45,7 @@ class Recognised:
         path: as it was found.
         said: what is in it, in words; why nothing is known of it.
         n_photos: photos in it, also those in a scan.
+        n_posed: photos in a scan whose lens and pose it states.
         fields: what each point of a scan has besides coordinates.
     """
 
@@ -52,6 +53,7 @@ class Recognised:
     path: Path
     said: str = ""
     n_photos: int = 0
+    n_posed: int = 0
     fields: frozenset[str] = frozenset()
 
 
@@ -120,14 +122,22 @@ def _raw(path: Path) -> Recognised:
 def _scan(path: Path) -> Recognised:
     scan = open_scan(path)
     fields = frozenset(str(name) for name in scan.fields)
-    n_photos = count_e57_images(path) if path.suffix.lower() == E57_SUFFIX else 0
+    is_e57 = path.suffix.lower() == E57_SUFFIX
+    photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
     if has := [word for name, word in _FIELDS.items() if name in fields]:
         # Files may have room for them and nothing in it.
         words.append(f"fields for {' and '.join(has)}")
-    words += [f"{n_photos} photos" if n_photos > 1 else "a photo"] if n_photos else []
+    if photos.n_images:
+        count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
+        words.append(count if photos.n_posed else f"{count} without a pose")
     return Recognised(
-        kind="scan", path=path, said=", ".join(words), n_photos=n_photos, fields=fields
+        kind="scan",
+        path=path,
+        said=", ".join(words),
+        n_photos=photos.n_images,
+        n_posed=photos.n_posed,
+        fields=fields,
     )
 
 

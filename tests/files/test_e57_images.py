@@ -13,7 +13,7 @@ from orthoflow_plugins.read.photos import ReadPhotos
 
 from orthoflow.errors import InputError
 from orthoflow.files import e57_images
-from orthoflow.files.e57_images import read_e57_images
+from orthoflow.files.e57_images import E57ImageCount, count_e57_images, read_e57_images
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
 from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Cameras, InputFiles, Photos
@@ -98,6 +98,7 @@ def test_images_without_a_pose_are_photos_with_the_reason(tmp_path: Path) -> Non
     photos, cameras = read(tmp_path / "room.e57")
     assert len(photos.photos) == 3
     assert [camera.status == "ok" for camera in cameras.cameras] == [False, False, True]
+    assert count_e57_images(tmp_path / "room.e57") == E57ImageCount(n_images=3, n_posed=1)
 
 
 def coloured(directions: NDArray[np.float64]) -> NDArray[np.float64]:

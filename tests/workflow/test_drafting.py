@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -199,7 +200,8 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
 
 
 def found(kind: str, name: str, said: str = "something", n_photos: int = 0) -> Recognised:
-    return Recognised(kind=kind, path=Path(name), said=said, n_photos=n_photos)  # type: ignore[arg-type]
+    posed = n_photos if kind == "scan" else 0
+    return Recognised(kind=kind, path=Path(name), said=said, n_photos=n_photos, n_posed=posed)  # type: ignore[arg-type]
 
 
 def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
@@ -217,6 +219,14 @@ def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
     assert "cameras" not in two.inputs
     given = draft_workflow([scan, found("cameras", "poses.json", "poses")], Path("flow.yaml"), None)
     assert given.inputs["cameras"] == "poses.json, poses"
+
+
+def test_photos_without_a_pose_in_a_scan_are_taken_when_asked_for() -> None:
+    scan = replace(found("scan", "hall.e57", "a scan", 1), n_posed=0)
+    plain = draft_workflow([scan], Path("flow.yaml"), None)
+    assert (plain.recipe, sorted(plain.inputs)) == ("direct", ["scan"])
+    asked = draft_workflow([scan], Path("flow.yaml"), "photos-on-scan")
+    assert sorted(asked.inputs) == ["photos", "scan"]
 
 
 def test_text_beside_scans_of_other_formats_is_left_out() -> None:

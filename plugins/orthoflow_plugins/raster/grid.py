@@ -43,6 +43,7 @@ from orthoflow_plugins.raster.selection import (
     Place,
     WallChoice,
     chosen_planes,
+    chosen_relief,
     covered_planes,
     distance_m,
     frame_of,
@@ -346,6 +347,12 @@ def _crops(
     )
     chosen = chosen_planes(planes, choice)
     warn_of_covered(ctx, planes.names, covered_planes(planes, choice, chosen))
+    for index, wall in chosen_relief(planes, choice, chosen).items():
+        ctx.warn(
+            f"near takes {planes.names[index]}, which is relief of {planes.names[wall]}: where "
+            f"that wall is meant, set ranks to [{wall}] and leave near out (skip_covered: false "
+            "says that the relief is)"
+        )
     frames = {
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen

@@ -105,6 +105,25 @@ def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) ->
     return found
 
 
+def chosen_relief(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
+    """Planes chosen by a point near them that lie on a better supported wall -> that wall.
+
+    Args:
+        planes: by support.
+        choice: what decided; empty without `near`, and where relief is not left out anyway.
+        chosen: what `chosen_planes` chose of them by it.
+    """
+    if not choice.skip_covered or not choice.near:
+        return {}
+    found: dict[int, int] = {}
+    for index in chosen:
+        others = (wall for wall in range(index) if _fits(planes, wall, choice.constraint))
+        walls = (wall for wall in others if _covers(planes, wall, index, choice))
+        if (wall := next(walls, index)) not in chosen:
+            found[index] = wall
+    return found
+
+
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
     """Index of the plane nearest to a point (3,), of equally near ones the better supported."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))

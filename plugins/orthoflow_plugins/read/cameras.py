@@ -82,6 +82,7 @@ class ReadCameras(Method):
                 f"the input {inputs.files.name} orients none of the {len(photos)} photos, such as "
                 f"{photos[0].name if photos else 'none'}: it speaks of {names}"
                 f"{' ...' if len(given) > _NAMED else ''}; {cameras[0].status if cameras else ''}"
+                "; without these files, photos are oriented by matching with the scan"
             )
         for camera in cameras:
             if camera.status != "ok":

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import selection
-from orthoflow_plugins.raster.selection import WallChoice, chosen_planes, covered_planes
+from orthoflow_plugins.raster.selection import (
+    WallChoice,
+    chosen_planes,
+    chosen_relief,
+    covered_planes,
+)
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Planes
@@ -128,7 +133,13 @@ def test_the_wall_nearest_to_a_point_is_chosen() -> None:
 def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
     both = planes(MAIN, (0.08, 1.0, 0.2, 0.0))
     assert chosen_planes(both, CHOICE) == [0]
-    assert chosen_planes(both, replace(CHOICE, near=((1.1, 2.9, 1.0),))) == [1]
+    choice = replace(CHOICE, near=((1.1, 2.9, 1.0),))
+    assert chosen_planes(both, choice) == [1]
+    assert chosen_relief(both, choice, [1]) == {1: 0}
+    # Who wants both, or says that relief counts, needs no word.
+    assert chosen_relief(both, choice, [0, 1]) == {}
+    assert chosen_relief(both, replace(choice, skip_covered=False), [1]) == {}
+    assert chosen_relief(both, CHOICE, [0]) == {}
 
 
 def test_only_planes_of_the_right_direction_are_near() -> None:
