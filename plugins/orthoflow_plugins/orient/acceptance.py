@@ -91,9 +91,20 @@ class Candidate:
         return self.estimate.agreeing & ~self.is_check
 
     @property
-    def checked(self) -> NDArray[np.bool_]:
-        """Check ties that agree."""
+    def withheld(self) -> NDArray[np.bool_]:
+        """Withheld ties that agree."""
         return self.estimate.agreeing & self.is_check
+
+    @property
+    def checked(self) -> NDArray[np.bool_]:
+        """Withheld ties that agree and are none of the control once more, which checks nothing.
+
+        A key point whose gradients have two directions is two features in one place, and both may
+        be matched with the same point.
+        """
+        places = np.column_stack([self.seen.pixels_photo, self.seen.points_world])
+        place = np.unique(places, axis=0, return_inverse=True)[1].ravel()
+        return self.withheld & ~np.isin(place, place[~self.is_check])
 
     @property
     def quadrant_counts(self) -> list[int]:
@@ -128,7 +139,7 @@ def too_few(n_ties: int) -> str:
     if n_ties < _TIES_LEAST:
         return (
             f"{n_ties} ties with the walls, at least {_TIES_LEAST} are needed: the photo "
-            "shows none of the walls, or too differently"
+            "shows none of the walls, or too differently, or in cells that are too coarse"
         )
     return ""
 
@@ -191,11 +202,11 @@ def _enough_share(candidate: Candidate) -> str:
 
 def _not_by_chance(candidate: Candidate) -> str:
     """A pose fitted to wrong ties fits withheld ties by chance only."""
-    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.checked.sum())
+    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.withheld.sum())
     lengths = candidate.estimate.fit.normalised / candidate.estimate.limit
     probabilities = []
     for share in _CHANCE_RADII:
-        near = candidate.checked & (lengths <= share)
+        near = candidate.withheld & (lengths <= share)
         by_chance = _chance_probability(candidate, share * candidate.estimate.limit)
         n_places = _n_places(candidate.seen.pixels_photo[near])
         probabilities.append(_tail(n_places, n_check, by_chance))
@@ -209,7 +220,7 @@ def _not_by_chance(candidate: Candidate) -> str:
 
 def _check_agrees(candidate: Candidate) -> str:
     share_control = float(candidate.control.sum() / (~candidate.is_check).sum())
-    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.checked.sum())
+    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.withheld.sum())
     if n_agree / n_check < _CHECK_AGREEMENT_LEAST * share_control and n_check >= 5:
         return (
             f"{n_agree} of {n_check} withheld ties agree with the pose, but {share_control:.0%} of "
@@ -217,7 +228,7 @@ def _check_agrees(candidate: Candidate) -> str:
         )
     lengths = candidate.estimate.fit.normalised
     rms_control = float(np.sqrt(np.mean(lengths[candidate.control] ** 2)))
-    rms_check = float(np.sqrt(np.mean(lengths[candidate.checked] ** 2))) if n_agree else math.inf
+    rms_check = float(np.sqrt(np.mean(lengths[candidate.withheld] ** 2))) if n_agree else math.inf
     if n_agree >= 5 and rms_check > _CHECK_RMSE_RATIO * rms_control:
         return (
             f"the check ties deviate {rms_check / rms_control:.1f} times as much as the control, "

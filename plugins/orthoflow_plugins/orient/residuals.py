@@ -37,8 +37,8 @@ class PhotoNumbers:
     """What the report says of one oriented photo.
 
     Attributes:
-        n_control: ties that determine the pose.
-        n_check: withheld ties that agree.
+        n_control: ties that determine the pose, and withheld ones that are one of these again.
+        n_check: withheld ties that agree, and are no control.
         n_rejected: ties that do not agree.
         control_rmse_px: root mean square of a residual coordinate.
         check_rmse_px: the same of the withheld ties, NaN without any.
@@ -65,7 +65,7 @@ def photo_numbers(candidate: Candidate) -> PhotoNumbers:
     pixel_mm = 1000.0 * metres_per_pixel(camera, candidate.seen.points_world[candidate.control])
     check_rmse_px = _rms(check)
     return PhotoNumbers(
-        n_control=len(control),
+        n_control=int(candidate.estimate.agreeing.sum()) - len(check),
         n_check=len(check),
         n_rejected=int((~candidate.estimate.agreeing).sum()),
         control_rmse_px=_rms(control),

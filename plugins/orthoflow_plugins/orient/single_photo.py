@@ -267,7 +267,7 @@ def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
     if reason:
         return replace(refused(tied, reason), entry=entry)
     result, estimate = candidate.estimate.resection, candidate.estimate
-    role = np.where(candidate.is_check, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
+    role = np.where(candidate.checked, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[~estimate.agreeing] = TieRole.REJECTED
     return Oriented(
         camera=Camera(

@@ -115,6 +115,14 @@ def test_a_good_orientation_is_ok_without_a_note() -> None:
     assert good.hull_ratio == pytest.approx((0.9 / 0.95) ** 2, rel=0.05)
 
 
+def test_what_is_control_once_more_checks_nothing() -> None:
+    pixels = grid()
+    pixels[10] = pixels[11]  # withheld, and control
+    twice = candidate(pixels=pixels)
+    assert twice.withheld.sum() == 16
+    assert np.flatnonzero(twice.withheld & ~twice.checked).tolist() == [10]
+
+
 def test_eight_ties_are_needed() -> None:
     assert too_few(8) == ""
     assert too_few(7).startswith("7 ties with the walls, at least 8 are needed")
