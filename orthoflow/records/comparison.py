@@ -146,7 +146,10 @@ class CellFacts:
     def __str__(self) -> str:
         parts = (
             self.status,
-            f"{self.method} result version {self.result_version}",
+            # Of what was skipped nobody has loaded the method.
+            f"{self.method} result version {self.result_version}"
+            if self.result_version
+            else self.method,
             self.distribution,
             *(f"code of {name} {digest[:8]}" for name, digest in self.code.items()),
             *(f"{name} {version}" for name, version in self.tools.items()),

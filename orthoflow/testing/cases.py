@@ -107,7 +107,7 @@ def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
     if not isinstance(error, OrthoflowError):
         return f"the method raised {describe_error(error)}{where}"
     # Raised behind the method's back, by a product that it makes or by what it reports.
-    if isinstance(error, ProductError) and within and frames[-1] != within[-1]:
+    if isinstance(error, ProductError) and frames and frames[-1:] != within[-1:]:
         return f"what the method makes is not valid: {error}{where}"
     return f"the method refuses the suite's inputs: {error}{where}"
 

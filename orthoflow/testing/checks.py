@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, zip_longest
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from orthoflow.engine.store import digest_of
-from orthoflow.errors import CancelledStepError, OrthoflowError
-from orthoflow.products import Cameras, PointCloud
+from orthoflow import products
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.wording import describe_error
+from orthoflow.engine.store import digest_of, publish_into
+from orthoflow.errors import CancelledStepError, OrthoflowError, ProductError
+from orthoflow.products import Cameras, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room, few_points
@@ -36,6 +42,12 @@ from orthoflow.testing.witnesses import Subject, require
 
 # What a float parameter's name has in it: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
+# Product types whose publishers have tests of their own.
+_OURS: Final = frozenset(
+    cls.type_name
+    for cls in vars(products).values()
+    if isinstance(cls, type) and issubclass(cls, Product) and cls is not Product
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +123,32 @@ def outputs_are_valid(subject: Subject) -> None:
             subject.method.may_report(metric.name),
             f"metric {metric.name} is none of those that the method declares (`metrics`)",
         )
+
+
+def publishers_write_into_their_folder(subject: Subject) -> None:
+    """Publishers of products that are not ours write plain files, into their folder alone."""
+    catalog = discover_catalog()
+    for name, product in subject.witness.first.run.outputs.items():
+        publisher = catalog.publisher(product.type_name)
+        if product.type_name in _OURS or publisher is None:
+            continue
+        around, here = subject.folder / f"published-{name}", subject.folder / f"beside-{name}"
+        here.mkdir(parents=True)
+        who = f"the publisher of {product.type_name}"
+        try:
+            with contextlib.chdir(here):
+                publish_into(around / "files", product, publisher, digest_of(product))
+        except ProductError as error:
+            raise AssertionError(str(error)) from error
+        except Exception as error:
+            raised = traceback.extract_tb(error.__traceback__)[-1]
+            raise AssertionError(
+                f"{who} raised {describe_error(error)} ({Path(raised.filename).name}:"
+                f"{raised.lineno})"
+            ) from error
+        beside = (path.name for folder in (around, here) for path in sorted(folder.iterdir()))
+        strays = [name for name in beside if name != "files"]
+        require(not strays, f"{who} wrote beside its folder: {', '.join(strays)}")
 
 
 def inputs_stay_untouched(subject: Subject) -> None:
@@ -307,6 +345,10 @@ def _maps(method: type[Method]) -> bool:
     return bool(method.maps_over)
 
 
+def _makes_its_own(method: type[Method]) -> bool:
+    return any(port.type_name not in _OURS for port in port_specs(method.Out).values())
+
+
 def _takes_a_cloud(method: type[Method]) -> bool:
     return any(True for _ in _cloud_ports(method))
 
@@ -331,6 +373,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(parameters_are_documented, _always),
     _check(parameters_round_trip, _always),
     _check(outputs_are_valid, _always),
+    _check(publishers_write_into_their_folder, _makes_its_own),
     _check(inputs_stay_untouched, _always),
     _check(global_state_stays_untouched, _always),
     _check(nothing_is_written_outside_scratch, _always, is_quick=False),

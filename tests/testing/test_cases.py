@@ -81,6 +81,9 @@ def test_what_a_method_makes_is_not_valid_where_a_product_says_so() -> None:
         PointLabels(plane_index=np.zeros((2, 2), dtype=np.int16))
     said = failed(caught.value)
     assert said.startswith("what the method makes is not valid: ")
+    # Where annotations do not fit is seen when the method has returned, in no line of its own.
+    behind = caught.value.with_traceback(caught.tb.tb_next)
+    assert failed(behind).startswith("what the method makes is not valid: ")
     assert " (test_cases.py:" in said
 
 

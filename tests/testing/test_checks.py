@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -315,3 +316,71 @@ def test_parts_that_show_are_noticed(tmp_path: Path) -> None:
             check(Seen)
         with pytest.raises(AssertionError, match="n_parts depends on the parts: 1 of a whole, 3"):
             check(Counting)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks(Product):
+    """A stranger's product."""
+
+    type_name = "marks"
+    width_m: float
+
+
+class Marking(Finding):
+    """A method that gives it."""
+
+    id = "mark.marking"
+
+    class Out(Ports):
+        """Marks."""
+
+        marks: Marks
+
+
+def publish_well(product: Product, folder: Path, digest: str) -> None:
+    (folder / "inner").mkdir()
+    (folder / "inner" / "marks.json").write_text(digest)
+
+
+def publish_nothing_but_an_error(product: Product, folder: Path, digest: str) -> None:
+    raise ValueError("disk on fire")
+
+
+def publish_above(product: Product, folder: Path, digest: str) -> None:
+    (folder.parent / "marks.json").write_text(digest)
+
+
+def publish_here(product: Product, folder: Path, digest: str) -> None:
+    Path("marks.json").write_text(digest)
+
+
+def publish_a_link(product: Product, folder: Path, digest: str) -> None:
+    (folder / "marks.json").symlink_to("/etc/passwd")
+
+
+@pytest.mark.parametrize(
+    ("publisher", "said"),
+    [
+        (None, ""),
+        (publish_well, ""),
+        (publish_nothing_but_an_error, r"publisher of marks raised ValueError: disk .*\(test_ch"),
+        (publish_above, "the publisher of marks wrote beside its folder: marks.json"),
+        (publish_here, "the publisher of marks wrote beside its folder: marks.json"),
+        (publish_a_link, "a marks publishes 'marks.json', which is a link or a device"),
+    ],
+)
+def test_publishers_write_into_their_folder_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, publisher: object, said: str
+) -> None:
+    catalog = SimpleNamespace(publisher=lambda _type_name: publisher)
+    monkeypatch.setattr(checks, "discover_catalog", lambda: catalog)
+    run = SimpleNamespace(outputs={"marks": Marks(width_m=0.1)})
+    tried = subject(Marking, first=SimpleNamespace(run=run))
+    tried.folder = tmp_path
+    (check,) = (
+        one for one in checks.CHECKS if one.run is checks.publishers_write_into_their_folder
+    )
+    assert check.applies(Marking)
+    assert not check.applies(Finding)
+    with pytest.raises(AssertionError, match=said) if said else contextlib.nullcontext():
+        check.run(tried)
