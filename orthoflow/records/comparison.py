@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
@@ -14,9 +14,11 @@ import numpy as np
 from orthoflow_provenance.digests import canonical_json
 from orthoflow_provenance.model import (
     COSTS,
+    MethodIdentity,
     RecordedCell,
     RecordedFile,
     RunRecord,
+    shared_fields,
 )
 
 from orthoflow.alike import first_few
@@ -146,7 +148,6 @@ class CellFacts:
     def __str__(self) -> str:
         parts = (
             self.status,
-            # Of what was skipped nobody has loaded the method.
             f"{self.method} result version {self.result_version}"
             if self.result_version
             else self.method,
@@ -382,6 +383,10 @@ def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
 
 
 def _facts(cell: RecordedCell) -> CellFacts:
+    if cell.status == "skipped":
+        # Its method decides nothing, and has its versions only where another cell has loaded it.
+        unloaded = MethodIdentity(method=cell.method)
+        cell = replace(cell, seed=None, **shared_fields(unloaded, MethodIdentity))
     preimage = read_preimage(cell.key_preimage)
     return CellFacts(
         status=cell.status,

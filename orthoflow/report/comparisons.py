@@ -47,17 +47,19 @@ class Column:
         metric: name of the metric.
         label: what the metric is, in words, with its unit.
         sense: what makes a value good.
+        is_declared: its method says so itself.
     """
 
     step: str
     metric: str
     label: str
     sense: Sense
+    is_declared: bool = False
 
     @property
     def is_key(self) -> bool:
         """It says how good the products are, and stands in tables for a first look."""
-        return self.metric in QUALITY
+        return self.is_declared or self.metric in QUALITY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +251,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
-    """Metrics that the workflows ask for, else the quality metrics; the cost has its own places."""
+    """Metrics that the workflows ask for, else those of quality; the cost has its own places."""
     first: dict[tuple[str, str], MetricRow] = {}
     for cell in (cell for one in combinations for cell in one.cells):
         for row in cell_metrics(cell):
@@ -264,7 +266,9 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         for one in combinations:
             steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
             last |= dict.fromkeys((step, metric) for metric, step in steps.items())
-        wanted = [
+        # First what a plugin says to have a good side, as on the first screen.
+        wanted = [key for key, row in first.items() if row.good]
+        wanted += [
             key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
         ]
         wanted += [
@@ -273,9 +277,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
             for key in last
             if key[1] == name and first[key].method.startswith("inspect.")
         ]
-        # What a plugin says to have a good side is worth a column, too.
-        wanted += [key for key, row in first.items() if row.good]
-    return tuple(_column(first[key], combinations) for key in wanted)
+    return tuple(_column(first[key], combinations) for key in dict.fromkeys(wanted))
 
 
 def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:
@@ -290,7 +292,9 @@ def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:
         # The smallest tolerance leaves the smallest distances, whatever the plane is like.
         if len(tolerances) > 1:
             label, sense = f"{label}, cut at its own tolerance", Sense.NEITHER
-    return Column(step=row.step, metric=row.metric, label=label, sense=sense)
+    return Column(
+        step=row.step, metric=row.metric, label=label, sense=sense, is_declared=bool(row.good)
+    )
 
 
 def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -292,6 +292,16 @@ def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: S
     assert {item.verdict for item in measured} == {"within tolerance"}
 
 
+def test_what_was_skipped_has_no_versions_to_differ_in() -> None:
+    # Its method was loaded only where another dataset needed it.
+    skipped = replace(cell("cloud", status="skipped", error_message="no scan"), seed=None)
+    loaded = replace(skipped, result_version=1, determinism="exact", distribution="toys")
+    facts = [module._facts(one) for one in (skipped, loaded)]
+    assert facts[0] == facts[1]
+    assert str(facts[1]) == "skipped, cloud.toy, no scan"
+    assert module._facts(replace(loaded, status="ok")).result_version == 1
+
+
 @pytest.mark.parametrize("preimage", ["", "[1]", "{", "[" * 50_000, '{"code": 5, "tools": [1]}'])
 def test_a_preimage_that_says_nothing_costs_nothing(studio: Studio, preimage: str) -> None:
     first, second = (open_run(studio.folder / name) for name in ("first", "first"))

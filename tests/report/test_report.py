@@ -17,7 +17,7 @@ from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
 from orthoflow.report.combinations import Measured, combinations_of
-from orthoflow.report.comparisons import comparison_table
+from orthoflow.report.comparisons import comparison_columns, comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
@@ -320,6 +320,8 @@ def test_what_a_stranger_calls_good_is_told_first() -> None:
         ("share of dents", "0.25", "dent"),
         ("points to their plane, RMS", "1.6 mm", "plane"),
     ]
+    columns = comparison_columns(combinations_of(run(*cells)))
+    assert [(one.metric, one.is_key) for one in columns] == [("dent_share", True), ("rms_mm", True)]
 
 
 def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
