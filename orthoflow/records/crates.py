@@ -219,10 +219,14 @@ class _Crate:
         return tuple(entities.file_id(file) for entry in self.record.inputs for file in entry.files)
 
     def _workflow(self) -> Entity:
+        options = " ".join(self.record.overrides)
+        said = f"ran with {options}" if options else "ran as it stands"
         return {
             "@id": WORKFLOW_FILE,
             "@type": ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
             "name": self.record.name,
+            "description": f"The workflow as its author wrote it; it {said}. {RESOLVED_FILE} has "
+            "what ran, with every parameter.",
             "version": self.record.created_by,
             "encodingFormat": "text/yaml",
             "conformsTo": ref(_BIOSCHEMAS),

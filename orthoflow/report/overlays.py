@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Final
 
@@ -252,8 +252,15 @@ def _inspection_overlays(
                 kinds=np.full(len(here), "shown"),
             )
             place = _Place(cell=address, walls_cell=walls_cell, wall=wall, known=at)
-            what = "displacements in the orthoimage of"
-            yield _overlay(place, vectors, what=what, marks_most=frames.marks_most)
+            names = np.array(inspection.kinds)[inspection.kind[here]]
+            yield _overlay(
+                place,
+                vectors,
+                what="displacements in the orthoimage of",
+                marks_most=frames.marks_most,
+                # The numbers of a method leave out what lies beside depth steps.
+                counted=f"{_counts(replace(vectors, kinds=names))}, beside depth steps, too",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,7 +273,9 @@ class _Place:
     known: _Known
 
 
-def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> Overlay:
+def _overlay(
+    place: _Place, vectors: Vectors, *, what: str, marks_most: int, counted: str = ""
+) -> Overlay:
     frame = place.known.frame
     judged = vectors.kinds != "rejected"
     magnification = magnification_for(frame, vectors.lengths_m[judged])
@@ -274,7 +283,7 @@ def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> 
     # Rejected ties may be metres off: a mark says that they are there, a vector would cross all.
     lengths_m = np.where((shown.kinds == "rejected")[:, None], 0.0, shown.lengths_m)
     shown = Vectors(pixels_wall=shown.pixels_wall, lengths_m=lengths_m, kinds=shown.kinds)
-    caption = f"{_counts(vectors)}; vectors drawn {magnification:g} times as long" + (
+    caption = f"{counted or _counts(vectors)}; vectors drawn {magnification:g} times as long" + (
         "" if len(shown.kinds) == len(vectors.kinds) else f", {len(shown.kinds)} of them shown"
     )
     title = f"{what} {place.known.name}, {place.cell}"

@@ -248,6 +248,10 @@ def test_who_has_the_crate_alone_is_told_how_to_read_and_verify_it(
         _, name, file = command.split()
         done = studio(name, str(studio.folder / "crate" / file))
         assert done.exit_code == 0, done.output
+    (workflow,) = entities(crate, "ComputationalWorkflow")
+    assert (
+        "it ran with --set paint.grey=131 --input number=n.txt. workflow" in workflow["description"]
+    )
     (engine,) = (entity for entity in crate["@graph"] if entity["@id"] == "#engine")
     assert f"orthoflow-tls=={engine['softwareVersion']}" in engine["description"]
 

@@ -132,7 +132,8 @@ def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) 
     assert found[0].title == "Ties of wall 8, orient@plane=fine"
     assert found[2].title == "Displacements in the orthoimage of wall 8, check@plane=fine"
     assert found[2].caption == (
-        "2 shown (RMS 0.71 mm along u, 0.71 mm along v); vectors drawn 20 times as long"
+        "2 patch (RMS 0.71 mm along u, 0.71 mm along v), beside depth steps, too; "
+        "vectors drawn 20 times as long"
     )
     assert found[0].caption.startswith("10 control (RMS ")
     assert found[0].caption.endswith(" times as long")
