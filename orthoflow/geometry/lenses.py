@@ -19,6 +19,8 @@ _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.35
 # What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came
 # out wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
+# Pixels are square to a thousandth, which at the edge of a picture is more than a pixel.
+_ASPECT_SIGMA: Final = 1e-3
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
@@ -82,6 +84,7 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
     """
     return LensFreedom(
         focal_sigma=_EXIF_SIGMA if has_exif else _UNKNOWN_SIGMA,
+        aspect_sigma=_ASPECT_SIGMA,
         centre_sigma_px=_CENTRE_SHARE * longer_px,
         k1_sigma=_K1_SIGMA,
         k2_sigma=_K2_SIGMA,

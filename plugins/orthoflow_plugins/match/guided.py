@@ -53,7 +53,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 9
+    result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",

@@ -66,7 +66,7 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 9
+    result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         *ORIENTATION_METRICS,

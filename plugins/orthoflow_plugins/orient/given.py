@@ -34,7 +34,7 @@ class OrientGiven(Method):
     """
 
     id: ClassVar[str] = "orient.given"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_photos",

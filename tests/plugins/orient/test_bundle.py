@@ -106,6 +106,9 @@ def test_a_lens_known_from_exif_is_found(exif: Cameras) -> None:
     assert found.fx == pytest.approx(true.fx, abs=4.0 * sigmas["focal"])
     assert sigmas["focal"] < 2.0
     assert found.cx == pytest.approx(true.cx, abs=4.0 * sigmas["cx"])
+    # Its pixels are wider than high by 0.36 %, which a lens of square ones would bend the poses by.
+    assert found.fy / found.fx == pytest.approx(true.fy / true.fx, abs=4.0 * sigmas["aspect"])
+    assert sigmas["aspect"] < 5e-4
     assert found.distortion[0] == pytest.approx(true.distortion[0], abs=0.005)
     assert {camera.intrinsics for camera in exif.cameras} == {found}
 

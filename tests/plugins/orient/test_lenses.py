@@ -17,7 +17,7 @@ CALIBRATED = Intrinsics(
     width=600, height=400, fx=510.0, fy=512.0, cx=303.0, cy=197.0,
     distortion=(-0.1, 0.02, 1e-4, 2e-4, 0.0),
 )  # fmt: skip
-FREE = ("focal", "cx", "cy", "k1", "k2", "p1", "p2")
+FREE = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def photo(
@@ -58,7 +58,7 @@ def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer()
         assert not any(guess.distortion)
     assert prior.freedom.names == FREE
     # The principal point to a hundredth of the longer side.
-    assert prior.freedom.sigmas.tolist() == [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+    assert prior.freedom.sigmas.tolist() == [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
 
 
 @pytest.mark.parametrize("size", [(600, 400), (400, 600)])
@@ -68,7 +68,7 @@ def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) 
     assert shares == pytest.approx([0.6, 0.75, 0.95, 1.2, 1.6, 2.2])
     assert {(guess.cx, guess.cy) for guess in prior.guesses} == {(size[0] / 2, size[1] / 2)}
     assert (prior.source, prior.freedom.names) == ("none", FREE)
-    assert prior.freedom.sigmas.tolist() == [0.35, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+    assert prior.freedom.sigmas.tolist() == [0.35, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
 
 
 @pytest.mark.parametrize(
@@ -134,10 +134,10 @@ def test_of_unknown_lenses_the_photos_oriented_by_themselves_tell_the_middle() -
 @pytest.mark.parametrize(
     ("refined", "exif_sigmas", "calibrated_sigmas"),
     [
-        ("uncalibrated", [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3], []),
+        ("uncalibrated", [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3], []),
         (
             "all",
-            [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3],
+            [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3],
             [0.01, 1.8, 1.8, 0.02, 0.04, 1e-3, 1e-3],
         ),
         ("none", [], []),
