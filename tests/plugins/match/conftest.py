@@ -1,15 +1,16 @@
-"""What the tests of matching share: key points of the few pictures that they look at."""
+"""What the tests of matching share: key points and matches of the few pictures they look at."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import features
+from orthoflow_plugins.match import features, pairing
+from orthoflow_plugins.match.descriptors import Matches
 
 # What compares runs, or looks at how key points are found, finds them anew each time.
 _ANEW: Final = (
@@ -26,8 +27,10 @@ class _Remembered:
 
     tiles: dict[tuple[object, ...], Any] = field(default_factory=dict)
     described: dict[tuple[object, ...], NDArray[np.float32]] = field(default_factory=dict)
+    matched: dict[tuple[object, ...], Matches] = field(default_factory=dict)
     find: Any = features._in_tile
     describe: Any = features._described
+    match: Any = pairing.mutual_matches
 
     def in_tile(
         self, sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
@@ -56,13 +59,25 @@ class _Remembered:
             self.described[key] = self.describe(sift, picture, tiles, chosen)
         return self.described[key].copy()
 
+    def matches(
+        self, first: NDArray[np.float32], second: NDArray[np.float32], **rule: Any
+    ) -> Matches:
+        """Give which of two sets of descriptors belong together."""
+        digests = [hashlib.sha256(np.ascontiguousarray(one)).digest() for one in (first, second)]
+        key = (*digests, *sorted(rule.items()))
+        if key not in self.matched:
+            self.matched[key] = self.match(first, second, **rule)
+        found = self.matched[key]
+        return replace(found, **{name: array.copy() for name, array in vars(found).items()})
+
 
 _remembered = _Remembered()
 
 
 @pytest.fixture(autouse=True)
 def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look at each picture once: tests look at the same few, and at a wall in most of them."""
+    """Look at each picture, and match two of them, once: tests look at the same few."""
     if request.path.stem != "test_features" and request.node.originalname not in _ANEW:
         monkeypatch.setattr(features, "_in_tile", _remembered.in_tile)
         monkeypatch.setattr(features, "_described", _remembered.of_chosen)
+        monkeypatch.setattr(pairing, "mutual_matches", _remembered.matches)

@@ -176,11 +176,8 @@ def test_walls_are_seen_from_the_side_of_their_photos_whichever_way_their_planes
         RasterGrid.In(cloud=merged, planes=found), RasterGrid.Params(gsd_m=0.01), context(tmp_path)
     )
     ctx = context(tmp_path)
-    ties = (
-        MatchSift()
-        .run(MatchSift.In(photos=photos, walls=walls.walls), MatchSift.Params(), ctx)
-        .ties
-    )
+    params = MatchSift.Params(n_features_max=2000)
+    ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls.walls), params, ctx).ties
     assert not [warning for warning in ctx.warnings if "mirror" in warning]
     posed = OrientPnp().run(
         OrientPnp.In(ties=ties, photos=photos), OrientPnp.Params(), context(tmp_path)

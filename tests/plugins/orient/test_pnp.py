@@ -92,7 +92,8 @@ def test_the_chain_orients_within_its_stated_error(tmp_path: Path, seed: int) ->
     camera = ms.camera_before(scene, centre=(0.6 + 0.6 * seed, -2.6, 1.1), roll=0.8 * seed)
     photos, walls = ms.photos(ms.photo_of(scene, camera)), ms.walls_of(scene)
     ctx = context(tmp_path, seed=seed)
-    ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls), MatchSift.Params(), ctx).ties
+    params = MatchSift.Params(n_features_max=2000)
+    ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls), params, ctx).ties
     for folder in ("first", "second"):
         (tmp_path / folder).mkdir()
     first = orient(ties, photos, context(tmp_path / "first", seed=seed))

@@ -111,7 +111,7 @@ def test_between_pixels_a_ramp_stays_a_ramp(tmp_path: Path, resampling: str) -> 
 
 def test_averages_over_cells_keep_sixteen_bits(tmp_path: Path) -> None:
     where = scenes.frame()
-    viewer = scenes.camera(where, width=3000)
+    viewer = scenes.camera(where, width=2000)
     rows, columns = np.mgrid[: viewer.height, : viewer.width]
     deep = np.dstack([20 * columns, 25 * rows, 0 * rows + 999]).astype(np.uint16)
     (layer,) = laid(context(tmp_path), deep_photos(deep), viewer).layers
