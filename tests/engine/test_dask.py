@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing.util
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -110,6 +112,11 @@ def is_under_way(event: RunEvent) -> bool:
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
+    with pytest.MonkeyPatch.context() as patch:
+        # Removed when this process ends: by then that of the tests, with all in it, is gone.
+        patch.delenv("TMPDIR", raising=False)
+        patch.setattr(tempfile, "tempdir", None)
+        multiprocessing.util.get_temp_dir()
     with toy_world(tmp_path_factory.mktemp("office")) as world:
         quiet = digests(world.run(STEPS, executor="inline"))
         with cluster(2, **{CORES: 1}) as opened:
