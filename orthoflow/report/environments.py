@@ -38,10 +38,10 @@ def alike_environments(runs: Iterable[Run]) -> AlikeEnvironments:
     """
     runs = tuple(runs)
     environments = {one.id: one for run in runs for one in run.record.environments}
-    used = required_distributions(
-        frozenset(cell.distribution for run in runs for cell in run.record.cells) - {""}
-        | {DISTRIBUTION}
-    )
+    named = {cell.distribution for run in runs for cell in run.record.cells} - {""}
+    # Of one alone nothing has to be known.
+    several = len(environments) > 1
+    used = required_distributions(frozenset({*named, DISTRIBUTION})) if several else None
     first: dict[str, str] = {}
     known: dict[str, dict[str, str]] = {}
     for key, environment in environments.items():
