@@ -26,6 +26,8 @@ class CellState:
         started: seconds of a clock.
         wall_s: how long it took.
         took_s: how long it, or one like it, took before; None when nobody knows.
+        compiled_s: how long it has waited for kernels.
+        heard: when it said something last, seconds of that clock.
     """
 
     state: str = "waiting"
@@ -34,6 +36,19 @@ class CellState:
     started: float = 0.0
     wall_s: float = 0.0
     took_s: float | None = None
+    compiled_s: float = 0.0
+    heard: float = 0.0
+
+    def hear(self, fraction: float, text: str, now_s: float) -> None:
+        """Take what it says of itself."""
+        if self._is_compiling:
+            self.compiled_s += now_s - self.heard
+        self.fraction, self.text, self.heard = fraction, text, now_s
+
+    @property
+    def _is_compiling(self) -> bool:
+        # As `geometry.compiling` tells it, before a kernel and after it.
+        return self.text.startswith("compiling ")
 
     def left_s(self, now_s: float) -> float | None:
         """Seconds that it still takes; None when nobody knows.
@@ -47,9 +62,12 @@ class CellState:
         elapsed_s = now_s - self.started
         if self.took_s is not None and elapsed_s < self.took_s:
             return self.took_s - elapsed_s
-        if self.fraction < _SMALLEST_FRACTION or elapsed_s < _SHORTEST_S:
+        # Kernels are compiled once: the share that is done took the rest of the time.
+        worked_s = elapsed_s - self.compiled_s
+        is_early = self.fraction < _SMALLEST_FRACTION or worked_s < _SHORTEST_S
+        if is_early or self._is_compiling:
             return None
-        return elapsed_s * (1 - self.fraction) / self.fraction
+        return worked_s * (1 - self.fraction) / self.fraction
 
     def done(self, now_s: float) -> float:
         """How far it is, 0..1: as it says, or as far as such a step was by now.

@@ -71,10 +71,10 @@ class RunState:
                 case CellStarted():
                     cell = self._cells.setdefault(event.address, CellState())
                     cell.state, cell.text, cell.started = "running", _STARTING, time.monotonic()
-                    cell.fraction = 0.0
+                    cell.fraction = cell.compiled_s = 0.0
                 case CellProgress():
                     cell = self._cells.setdefault(event.address, CellState(state="running"))
-                    cell.fraction, cell.text = event.fraction, event.text
+                    cell.hear(event.fraction, event.text, time.monotonic())
                 case CellFinished():
                     result = event.result
                     self._cells[event.address] = CellState(

@@ -39,6 +39,16 @@ def test_a_cell_takes_as_long_as_before_then_as_long_as_it_says(
     assert found == (None if left_s is None else pytest.approx(left_s))
 
 
+def test_kernels_that_are_compiled_once_are_no_share_of_the_work() -> None:
+    cell = running()
+    cell.hear(0.25, "compiling span_rows (1 so far)", 102.0)
+    assert cell.left_s(150.0) is None
+    cell.hear(0.25, "compiling claim_slab (2 so far)", 150.0)
+    cell.hear(0.25, "wall 0", 160.0)
+    # Four of 62 seconds were work: two before, two since.
+    assert cell.left_s(162.0) == pytest.approx(12.0)
+
+
 @pytest.mark.parametrize(
     ("cell", "now_s", "done"),
     [
