@@ -265,7 +265,7 @@ def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None
     check_finished(desk)
 
 
-@pytest.mark.parametrize("mib", [260, 350, 600])
+@pytest.mark.parametrize("mib", [175, 260, 600])
 def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
@@ -274,7 +274,8 @@ def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> 
     code, said = desk.run(before=limit, environment={"OPENBLAS_NUM_THREADS": "1"})
     name = "run"
     if code != 0:
-        assert code in (1, 4), said
+        # A little less, and not even the methods load.
+        assert code in (1, 2, 4), said
         # A step that had too little fails alone, and its run is a whole one.
         has_ended = (desk.folder / "run" / "run.h5").exists()
         check_sentence(said.replace(" failed: ", "error: ") if has_ended else said)
