@@ -154,7 +154,8 @@ def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
         name, extras = left.pop()
         try:
             stated = requires(name) or []
-        except PackageNotFoundError:
+        except (PackageNotFoundError, ValueError):
+            # No such thing, or nobody can read what it says.
             missing.add(name)
             continue
         for text in stated:

@@ -129,8 +129,9 @@ def publishers_write_into_their_folder(subject: Subject) -> None:
     """Publishers of products that are not ours write plain files, into their folder alone."""
     catalog = discover_catalog()
     for name, product in subject.witness.first.run.outputs.items():
-        publisher = catalog.publisher(product.type_name)
-        if product.type_name in _OURS or publisher is None:
+        is_ours = product.type_name in _OURS
+        publisher = None if is_ours else catalog.publisher(product.type_name)
+        if publisher is None:
             continue
         around, here = subject.folder / f"published-{name}", subject.folder / f"beside-{name}"
         here.mkdir(parents=True)

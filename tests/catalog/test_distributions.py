@@ -147,4 +147,5 @@ def test_what_a_distribution_requires_is_followed(folder: Path) -> None:
         (info / "METADATA").write_text("\n".join(["Metadata-Version: 2.1", *lines]))
     found = required_distributions(frozenset({"my-plugin"}))
     assert found == {"my-plugin", "one", "speed", "gone"}
-    assert required_distributions(frozenset({"my-plugin", "gone"})) is None
+    for unknown in ("gone", " ", "../x"):
+        assert required_distributions(frozenset({"my-plugin", unknown})) is None
