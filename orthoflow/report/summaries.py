@@ -15,6 +15,7 @@ from orthoflow.records.warnings import standing_warnings
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
+from orthoflow.report.ways import improved_on
 
 # Without photos that show a place, completeness cannot be asked for there.
 _SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
@@ -193,8 +194,16 @@ def limits(run: Run) -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
+    # What a later orientation leaves open of the photos it says itself.
+    oriented = [
+        cell.address
+        for cell in by_baseline
+        if cell.status == "ok" and cell.method.startswith("orient.")
+    ]
+    settled = improved_on(run, oriented)
+    standing = [said for said in standing_warnings(by_baseline) if said[0] not in settled]
     warnings = sorted(
-        alike(standing_warnings(by_baseline)),
+        alike(standing),
         key=lambda item: (
             not item.is_foremost,
             _is_of_others_than(imaged, item.sentence),

@@ -274,6 +274,21 @@ def test_advice_on_what_was_measured_is_the_first_limit() -> None:
     assert [limit.cells for limit in limits(run(scan, check))] == [("scan",), ("points",)]
 
 
+def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended() -> None:
+    first = cell("first", method="orient.pnp", warnings=("photo a: few ties",))
+    reties = cell("reties", method="match.guided", inputs={"c": given("first.cameras", "1", "c")})
+    orient = cell(
+        "orient",
+        method="orient.pnp",
+        inputs={"t": given("reties.ties", "2", "t")},
+        warnings=("photo b: few ties",),
+    )
+    assert [limit.cells for limit in limits(run(first, reties, orient))] == [("orient",)]
+    failed = replace(orient, status="failed", error_message="no disk", warnings=())
+    told = [limit.cells for limit in limits(run(first, reties, failed))]
+    assert told == [("orient",), ("first",)]
+
+
 def test_what_is_said_of_planes_without_an_orthoimage_stands_last() -> None:
     guessed = "from which side {} was seen is a guess: set view_from"
     told = [
