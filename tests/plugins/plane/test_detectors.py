@@ -40,7 +40,9 @@ SURVEY = (634512.347, 486215.781, 112.193)
 # Finds the table too, which holds 3 % of the points.
 TO_THE_END = {"stop_unclassified_share": 0.0}
 
-# Of a room's points a fourth shows as well which planes are left.
+# Half of a room's points fix its planes as well: errors are a fourth of what is asserted, or less,
+# but for the table's, which has the fewest. A fourth of them shows which planes are left.
+HALF = slice(None, None, 2)
 FEW = slice(None, None, 4)
 
 every_detector = pytest.mark.parametrize("detector", DETECTORS)
@@ -77,7 +79,7 @@ def errors(planes: Planes, truth: Rectangle, turn: NDArray[np.float64]) -> tuple
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    cloud = cloud_of(sampled(), stations=STATION)
+    cloud = cloud_of(sampled()[HALF], stations=STATION)
     return {
         name: detect(name, cloud, tmp_path_factory.mktemp(name), **TO_THE_END)[0]
         for name in DETECTORS
@@ -86,8 +88,8 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def halves(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What is found in every other point of the room."""
-    cloud = cloud_of(sampled()[::2], stations=STATION)
+    """What is found in every other of the points of `rooms`."""
+    cloud = cloud_of(sampled()[FEW], stations=STATION)
     return {
         name: detect(name, cloud, tmp_path_factory.mktemp(name), **TO_THE_END)[0]
         for name in DETECTORS
@@ -101,8 +103,8 @@ def same_planes(planes: Planes, expected: Planes, turn: NDArray[np.float64]) -> 
         middle = turn @ corners.mean(axis=0)
         index = nearest(planes, turn @ normal, middle)
         assert abs(planes.normal[index] @ middle - planes.offset[index]) < 1e-4
-        # The table has 2 500 points of 2 mm noise over a metre: other cells, other weights.
-        limit_deg = 0.002 if planes.n_points[index] > 5_000 else 0.02
+        # The table has 1 250 points of 2 mm noise over a metre: other cells, other weights.
+        limit_deg = 0.002 if planes.n_points[index] > 2_500 else 0.02
         assert angle_between_deg(planes.normal[index], turn @ normal) < limit_deg
 
 
@@ -126,10 +128,11 @@ def test_labels_name_the_plane_each_point_lies_on(detector: str, rooms: dict[str
     out, start = rooms[detector], 0
     for truth in ROOM:
         index = nearest(out.planes, truth.normal, np.array(truth.centre))
-        own = out.labels.plane_index[start : start + truth.n_points]
+        n_points = truth.n_points // 2
+        own = out.labels.plane_index[start : start + n_points]
         # Points in a corner belong to either surface; a strip of some millimetres along the edges.
         assert np.mean(own == index) > 0.98
-        start += truth.n_points
+        start += n_points
     labels = out.labels.plane_index
     counts = np.bincount(labels[labels >= 0], minlength=len(out.planes))
     np.testing.assert_array_equal(counts, out.planes.n_points)
@@ -139,7 +142,7 @@ def test_labels_name_the_plane_each_point_lies_on(detector: str, rooms: dict[str
 def test_labelled_points_lie_within_the_find_tolerance(
     detector: str, rooms: dict[str, Any]
 ) -> None:
-    out, points = rooms[detector], sampled()
+    out, points = rooms[detector], sampled()[HALF]
     labels = out.labels.plane_index
     distances = np.einsum("ij,ij->i", points, out.planes.normal[labels]) - out.planes.offset[labels]
     assert np.abs(distances[labels >= 0]).max() < 0.05 + 1e-6
@@ -149,8 +152,8 @@ def test_labelled_points_lie_within_the_find_tolerance(
 def test_shuffled_points_give_the_same_planes(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
-    order = np.random.default_rng(7).permutation(len(sampled()))
-    cloud = cloud_of(sampled()[order], stations=STATION)
+    points = np.random.default_rng(7).permutation(sampled()[HALF])
+    cloud = cloud_of(points, stations=STATION)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, np.eye(3))
 
@@ -159,7 +162,7 @@ def test_shuffled_points_give_the_same_planes(
 def test_survey_coordinates_of_a_million_metres_lose_nothing(
     detector: str, halves: dict[str, Any], tmp_path: Path
 ) -> None:
-    cloud = cloud_of(sampled()[::2], stations=STATION, origin=SURVEY)
+    cloud = cloud_of(sampled()[FEW], stations=STATION, origin=SURVEY)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     expected = halves[detector].planes
     np.testing.assert_array_equal(out.planes.normal, expected.normal)
@@ -174,7 +177,7 @@ def test_a_turned_room_gives_the_turned_planes(
     detector: str, angle_deg: float, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
     turn = turned(angle_deg)
-    cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+    cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)
 
@@ -187,7 +190,7 @@ def test_ten_other_turns_give_the_turned_planes(
 ) -> None:
     for angle_deg in (7.0, 18.5, 41.0, 57.3, 77.0, 103.0, 131.7, 168.0, 212.4, 299.9):
         turn = turned(angle_deg)
-        cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+        cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
         out, _ = detect(detector, cloud, tmp_path / str(angle_deg), **TO_THE_END)
         same_planes(out.planes, rooms[detector].planes, turn)
 
@@ -199,7 +202,7 @@ def test_a_room_turned_any_way_gives_the_turned_planes(
     axis = np.array([0.48, 0.6, 0.64])
     cross = np.cross(np.eye(3), axis)
     turn = np.eye(3) + np.sin(1.0) * cross + (1.0 - np.cos(1.0)) * cross @ cross
-    cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+    cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)
 
@@ -228,8 +231,8 @@ def test_half_of_the_points_give_the_same_planes_within_three_sigma(
 def test_five_percent_of_gross_outliers_neither_hide_nor_move_a_wall(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
-    stray = np.random.default_rng(3).uniform(-400.0, 400.0, (4_400, 3))
-    cloud = cloud_of(np.vstack([sampled(), stray]), stations=STATION)
+    stray = np.random.default_rng(3).uniform(-400.0, 400.0, (2_200, 3))
+    cloud = cloud_of(np.vstack([sampled()[HALF], stray]), stations=STATION)
     out, _ = detect(detector, cloud, tmp_path)
     for truth in ROOM[:6]:
         angle_deg, miss_m = errors(out.planes, truth, np.eye(3))
@@ -243,7 +246,7 @@ def test_recesses_of_different_depth_are_not_joined_by_a_plane_that_leans(
 ) -> None:
     door = Rectangle("door", (1.7, 2.12, -0.4), (0.45, 0, 0), (0, 0, 1.1), 12_000)
     niche = Rectangle("niche", (-1.5, 2.25, -0.2), (0.4, 0, 0), (0, 0, 0.9), 10_000)
-    cloud = cloud_of(sampled((*ROOM, door, niche)), stations=STATION)
+    cloud = cloud_of(sampled((*ROOM, door, niche))[HALF], stations=STATION)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     for truth in (door, niche):
         angle_deg, miss_m = errors(out.planes, truth, np.eye(3))
@@ -256,10 +259,10 @@ def test_mirror_ghosts_and_furniture_neither_hide_nor_move_the_walls(
     detector: str, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(5)
-    room = sampled()
+    room = sampled()[HALF]
     # A mirror on the front wall shows the room behind it: 4 % of the points lie where nothing is.
     front = ROOM[0]
-    seen = room[rng.choice(len(room), 3_500, replace=False)]
+    seen = room[rng.choice(len(room), 1_750, replace=False)]
     depth_m = (seen - front.centre) @ front.normal
     ghosts = seen - 2.0 * depth_m[:, None] * front.normal
     boxes = tuple(
@@ -272,7 +275,7 @@ def test_mirror_ghosts_and_furniture_neither_hide_nor_move_the_walls(
             ]
         )
     )
-    points = np.concatenate([room, ghosts, sampled(boxes, seed=6)])
+    points = np.concatenate([room, ghosts, sampled(boxes, seed=6)[HALF]])
     planes = detect(detector, cloud_of(points, stations=STATION), tmp_path, **TO_THE_END)[0].planes
     for truth in ROOM[:6]:
         angle_deg, miss_m = errors(planes, truth, np.eye(3))
@@ -345,20 +348,20 @@ def test_parts_that_do_not_touch_are_one_plane_only_on_demand(
 def test_thinning_finds_the_same_planes_and_labels_every_point(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
-    cloud = cloud_of(sampled(), stations=STATION)
+    cloud = cloud_of(sampled()[HALF], stations=STATION)
     out, _ = detect(detector, cloud, tmp_path, thinning=5)
     front = ROOM[0]
     angle_deg, miss_m = errors(out.planes, front, np.eye(3))
     assert angle_deg < 0.02
     assert miss_m < 3e-4
     index = nearest(out.planes, front.normal, np.array(front.centre))
-    assert np.mean(out.labels.plane_index[: front.n_points] == index) > 0.97
+    assert np.mean(out.labels.plane_index[: front.n_points // 2] == index) > 0.97
     assert out.planes.n_points.sum() == np.count_nonzero(out.labels.plane_index >= 0)
 
 
 @every_detector
 def test_stop_rules_end_the_search(detector: str, tmp_path: Path) -> None:
-    cloud = cloud_of(sampled()[::2], stations=STATION)
+    cloud = cloud_of(sampled()[HALF], stations=STATION)
     number = detect(detector, cloud, tmp_path, n_planes_max=2)[0].planes
     few = partial(detect, detector, cloud, tmp_path)
     support = few(min_share=0.15, **TO_THE_END)[0].planes
