@@ -207,7 +207,7 @@ def test_a_page_shows_the_model_without_a_server(
     (inside,) = re.findall(r'const model = "([A-Za-z0-9+/=]*)"', text)
     assert b64decode(inside) == written.read_bytes()
     with browser(tmp_path / "profile") as page:
-        page.show_as(800, 600)
+        page.show_as(320, 240)
         page.open(page_file)
         page.evaluate("new Promise(done => setTimeout(done, 1500))")
         if not page.evaluate("gl !== null"):
