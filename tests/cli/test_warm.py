@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +17,7 @@ from orthoflow.cli import plugins, warm
 from orthoflow.cli.program import program
 from orthoflow.engine.compiled_code import VARIABLE, begun_with_warm, leave_for_others, warm_folder
 from orthoflow.engine.executors import COMPILED_CODE
-from tests.workshop_runs import WORKSHOP, command, workshop_environment, write_studio
+from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
 
 
 @pytest.fixture
@@ -47,14 +46,8 @@ def test_a_store_begins_with_what_was_compiled_beforehand(
     again = CliRunner().invoke(program, ["warm", str(studio)])
     assert again.stdout.splitlines()[0].startswith("compiled 0 kernels of 2 methods in ")
     assert again.stdout.splitlines()[0].endswith(", 2 were there")
-    done = subprocess.run(
-        command("run", "studio.yaml", "-o", "run"),
-        cwd=tmp_path,
-        env={**workshop_environment(), VARIABLE: str(kernels)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    begins = {VARIABLE: str(kernels)}
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "run", environment=begins)
     assert done.returncode == 0, done.stderr
     (store,) = (tmp_path / ".orthoflow" / "numba").iterdir()
     assert compiled(store) == compiled(kernels)
