@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthoflow.files.drawings import printed_pictures
 from orthoflow.files.drawings.papers import Part
 from orthoflow.files.drawings.printed_pictures import (
     contours,
@@ -59,19 +60,22 @@ def test_finer_cells_than_print_shows_are_averaged_to_400_per_inch(tmp_path: Pat
     assert picture.std() < rgb.std() / 3
 
 
-def test_large_pictures_are_jpeg_with_the_colours_they_had(tmp_path: Path) -> None:
-    rgb = np.empty((3000, 4000, 3), dtype=np.uint8)
-    rgb[:, :2000], rgb[:, 2000:] = (200, 40, 90), (10, 220, 30)
-    shown = np.ones((3000, 4000), np.bool_)
-    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.01, tags={})
+def test_large_pictures_are_jpeg_with_the_colours_they_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rgb = np.empty((300, 400, 3), dtype=np.uint8)
+    rgb[:, :200], rgb[:, 200:] = (200, 40, 90), (10, 220, 30)
+    write_orthoimage(tmp_path / "a.tif", rgb, np.ones((300, 400), np.bool_), gsd_m=0.1, tags={})
     part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
-    write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=50)
-    assert picture_file(tmp_path / "p").suffix == ".jpg"
-    picture = decode_image(picture_file(tmp_path / "p").read_bytes()).astype(int)
-    assert picture.shape == (3000, 4000, 3)
+    for lossless_px, suffix in ((120_000, ".png"), (119_999, ".jpg")):
+        monkeypatch.setattr(printed_pictures, "_LOSSLESS_PX", lossless_px)
+        write_picture(tmp_path / "a.tif", part, tmp_path / suffix[1:], scale=50)
+        assert picture_file(tmp_path / suffix[1:]).suffix == suffix
+    picture = decode_image(picture_file(tmp_path / "jpg").read_bytes()).astype(int)
+    assert picture.shape == (300, 400, 3)
     # No chroma is thinned out: beside the edge too colours are right to JPEG's rounding.
-    assert np.abs(picture[:, :1990] - (200, 40, 90)).max() <= 3
-    assert np.abs(picture[:, 2010:] - (10, 220, 30)).max() <= 3
+    assert np.abs(picture[:, :190] - (200, 40, 90)).max() <= 3
+    assert np.abs(picture[:, 210:] - (10, 220, 30)).max() <= 3
 
 
 def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
