@@ -39,6 +39,7 @@ INSTRUCTION_SWITCHES: Final = (
 )
 # Two where the session has one, else one.
 _ALGEBRA_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_SERVE: Final = "from orthoflow.testing.isolation import serve; serve()"
 _LIMIT_S: Final = 600
 # Slow to import, harmless to fork after; the server imports them once the session has.
 _SHARED_LIBRARIES: Final = ("numba", "scipy.ndimage", "scipy.spatial", "cv2", "matplotlib.figure")
@@ -91,7 +92,7 @@ class _Server:
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="orthoflow-elsewhere-")
         self._process = subprocess.Popen(
-            [sys.executable, "-c", "from orthoflow.testing.isolation import serve; serve()"],
+            [sys.executable, "-c", _SERVE],
             cwd=self._folder.name,
             env=_environment(Path(self._folder.name)),
             stdin=subprocess.PIPE,
