@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import multiprocessing.util
 import os
-import subprocess
+import signal
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PathDistribution
 from importlib.util import cache_from_source
+from multiprocessing.context import ForkServerProcess
+from multiprocessing.reduction import DupFd
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import pytest
 
@@ -110,20 +115,64 @@ def digests(outcome: RunOutcome) -> dict[str, str]:
     }
 
 
-def start_coordinator(world: World, steps: str, into: str) -> subprocess.Popen[bytes]:
+@dataclass
+class Coordinator:
+    """A process that runs a workflow, which tests may stop.
+
+    Attributes:
+        process: it, forked from one that has loaded all that it needs.
+        stdout: what it says, "ready" before the run.
+    """
+
+    process: ForkServerProcess
+    stdout: BinaryIO
+
+    @property
+    def pid(self) -> int:
+        assert self.process.pid is not None
+        return self.process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        return self.process.exitcode
+
+    def kill(self) -> None:
+        self.process.kill()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        os.kill(self.pid, number)
+
+    def communicate(self, timeout: float | None = None) -> str:
+        """Wait for its end; what it said since it was read last."""
+        self.process.join(timeout)
+        assert self.process.exitcode is not None
+        with self.stdout:
+            return self.stdout.read().decode()
+
+
+def start_coordinator(world: World, steps: str, into: str) -> Coordinator:
     """Run a workflow in a process of its own, which tests may kill."""
-    (world.folder / "steps.txt").write_text(steps)
-    root = Path(__file__).resolve().parents[1]
-    paths = [str(root / part) for part in ("", "plugins", "provenance")]
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.engine_world", str(world.folder), into],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-    )
+    keep_fork_server_elsewhere()
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.engine_world"])
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb") as said:
+        process = context.Process(
+            target=_coordinate, args=(world.folder, steps, into, DupFd(said.fileno()))
+        )
+        process.start()
+    return Coordinator(process, os.fdopen(reading, "rb"))
+
+
+def keep_fork_server_elsewhere() -> None:
+    """Keep what belongs to the server that processes are forked from out of the tests' folder.
+
+    It is removed when this process ends: by then that of the tests, with all in it, is gone.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("TMPDIR", raising=False)
+        patch.setattr(tempfile, "tempdir", None)
+        multiprocessing.util.get_temp_dir()
 
 
 def install_toys(site: Path) -> None:
@@ -165,17 +214,20 @@ def has_ended(process_id: int) -> bool:
     return False
 
 
-def _main(folder: Path, into: str) -> None:
+# Any: what multiprocessing hands descriptors over with has no public type.
+def _coordinate(folder: Path, steps: str, into: str, said: Any) -> None:
+    """Run a workflow as a process of its own that has started in its own session."""
+    os.setsid()
+    descriptor = said.detach()
+    for stream in (1, 2):
+        os.dup2(descriptor, stream)
+    os.close(descriptor)
     with toy_world(folder) as world:
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         try:
-            outcome = world.run((folder / "steps.txt").read_text(), into=into)
+            outcome = world.run(steps, into=into)
         except OrthoflowError as error:
             sys.stdout.write(f"{type(error).__name__}: {error}\n")
             sys.exit(error.exit_code)
         sys.exit(outcome.exit_code)
-
-
-if __name__ == "__main__":
-    _main(Path(sys.argv[1]), sys.argv[2])

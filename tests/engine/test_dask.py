@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing.util
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +30,13 @@ from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.engine.plan import RunPlan
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
-from tests.engine_world import World, digests, has_ended, toy_world
+from tests.engine_world import (
+    World,
+    digests,
+    has_ended,
+    keep_fork_server_elsewhere,
+    toy_world,
+)
 
 STEPS = """
 steps:
@@ -115,14 +119,11 @@ def is_under_way(event: RunEvent) -> bool:
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
-    with pytest.MonkeyPatch.context() as patch:
-        # Removed when this process ends: by then that of the tests, with all in it, is gone.
-        patch.delenv("TMPDIR", raising=False)
-        patch.setattr(tempfile, "tempdir", None)
-        multiprocessing.util.get_temp_dir()
+    keep_fork_server_elsewhere()
     with toy_world(tmp_path_factory.mktemp("office")) as world:
         quiet = digests(world.run(STEPS, executor="inline"))
-        with cluster(2, tmp_path_factory.mktemp("answers"), **{CORES: 1}) as opened:
+        (world.folder / "answers").mkdir()
+        with cluster(2, world.folder / "answers", **{CORES: 1}) as opened:
             yield Office(world, opened, quiet)
 
 
@@ -298,11 +299,11 @@ def _target(link: Path) -> str:
 
 
 def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
-    office: Office, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dask_executor, "_PATIENCE_S", 3.0)
     world, folder = office.world, office.world.folder / "alone"
-    with cluster(1, tmp_path, **{CORES: 1}) as lost:
+    with cluster(1, world.folder / "answers", **{CORES: 1}) as lost:
         plan = world.plan(
             STEPS, executor="dask", scheduler=lost.scheduler_address, force=("second",)
         )
