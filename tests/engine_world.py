@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PathDistribution
 from importlib.util import cache_from_source
+from multiprocessing import forkserver
 from multiprocessing.context import ForkServerProcess
 from multiprocessing.reduction import DupFd
 from pathlib import Path
@@ -152,9 +153,8 @@ class Coordinator:
 
 def start_coordinator(world: World, steps: str, into: str) -> Coordinator:
     """Run a workflow in a process of its own, which tests may kill."""
-    keep_fork_server_elsewhere()
+    start_fork_server()
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.engine_world"])
     reading, writing = os.pipe()
     with os.fdopen(writing, "wb") as said:
         process = context.Process(
@@ -164,15 +164,18 @@ def start_coordinator(world: World, steps: str, into: str) -> Coordinator:
     return Coordinator(process, os.fdopen(reading, "rb"))
 
 
-def keep_fork_server_elsewhere() -> None:
-    """Keep what belongs to the server that processes are forked from out of the tests' folder.
+def start_fork_server(*modules: str) -> None:
+    """Start the server that `multiprocessing` forks from, with what it loads; once in a process.
 
-    It is removed when this process ends: by then that of the tests, with all in it, is gone.
+    What belongs to it lies outside the tests' folder: it is removed when this process ends, and by
+    then the folder, with all in it, is gone.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TMPDIR", raising=False)
         patch.setattr(tempfile, "tempdir", None)
         multiprocessing.util.get_temp_dir()
+    forkserver.set_forkserver_preload([*modules, "tests.engine_world"])
+    forkserver.ensure_running()
 
 
 def install_toys(site: Path) -> None:

@@ -24,6 +24,8 @@ steps:
   side: {use: paint.plain, in: {planes: other.planes}}
 """
 TABLE = "name,number\nhall,data/hall.txt\nattic,data/attic.txt\nstairs,data/stairs.txt\n"
+# No test here asks for the processes of steps.
+INLINE = ("--executor", "inline")
 NUMBERS = {"hall": "1.5", "attic": "", "stairs": "2.5"}
 
 
@@ -36,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "data").mkdir()
     for name, text in NUMBERS.items():
         (folder / "data" / f"{name}.txt").write_text(text)
-    done = orthoflow(folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "-o", "first")
+    done = orthoflow(folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "-o", "first", *INLINE)
     # Every root failure is that of an input.
     assert done.returncode == 2, done.stderr
     return folder
@@ -72,7 +74,7 @@ def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
     }
     done = orthoflow(folder, "verify", "first")
     assert done.returncode == 0, done.stdout
-    done = orthoflow(folder, "replay", "first", "-o", "again", "--json")
+    done = orthoflow(folder, "replay", "first", "-o", "again", "--json", *INLINE)
     assert done.returncode == 0, done.stderr
     products = json.loads(done.stdout)["products"]
     assert len(products) == 6
@@ -91,7 +93,7 @@ def test_a_replay_takes_the_files_of_a_dataset_from_elsewhere(
     done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again")
     assert done.returncode == 3
     assert "input number@hall: hall.txt" in done.stderr
-    done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again", "--input", given)
+    done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again", "--input", given, *INLINE)
     if given == "number=moved":
         assert done.returncode == 0, done.stderr
     else:

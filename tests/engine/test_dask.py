@@ -34,7 +34,7 @@ from tests.engine_world import (
     World,
     digests,
     has_ended,
-    keep_fork_server_elsewhere,
+    start_fork_server,
     toy_world,
 )
 
@@ -119,7 +119,7 @@ def is_under_way(event: RunEvent) -> bool:
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
-    keep_fork_server_elsewhere()
+    start_fork_server("tests.asking_once", "orthoflow.engine.dask_worker")
     with toy_world(tmp_path_factory.mktemp("office")) as world:
         quiet = digests(world.run(STEPS, executor="inline"))
         (world.folder / "answers").mkdir()

@@ -86,7 +86,9 @@ class Desk:
         return done.returncode, done.stderr
 
     def forked(
-        self, *arguments: str, environment: Mapping[str, str | None] | None = None
+        self,
+        *arguments: str,
+        environment: Mapping[str, str | None] | None = None,
     ) -> tuple[int, str]:
         """Run a command so, where nothing is asked of how it loads: forked from one that has."""
         changed = self._variables(environment)
@@ -212,10 +214,10 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
         code, said = desk.forked(*command)
         assert code == 0, said
     for command in (
-        ("run", "toy.yaml", "-o", "second"),
+        ("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS),
         ("report", "run"),
         ("export", "run", "--to", "ro-crate", "-o", "crate"),
-        ("replay", "run", "-o", "again", "--input", "numbers=numbers.txt"),
+        ("replay", "run", "-o", "again", "--input", "numbers=numbers.txt", *IN_THIS_PROCESS),
         ("cache", "gc"),
         ("cache", "verify"),
     ):
@@ -236,7 +238,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     for path in (store, *store.rglob("*")):
         os.chown(path, NOBODY, NOBODY)
         path.chmod(0o777 if is_open else 0o755 if path.is_dir() else 0o644)
-    code, said = desk.forked("run", "toy.yaml", "-o", "second")
+    code, said = desk.forked("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS)
     if is_open:
         assert code == 0, said
         assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
@@ -294,12 +296,12 @@ def test_files_from_the_future_are_taken_as_any_others(used_desk: Desk) -> None:
         if path.is_file():
             state = path.stat()
             os.utime(path, (state.st_atime + YEAR_S, state.st_mtime + YEAR_S))
-    code, said = desk.forked("run", "toy.yaml", "-o", "second")
+    code, said = desk.forked("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS)
     assert code == 0, said
     assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
     for command in (("cache", "verify"), ("cache", "list"), ("cache", "gc", "--older-than", "1")):
         assert desk.forked(*command)[0] == 0
-    assert desk.forked("run", "toy.yaml", "-o", "third")[0] == 0
+    assert desk.forked("run", "toy.yaml", "-o", "third", *IN_THIS_PROCESS)[0] == 0
     assert all(cell.cached_from for cell in open_run(desk.folder / "third").cells.values())
 
 
