@@ -136,7 +136,8 @@ def judged(
     columns: tuple[int, int] = COLUMNS,
 ) -> tuple[int, NDArray[np.float64]]:
     shape = (-(-CAMERA.height // 4), -(-CAMERA.width // 4))
-    filled = np.ascontiguousarray(np.broadcast_to(np.float32(nearest), shape))
+    # A copy, since a view cannot be written to: the kernel would be compiled once more.
+    filled = np.array(np.broadcast_to(np.float32(nearest), shape), order="C")
     box = np.empty(4)
     verdict = judge_block(
         of or view(),

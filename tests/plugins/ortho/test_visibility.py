@@ -213,6 +213,7 @@ def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -
     depth[20:40, 10:30] += 0.1
     depth[50:60, 5:9] = depth[:2, :2] = depth[30, 50] = np.nan
     depth[70, 40] = 0.5
+    depth.flags.writeable = False  # as rasters are: the kernel would be compiled once more
     step_m, edge_m = 1e-4, 0.015
     occluding, tops = np.zeros(depth.shape, dtype=np.int16), np.zeros((10, 8), dtype=np.float32)
     for first, end in ((0, 3), (3, 4), (4, 10)):
@@ -284,7 +285,8 @@ def block_looked_at(
     buffer = nothing_in_the_way(camera)
     if np.ndim(nearest_m) or np.isfinite(nearest_m):
         filled = np.broadcast_to(np.float32(nearest_m), (camera.height, camera.width))
-        buffer = DepthBuffer(nearest=np.ascontiguousarray(filled), reduction=1.0)
+        # A copy, since a view cannot be written to: the kernel would be compiled once more.
+        buffer = DepthBuffer(nearest=np.array(filled, order="C"), reduction=1.0)
     done = look_at_blocks(
         view_of(camera, surface, PARAMS, is_exact=is_exact),
         surface.relief,
