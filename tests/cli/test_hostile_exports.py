@@ -150,7 +150,7 @@ def test_a_title_block_that_is_no_file_is_refused_at_once(run: Path, tmp_path: P
 
 def test_a_wall_that_no_usual_scale_gets_onto_one_sheet_has_no_index(run: Path) -> None:
     exchange_ortho(run, 4096, 4, gsd_m=20.0)
-    done = export(run, "sheet", "--paper", "200x200", "--scale", "20000")
+    done = export(run, "sheet", "--paper", "200x200", "--scale", "40000")
     assert done.exit_code == 0, done.output
     names = {path.name for path in (run.parent / "sheet").iterdir()}
     assert len(names) > 10

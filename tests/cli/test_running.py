@@ -17,6 +17,9 @@ from orthoflow.records.runs import open_run
 from tests.laboratories import write_distribution
 from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
 
+# Where no test asks for the processes of steps.
+INLINE = ("--executor", "inline")
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
@@ -137,7 +140,7 @@ def test_a_finished_folder_is_refused(finished: tuple[Path, str, str]) -> None:
 def test_an_input_from_the_command_line_is_recorded_by_content(tmp_path: Path) -> None:
     write_studio(tmp_path)
     (tmp_path / "n.txt").write_text("1.5", encoding="utf-8")
-    done = orthoflow(tmp_path, "run", "studio.yaml", "--input", "number=n.txt", "-o", "r")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "--input", "number=n.txt", "-o", "r", *INLINE)
     assert done.returncode == 0, done.stderr
     [given] = open_run(tmp_path / "r").record.inputs
     assert (given.name, given.files[0].name, given.files[0].size_bytes) == ("number", "n.txt", 3)
@@ -147,7 +150,7 @@ def test_an_input_from_the_command_line_is_recorded_by_content(tmp_path: Path) -
 
 def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     write_studio(tmp_path)
-    done = orthoflow(tmp_path, "run", "studio.yaml", "--embed", "-o", "r", "--executor", "inline")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "--embed", "-o", "r", *INLINE)
     assert done.returncode == 0, done.stderr
     checked = orthoflow(tmp_path, "verify", "r")
     assert checked.returncode == 0
@@ -270,7 +273,7 @@ def test_a_terminal_gets_a_live_table_that_leaves_nothing_behind(tmp_path: Path)
     write_studio(tmp_path)
     controlling, terminal = pty.openpty()
     done = subprocess.Popen(
-        command("run", "studio.yaml", "-o", "r"),
+        command("run", "studio.yaml", "-o", "r", *INLINE),
         cwd=tmp_path,
         env={**workshop_environment(), "TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
         stdout=subprocess.PIPE,
@@ -300,7 +303,7 @@ def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path: Path) -> None:
     os.close(reading)
     with os.fdopen(writing, "wb") as closed:
         done = subprocess.run(
-            command("run", "studio.yaml", "-o", "r", "--executor", "inline"),
+            command("run", "studio.yaml", "-o", "r", *INLINE),
             cwd=tmp_path,
             env=workshop_environment(),
             stdout=closed,
@@ -398,7 +401,7 @@ def test_plan_says_what_is_cached_and_what_changed(finished: tuple[Path, str, st
 
 def test_cache_lists_results_and_collects_garbage(tmp_path: Path) -> None:
     write_studio(tmp_path)
-    assert orthoflow(tmp_path, "run", "studio.yaml", "-o", "r").returncode == 0
+    assert orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE).returncode == 0
     listed = orthoflow(tmp_path, "cache", "list").stdout
     assert listed.splitlines()[-1] == "2 results in .orthoflow"
     methods = {
@@ -415,7 +418,7 @@ def test_cache_lists_results_and_collects_garbage(tmp_path: Path) -> None:
 
 def test_the_store_may_lie_elsewhere(tmp_path: Path) -> None:
     write_studio(tmp_path)
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", "--store", "elsewhere")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", "--store", "elsewhere", *INLINE)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "elsewhere" / "results").is_dir()
     assert not (tmp_path / ".orthoflow").exists()
@@ -439,7 +442,7 @@ def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -
     assert done.stdout.endswith("run 3 times in all; baseline paint=rough\n"), (
         done.stdout + done.stderr
     )
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "out")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "out", *INLINE)
     assert "baseline: paint=rough, with which the others are compared" in done.stdout.splitlines()
 
 
@@ -471,7 +474,7 @@ def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None
     answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
     assert (answer["ok"], answer["warnings"]) == (True, [said])
     # Whoever has not checked reads it where the run ends.
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", "--executor", "inline")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE)
     assert f"warning, workflow: {said}" in done.stdout.splitlines()
 
 
