@@ -274,7 +274,7 @@ def test_advice_on_what_was_measured_is_the_first_limit() -> None:
     assert [limit.cells for limit in limits(run(scan, check))] == [("scan",), ("points",)]
 
 
-def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended() -> None:
+def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path: Path) -> None:
     first = cell("first", method="orient.pnp", warnings=("photo a: few ties",))
     reties = cell("reties", method="match.guided", inputs={"c": given("first.cameras", "1", "c")})
     orient = cell(
@@ -284,6 +284,12 @@ def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended() -> None
         warnings=("photo b: few ties",),
     )
     assert [limit.cells for limit in limits(run(first, reties, orient))] == [("orient",)]
+    silent = run(first, reties, replace(orient, warnings=()))
+    write_report([silent], tmp_path / "report.html")
+    assert (
+        "No step warned of what a later one has not settled."
+        in (tmp_path / "report.html").read_text()
+    )
     failed = replace(orient, status="failed", error_message="no disk", warnings=())
     told = [limit.cells for limit in limits(run(first, reties, failed))]
     assert told == [("orient",), ("first",)]
