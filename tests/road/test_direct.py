@@ -26,7 +26,7 @@ SMALL_WALL = (*SMALL, *ONE_WALL)
 def road(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `direct.yaml` ran once on the small simulated room, as `run`."""
     shell = Shell(tmp_path_factory.mktemp("road"), store)
-    ended = shell("run", "direct.yaml", *SMALL_WALL, "-o", "run")
+    ended = shell("run", "direct.yaml", *SMALL_WALL, "-o", "run", "--executor", "inline")
     assert ended.code == 0, ended.said
     assert str(Path("run") / "report.html") in ended.out
     assert str(Path("run") / "run.h5") in ended.out
