@@ -282,7 +282,7 @@ SET: Final = Key(
     name="set",
     shape=OpenTable(words="a mapping step.parameter: value"),
     meaning="Parameters for this dataset alone, named as behind `--set`, which goes before them.",
-    example="{room.seed: 7, plane.ransac.tolerance_m: 0.03}",
+    example="{room.noise_m: 0.004, plane.ransac.tolerance_m: 0.03}",
     default="as in the steps",
 )
 DATASET: Final = Section(
@@ -290,7 +290,7 @@ DATASET: Final = Section(
     about="What hangs on the data runs once per dataset, with `data=<name>` first in its address; "
     "all else runs once. An input that a dataset does not name is that of the workflow. Instead of "
     "the mapping there may be a CSV file with a line per dataset: the column `name`, a column per "
-    "input, and columns such as `room.seed` for parameters; an empty place says nothing, and "
+    "input, and columns such as `room.noise_m` for parameters; an empty place says nothing, and "
     "relative paths start at the CSV file. `--datasets FILE` takes the place of the section, "
     "`--only-data A,B` chooses among the names.",
     keys=(SET,),
