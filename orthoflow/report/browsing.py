@@ -123,12 +123,9 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     A fact that some of them lack differs only where two others disagree on it. Of a sweep all
     values are told, and without the dataset what is the same on all datasets of each such run.
     """
-    values: dict[tuple[str, str], set[str]] = {}
     apart: set[tuple[str, str]] = set()
     for run in runs:
         told = run.told
-        for name, value in told.items():
-            values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
         on_datasets: dict[str, set[str]] = {}
         for name, short in run.shared.items():
             on_datasets.setdefault(short, set()).add(_sorted_json(told[name]))
@@ -138,10 +135,17 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
         short = run.shared.get(name, name)
         return name if (run.workflow, short) in apart else short
 
+    named = {
+        run.folder: {called(run, name): value for name, value in run.told.items()} for run in runs
+    }
+    values: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        for name, value in named[run.folder].items():
+            values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
     return {
         run.folder: {
-            called(run, name): value
-            for name, value in run.told.items()
+            name: value
+            for name, value in named[run.folder].items()
             if len(values[run.workflow, name]) > 1
         }
         for run in runs

@@ -199,6 +199,12 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
         {"check@data=stairs.tries": 4},
         {"check@data=stairs.tries": 5},
     ]
+    # Nor does it where others ran on no dataset.
+    plain = replace(
+        single, folder=tmp_path / "p", facts={"check.tries": 4}, swept={}, shared={}, n_datasets=0
+    )
+    of_both = [facts["check.tries"] for facts in differing_facts([swept, plain]).values()]
+    assert of_both == ["1|2|3", 4]
     # A dataset that others lack changes no name.
     three = told("d", (1, 2), (1, 2), (1, 2))
     assert differing_facts([three, single])[three.folder] == {"datasets": 3, "check.tries": "1|2"}
