@@ -173,7 +173,7 @@ def floods_all_sockets(values, params, ctx):
 
 @work("exact")
 def goes_on_writing(values, params, ctx):
-    array = np.zeros(1 << 22)
+    array = np.zeros(1 << 20)
     def write():
         while True:
             array[:] += 1.0
