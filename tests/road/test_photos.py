@@ -28,12 +28,12 @@ from tests.road.conftest import ROOT, Ended, Shell, metrics_of
 from tests.scan_files import write_las
 
 # A third of the shipped recipe's cells, and of its points of the main wall, fewer of the others;
-# half of its pixels. With fewer pixels a photo finds too few ties.
+# less than half of its pixels.
 SMALL = (
     *("--set", "room.scan_step_m=0.0047", "--set", "room.panorama_step_m=0.03"),
-    *("--set", "room.photo_gsd_m=0.0035", "--set", "wall.gsd_m=0.007"),
+    *("--set", "room.photo_gsd_m=0.004", "--set", "wall.gsd_m=0.007"),
 )
-GSD_MM, PHOTO_GSD_MM = 7.0, 3.5
+GSD_MM, PHOTO_GSD_MM = 7.0, 4.0
 # What the recipe for simulated data sets, for the recipe for own data.
 SAME_WALL = (
     *("--set", "wall.gsd_m=0.007", "--set", "wall.buffer_m=0.3"),
