@@ -172,7 +172,10 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    if (chosen.embed or chosen.split) and (doubt := broken_seal(opened, of_all=True)):
+    seals_anew = chosen.embed or chosen.split
+    # A crate hands on the record itself, with arrays that nobody has read.
+    doubt = broken_seal(opened, of_all=seals_anew or target == "ro-crate")
+    if doubt and seals_anew:
         raise RecordError(f"{doubt}; what was changed is not sealed anew: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
@@ -180,8 +183,6 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
         else:
             said = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {said}")
-    # A crate hands on the record itself, with arrays that nobody has read.
-    doubt = broken_seal(opened, of_all=target == "ro-crate")
     return code_for([doubt], f"rely on nothing in {folder}")
 
 

@@ -123,12 +123,12 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     A fact that some of them lack differs only where two others disagree on it. Of a sweep all
     values are told, and without the dataset what is the same on all datasets of each such run.
     """
+    told = {run.folder: run.told for run in runs}
     apart: set[tuple[str, str]] = set()
     for run in runs:
-        told = run.told
         on_datasets: dict[str, set[str]] = {}
         for name, short in run.shared.items():
-            on_datasets.setdefault(short, set()).add(_sorted_json(told[name]))
+            on_datasets.setdefault(short, set()).add(_sorted_json(told[run.folder][name]))
         apart |= {(run.workflow, short) for short, found in on_datasets.items() if len(found) > 1}
 
     def called(run: RunSummary, name: str) -> str:
@@ -136,7 +136,8 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
         return name if (run.workflow, short) in apart else short
 
     named = {
-        run.folder: {called(run, name): value for name, value in run.told.items()} for run in runs
+        run.folder: {called(run, name): value for name, value in told[run.folder].items()}
+        for run in runs
     }
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:

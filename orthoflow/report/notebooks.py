@@ -107,13 +107,12 @@ class OpenedRun(Run):
 
         output = self.cell(address).outputs.get(port)
         # Asking makes the folder of a store that is not there.
-        stored = Store(Path(store)) if Path(store).is_dir() else None
-        if output is None or output.embedded or stored is None:
-            return super().product(address, port)
-        if stored.product_file(output.digest) is None:
-            return super().product(address, port)
-        cls = discover_catalog().product_class(output.type_name)
-        return stored.get_product(output.digest, cls)
+        if output is not None and not output.embedded and Path(store).is_dir():
+            stored = Store(Path(store))
+            if stored.product_file(output.digest) is not None:
+                cls = discover_catalog().product_class(output.type_name)
+                return stored.get_product(output.digest, cls)
+        return super().product(address, port)
 
     def verify(self) -> Verification:
         """Check all of the record and the published files beside it, as `orthoflow verify` does."""

@@ -35,9 +35,14 @@ class Problem:
     message: str
     text: str = ""
 
-    def __str__(self) -> str:
+    @property
+    def place(self) -> str:
+        """Where it is, as it begins: `hall.yaml:3:9: steps.wall: `."""
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
-        head = f"{where}: {self.path}: {self.message}" if self.path else f"{where}: {self.message}"
+        return f"{where}: {self.path}: " if self.path else f"{where}: "
+
+    def __str__(self) -> str:
+        head = f"{self.place}{self.message}"
         snippet = self._snippet()
         return f"{head}\n{snippet}" if snippet else head
 
@@ -115,7 +120,7 @@ class ProblemLog:
 
     def place(self, position: Position, path: str) -> str:
         """Say where something stands, as problems begin; empty of what comes from no file."""
-        return f"{self.file}:{position.line}:{position.column}: {path}: " if position.line else ""
+        return self._at(position, path, "").place if position.line else ""
 
     def add_plugin(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of a plugin that the file needs here."""
