@@ -39,6 +39,8 @@ from orthoflow.products import Cameras, Photos, Ties, Truth, Walls
 from orthoflow.sdk import StepContext
 
 Estimator = type[OrientPnp] | type[OrientColmapBundle]
+# Clouds of 16 million points lie there, mapped; they go with the process.
+_SCRATCH: list[tempfile.TemporaryDirectory[str]] = []
 # As the shipped workflows have it: a first pose needs to be good to a few cells only.
 ROUGHLY = {
     "n_quadrant_min": 0,
@@ -72,8 +74,9 @@ class Score:
 
 
 def context(seed: int) -> StepContext:
-    folder = Path(tempfile.mkdtemp())
-    return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=folder)
+    folder = tempfile.TemporaryDirectory()
+    _SCRATCH.append(folder)
+    return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=Path(folder.name))
 
 
 def room(seed: int, gap: str, chosen: argparse.Namespace) -> tuple[Photos, Walls, Truth]:

@@ -1,6 +1,8 @@
 """One room as several files: bias of what is matched, and whether stated errors hold.
 
     python benchmarks/scan_formats.py --rooms 2 --first 501
+    # the other walls scanned finely too, 16 million points a room:
+    python benchmarks/scan_formats.py --rooms 4 --first 501 --panorama-step-m 0.0022
 
 A room is scanned from one station, points 4.4 mm apart on its main wall (median), and written as
 E57 with rows and columns, E57 without, LAZ, and E57 without whose points stand in random order.
@@ -17,7 +19,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +41,10 @@ from orthoflow.products import InputFiles, Planes, PointCloud, Ties, Truth, Wall
 FORMATS = ("e57 with rows", "e57 without", "laz", "random order")
 CELLS_M = (0.002, 0.004, 0.008)
 # Right before the station; farther off points lie farther apart.
-_STEP_M = 0.0034
+_STEP_M = 0.00356
+# The main wall and what stands out of it or goes into it is seen by its own scan alone.
+_BEFORE_WALL_M = 0.5
+_ALONG_COSINE = 0.99
 _LAZ_SCALE_M = 1e-4
 # Ties farther off are wrong ones, which estimators reject: no bias.
 _WRONG_CELLS = 1.5
@@ -116,11 +121,46 @@ def written(room: SimulateRoom.Out, folder: Path) -> Iterator[tuple[str, Path]]:
         yield name, path
 
 
-def planes_seen_from(cloud: PointCloud, truth: Truth) -> Planes:
-    """Planes of a cloud; the main one faces the room, which LAZ does not know."""
+def scanned_room(
+    seed: int, panorama_step_m: float, photo_gsd_m: float = 0.0025
+) -> SimulateRoom.Out:
+    """A room from one station, its main wall at one density."""
+    params = SimulateRoom.Params.model_validate(
+        {
+            "scan_step_m": _STEP_M,
+            "panorama_step_m": panorama_step_m,
+            "n_stations": 1,
+            "photo_layout": "quick",
+            "photo_gsd_m": photo_gsd_m,
+        }
+    )
+    room = SimulateRoom().run(SimulateRoom.In(), params, context(seed))
+    cloud, truth = scanned_apart(room.cloud, room.truth)
+    return replace(room, cloud=cloud, truth=truth)
+
+
+def scanned_apart(cloud: PointCloud, truth: Truth) -> tuple[PointCloud, Truth]:
+    """The cloud without what the panorama saw of the main wall: one density there."""
+    main = truth.planes.names.index("main wall")
+    off_m = cloud.points_world() @ truth.planes.normal[main] - truth.planes.offset[main]
+    is_kept = np.abs(off_m) > _BEFORE_WALL_M
+    if cloud.scan is not None:
+        is_kept |= cloud.scan != 0
+    per_point = ("x", "y", "z", "intensity", "rgb", "scan", "row", "column")
+    kept = {name: np.asarray(getattr(cloud, name))[is_kept] for name in per_point}
+    return replace(cloud, **kept), replace(truth, labels=truth.labels[is_kept])
+
+
+def main_wall_found(cloud: PointCloud, truth: Truth) -> tuple[Planes, int]:
+    """Planes of a cloud and which is the main wall; it faces the room, which LAZ does not know."""
     planes = Hough2d().run(Hough2d.In(cloud=cloud), Hough2d.Params(), context(1)).planes
-    inside = truth.stations.mean(axis=0) @ planes.normal[0] - planes.offset[0]
-    return planes if inside > 0.0 else planes.turned(0)
+    main = truth.planes.names.index("main wall")
+    middle = truth.planes.corners[main].mean(axis=0)
+    off_m = np.abs(planes.normal @ middle - planes.offset)
+    along = np.abs(planes.normal @ truth.planes.normal[main])
+    found = int(np.argmin(np.where(along > _ALONG_COSINE, off_m, np.inf)))
+    inside = truth.stations.mean(axis=0) @ planes.normal[found] - planes.offset[found]
+    return planes if inside > 0.0 else planes.turned(found), found
 
 
 def displacements_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
@@ -141,24 +181,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--rooms", type=int, default=2)
     parser.add_argument("--first", type=int, default=501, help="seed of the first room")
+    parser.add_argument("--panorama-step-m", type=float, default=0.03, help="of the other walls")
+    parser.add_argument("--photo-gsd-m", type=float, default=0.0025, help="pixel on the wall")
     parser.add_argument("--cells-m", type=float, nargs="+", default=CELLS_M)
     parser.add_argument("--formats", nargs="+", default=FORMATS, choices=FORMATS)
     chosen = parser.parse_args()
     scores: dict[tuple[str, float], Score] = {}
     titles = "photos  ties    u       v     wall[mm]  stated  ratio"
     for seed in range(chosen.first, chosen.first + chosen.rooms):
-        params = SimulateRoom.Params.model_validate(
-            {
-                "scan_step_m": _STEP_M,
-                "panorama_step_m": 0.03,
-                "n_stations": 1,
-                "photo_layout": "quick",
-                "photo_gsd_m": 0.0025,
-            }
-        )
-        room = SimulateRoom().run(SimulateRoom.In(), params, context(seed))
+        room = scanned_room(seed, chosen.panorama_step_m, chosen.photo_gsd_m)
         views = SceneCameras(room.truth.scene, cores=2)
-        step = measured_step(room.truth, room.cloud, 0)
+        nth = room.truth.planes.names.index("main wall")
+        step = measured_step(room.truth, room.cloud, nth)
         if step is not None:
             told = f"{1e3 * step.median_m:.1f} mm apart (p90 {1e3 * step.p90_m:.1f})"
             print(f"{seed} {len(room.cloud) / 1e6:.1f} M points, {told}", flush=True)
@@ -170,9 +204,9 @@ def main() -> None:
                 cloud = (
                     ReadScan().run(ReadScan.In(files=files), ReadScan.Params(), context(1)).cloud
                 )
-                planes = planes_seen_from(cloud, room.truth)
+                planes, wall = main_wall_found(cloud, room.truth)
                 for gsd_m in chosen.cells_m:
-                    rule = RasterGrid.Params(gsd_m=gsd_m, buffer_m=0.3, ranks=(0,))
+                    rule = RasterGrid.Params(gsd_m=gsd_m, buffer_m=0.3, ranks=(wall,))
                     rastered = RasterGrid.In(cloud=cloud, planes=planes)
                     walls = RasterGrid().run(rastered, rule, context(1)).walls
                     score = scores.setdefault((name, gsd_m), Score())

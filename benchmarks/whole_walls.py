@@ -38,6 +38,8 @@ _GSD_M = 0.004
 # Drawn relief stands out by 0.3 m and goes in by 0.45 m at most; furniture stands farther out.
 _FRONT_M, _BEHIND_M = 0.5, 0.6
 _ALONG_COSINE = 0.99
+# Floors and ceilings are rastered too, but no true wall is known of them.
+_UPRIGHT_SINE = 0.5
 # A surface counts from this share of the wall on as what a buffer should hold.
 _RELIEF_LEAST = 1e-3
 
@@ -159,7 +161,8 @@ def main() -> None:
         planes = Hough2d().run(Hough2d.In(cloud=room.cloud), Hough2d.Params(), context(1)).planes
         rule = RasterGrid.Params(
             gsd_m=_GSD_M,
-            n_walls_max=1 if chosen.layout == "quick" else 4,
+            # The four walls and, larger at times, floor and ceiling.
+            n_walls_max=1 if chosen.layout == "quick" else 6,
             rectangle=chosen.rectangle,
         )
         walls = (
@@ -175,7 +178,10 @@ def main() -> None:
         joined = MosaicSeams().run(
             MosaicSeams.In(layers=layers, walls=walls), MosaicSeams.Params(gains="none"), context(1)
         )
-        shares += [row(seed, room.truth, walls, image) for image in joined.orthoimages.images]
+        for image in joined.orthoimages.images:
+            normal = walls.walls[image.wall].frame.normal_world
+            if abs(float(normal @ room.truth.planes.up)) < _UPRIGHT_SINE:
+                shares.append(row(seed, room.truth, walls, image))
     scanned, painted = np.array(shares).T
     print(
         f"\n{len(painted)} walls: scanned {scanned.mean():.3f}, least {scanned.min():.3f}; "

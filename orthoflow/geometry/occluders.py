@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,17 @@ _VOXEL_CELLS: Final = 6.0
 # No scanner measures nearer to itself; what it reports from there are errors, and many in little
 # space.
 _BLIND_M: Final = 0.3
+# Where fewer of a station's rays end than one in this many, nothing stands: the others went
+# through. A rod of a millimetre stops more of those that meet a cube of 0.2 m.
+_PASSING_RAYS: Final = 200
+_N_ELEVATIONS: Final = 90
+# Half of what a surface that is scanned as finely as the wall has in 3 x 3 x 3 voxels.
+_FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
+# The corner of a surface holds a quarter of that, and its edge half.
+_CORNER_SHARE: Final = 0.25
+# Of the pairs of points there: nearer to 1 in 27 than to 1 in 9.
+_SPREAD_SHARE: Final = 0.07
+_SAMPLED_MOST: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +65,7 @@ class Occluders:
         origin: (3,) float64 metres.
         points: float32 offsets from the origin.
         around: how many points lie about each.
-        n_least: points with fewer about them are outliers.
+        n_least: points with fewer about them, in 3 x 3 x 3 voxels, are outliers.
         threads: how many threads look at once; it does not show in the result.
     """
 
@@ -80,9 +92,11 @@ def occluders_before(
         cloud: the whole cloud.
         slabs: of the walls; nothing beyond the box about them and the cameras can hide them.
         cameras: all of them.
-        spacing_m: between neighbouring points of a wall, about.
+        spacing_m: between neighbouring points of a wall, about; not of cells that are coarser, as
+            the larger the space that is looked at, the more stray points of a dense scan it holds.
         stations_world: (s, 3) metres, where scanners stood, if that is known.
-        n_least: see `Occluders`.
+        n_least: points with fewer about them are outliers, in a box that is small enough for its
+            voxels to hold as few points as they should.
         threads: see `Occluders`.
     """
     places = [camera.centre_world for camera in cameras]
@@ -120,11 +134,21 @@ def occluders_in(
     counts = np.zeros((int(shape[0]), int(shape[1]), int(shape[2])), dtype=np.uint16)
     grid = VoxelGrid(low=box.low, side_m=float(side), counts=counts)
     count_in_voxels(points, grid)
-    _sum_neighbours(counts)
-    if stations_world is not None:
-        _forget_around(grid, stations_world - cloud.origin)
+    larger = float(side) / (_VOXEL_CELLS * box.spacing_m)
+    n_few = _FEW_POINTS * larger**2
+    if stations_world is None or not len(stations_world):
+        is_spread = _spread(counts, n_few)
+        _sum_neighbours(counts)
+        counts[is_spread] = 0
+    else:
+        _sum_neighbours(counts)
+        stations = np.unique(stations_world, axis=0) - cloud.origin
+        _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
+        _forget_around(grid, stations)
+    # What is as thin as a line has that many more points in larger voxels.
+    n_asked = math.ceil(n_least * larger)
     return Occluders(
-        origin=cloud.origin, points=points, around=grid, n_least=n_least, threads=threads
+        origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
     )
 
 
@@ -182,6 +206,65 @@ def _part(points: Offsets, piece: slice) -> Offsets:
     return Offsets(points.x[piece], points.y[piece], points.z[piece])
 
 
+def _spread(counts: NDArray[np.uint16], n_few: float) -> tuple[NDArray[np.intp], ...]:
+    """Voxels about which few points are spread over all 27, as no surface spreads them.
+
+    Of all pairs of points, one in 27 lies in one voxel where they stray, one in 9 on a surface and
+    one in 3 along a line.
+    """
+    n, squares = counts.astype(np.uint32), counts.astype(np.uint32) ** 2
+    for each in (n, squares):
+        _sum_neighbours(each)
+    places = np.nonzero((n > 1) & (n < n_few))
+    around = n[places].astype(np.float64)
+    return tuple(
+        axis[squares[places] - around < _SPREAD_SHARE * around * (around - 1.0)] for axis in places
+    )
+
+
+def _forget_passed(
+    grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
+) -> None:
+    """Take no surface to be where nearly all rays of the stations that lead there went on.
+
+    Stray points of a dense scan lie closely enough to look like a surface, near its station most of
+    all; but of the rays about each of them hardly one ended there. A cloud that was thinned has as
+    few points near its stations, but not fewer than a surface has.
+    """
+    every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
+    places = np.column_stack([axis[every] for axis in points]).astype(np.float64)
+    weight = len(points.x) / max(1, len(places))
+    filled = np.flatnonzero(grid.counts)
+    middles = grid.low + grid.side_m * (
+        np.array(np.unravel_index(filled, grid.counts.shape)).T + 0.5
+    )
+    # Each station is taken to have all points, so that their mean is what all together have.
+    rays = np.zeros(len(filled))
+    for station in stations:
+        per_sr = weight * _points_per_sr(places - station) / len(stations)
+        ways = middles - station
+        squares = np.maximum((ways**2).sum(axis=1), grid.side_m**2)
+        rays += per_sr[_directions(ways)] * (3.0 * grid.side_m) ** 2 / squares
+    counts = grid.counts.reshape(-1)
+    counts[filled[counts[filled] < np.minimum(rays / _PASSING_RAYS, n_few)]] = 0
+
+
+def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How many points lie in a direction: (rows, columns) of elevation and azimuth."""
+    counts = np.zeros((_N_ELEVATIONS, 2 * _N_ELEVATIONS))
+    np.add.at(counts, _directions(ways), 1.0)
+    edges = np.sin(np.linspace(-0.5 * math.pi, 0.5 * math.pi, _N_ELEVATIONS + 1))
+    return counts / (np.diff(edges)[:, None] * math.pi / _N_ELEVATIONS)
+
+
+def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row of elevation and column of azimuth of each way (n, 3)."""
+    elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1])) / math.pi + 0.5
+    azimuth = np.arctan2(ways[:, 1], ways[:, 0]) / math.pi + 1.0
+    rows, columns = ((_N_ELEVATIONS * each).astype(np.intp) for each in (elevation, azimuth))
+    return np.minimum(rows, _N_ELEVATIONS - 1), np.minimum(columns, 2 * _N_ELEVATIONS - 1)
+
+
 def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
     """Take no surface to be where a scanner is blind."""
     for station in stations:
@@ -195,7 +278,7 @@ def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
         grid.counts[part][squares < reach**2] = 0
 
 
-def _sum_neighbours(counts: NDArray[np.uint16]) -> None:
+def _sum_neighbours(counts: NDArray[np.uint16] | NDArray[np.uint32]) -> None:
     """Replace each count by the sum over 3 x 3 x 3 voxels, in place."""
     for axis in range(3):
         view = np.moveaxis(counts, axis, 0)

@@ -157,6 +157,10 @@ class Walls(Product):
 
     def spacing_m(self) -> float:
         """The coarser of the finest raster's cells and the points' spacing on it, about."""
+        return max(min(wall.frame.gsd_m for wall in self.walls), self.points_apart_m())
+
+    def points_apart_m(self) -> float:
+        """The points' spacing on the finest raster, about, however coarse its cells are."""
         wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
         n_known = n_points = 0
         for rows in row_bands(wall.depth_m.shape):
@@ -164,7 +168,7 @@ class Walls(Product):
             n_known += int(np.count_nonzero(known))
             n_points += int(wall.count[rows].sum(where=known, dtype=np.int64))
         density = n_points / n_known if n_known else 1.0
-        return wall.frame.gsd_m / math.sqrt(min(1.0, max(density, 0.1)))
+        return wall.frame.gsd_m / math.sqrt(max(density, 0.1))
 
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:

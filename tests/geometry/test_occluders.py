@@ -26,6 +26,8 @@ ORIGIN = np.array([10.0, -4.0, 2.0])
 LOW, HIGH, SPACING_M = np.array([-0.6, -0.4, 1.8]), np.array([0.7, 0.5, 3.1]), 0.03
 # Six cells of a spacing each.
 SIDE_M = 6.0 * SPACING_M
+# So far off that hardly one of its rays meets a voxel.
+FAR = ORIGIN + np.array([[0.0, -1000.0, 0.0]])
 
 
 def points_m(seed: int) -> NDArray[np.float64]:
@@ -66,7 +68,7 @@ def camera() -> ViewingCamera:
 @pytest.mark.parametrize("seed", range(2))
 def test_points_are_counted_with_those_in_the_voxels_around(seed: int) -> None:
     points = points_m(seed)
-    found = occluders_in(cloud_of(points, origin=tuple(ORIGIN)), box(), None, n_least=4, threads=2)
+    found = occluders_in(cloud_of(points, origin=tuple(ORIGIN)), box(), FAR, n_least=4, threads=2)
     np.testing.assert_array_equal(found.around.counts, expected_around(points))
     assert found.around.side_m == pytest.approx(SIDE_M)
     np.testing.assert_array_equal(found.around.low, LOW)
@@ -89,6 +91,80 @@ def test_nothing_is_where_a_scanner_is_blind() -> None:
         expected[np.linalg.norm(middles - place, axis=-1) < 0.3] = 0
     assert (expected == 0).sum() > 10
     np.testing.assert_array_equal(found.around.counts, expected)
+
+
+def scan_of(places: NDArray[np.float64], station: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A wall (x = 3 m) and a rod of 6 mm before it, scanned; one ray in fifty is stray."""
+    ways = places - station
+    rng = np.random.default_rng(5)
+    along = np.where(rng.uniform(size=len(places)) < 0.02, rng.uniform(0.05, 0.9, len(places)), 1.0)
+    before = station + ways * (1.5 / ways[:, :1])
+    is_rod = np.abs(before[:, 1] - 0.5) < 0.003
+    return np.where(is_rod[:, None], before, station + ways * along[:, None])
+
+
+def test_stray_points_of_a_dense_scan_hide_nothing_and_a_rod_does() -> None:
+    side = np.arange(-1.0, 1.0, 0.004)
+    wall = np.stack(np.meshgrid([3.0], side, side), axis=-1).reshape(-1, 3)
+    station = np.array([0.0, 0.1, 0.2])
+    points = scan_of(wall, station)
+    before = Box(low=np.array([0.0, -1.0, -1.0]), high=np.array([3.1, 1.0, 1.0]), spacing_m=0.008)
+
+    def is_kept(stations: NDArray[np.float64] | None) -> NDArray[np.bool_]:
+        found = occluders_in(cloud_of(points), before, stations, n_least=6, threads=1)
+        places = np.floor((points - before.low) / found.around.side_m).astype(int)
+        return found.around.counts[tuple(places.T)] >= found.n_least
+
+    is_rod = (points[:, 0] == 1.5) & (np.abs(points[:, 1] - 0.5) < 0.003)
+    is_wall = points[:, 0] == 3.0
+    # What stands beside rod or wall counts with it.
+    is_stray = (points[:, 0] < 1.2) | ((points[:, 0] > 1.8) & (points[:, 0] < 2.7))
+    assert is_rod.sum() > 300
+    assert is_stray.sum() > 2_000
+    assert is_kept(FAR)[is_stray].mean() > 0.5
+    twice = np.array([station, station])
+    kept = is_kept(twice)
+    # Close to the station they are as many as a thinned surface would have there.
+    assert kept[is_stray].mean() < 0.15
+    assert kept[is_rod].all()
+    assert kept[is_wall].all()
+
+
+def test_a_thinned_surface_close_to_its_station_stays() -> None:
+    rng = np.random.default_rng(4)
+    wall = np.column_stack([np.full(400_000, 9.0), rng.uniform(-4.0, 4.0, (400_000, 2))])
+    near = np.column_stack([np.full(500, 0.5), rng.uniform(-0.14, 0.14, (500, 2))])
+    space = Box(low=np.array([0.0, -1.0, -1.0]), high=np.full(3, 1.0), spacing_m=0.0126)
+    station = np.zeros((1, 3))
+    found = occluders_in(cloud_of(np.vstack([wall, near])), space, station, n_least=6, threads=1)
+    places = np.floor((near - space.low) / found.around.side_m).astype(int)
+    assert (found.around.counts[tuple(places.T)] > 0).all()
+
+
+def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> None:
+    rng = np.random.default_rng(3)
+    space = Box(low=np.zeros(3), high=np.full(3, 3.0), spacing_m=SPACING_M)
+    stray = rng.uniform(0.0, 3.0, (12_000, 3))
+    # Along a line and on a surface, both sparser than anybody scans a wall.
+    line = np.array([0.4, 0.5, 0.6]) + np.linspace(0.0, 2.0, 120)[:, None] * [0.5, 0.6, 0.3]
+    face = np.column_stack([rng.uniform(0.0, 3.0, (3_000, 2)), np.full(3_000, 1.3)])
+
+    def is_kept(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        found = occluders_in(cloud_of(points), space, None, n_least=6, threads=1)
+        places = np.floor(points / found.around.side_m).astype(int)
+        return found.around.counts[tuple(places.T)] >= found.n_least
+
+    # Fewer of the voxels about an edge of the box lie in it, and share more pairs.
+    is_inside = ((stray > 0.2) & (stray < 2.8)).all(axis=1)
+    assert is_kept(stray)[is_inside].mean() < 0.05
+    assert is_kept(line).all()
+    assert is_kept(face).mean() > 0.95
+
+
+def test_larger_voxels_hold_as_many_more_points_of_a_line() -> None:
+    wide = Box(low=np.zeros(3), high=np.array([200.0, 300.0, 40.0]), spacing_m=0.005)
+    found = occluders_in(cloud_of(np.zeros((3, 3))), wide, None, n_least=4, threads=1)
+    assert found.n_least == math.ceil(4 * found.around.side_m / (6.0 * 0.005)) > 50
 
 
 def test_counts_end_before_their_sums_overflow() -> None:
@@ -118,7 +194,7 @@ def test_a_photo_sees_the_nearest_of_squares_as_large_as_the_gaps(scale: int) ->
         width=small.width * scale, height=small.height * scale,
     )  # fmt: skip
     n_least = 40
-    occluders = occluders_in(cloud, box(), None, n_least=n_least, threads=3)
+    occluders = occluders_in(cloud, box(), FAR, n_least=n_least, threads=3)
     found = depth_buffer(occluders, seen_by)
     # No side of more than 2048 pixels.
     reduction = 2 if scale == 30 else 1

@@ -78,22 +78,23 @@ def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("counts", "spacing_m"),
+    ("counts", "apart_m"),
     [
         # As many points as cells, or more, of cells of half a metre.
         ([[1, 1, 1, 1], [1, 1, 1, 1]], 0.5),
-        ([[9, 9, 9, 9], [1, 1, 1, 1]], 0.5),
+        ([[7, 7, 7, 7], [1, 1, 1, 1]], 0.25),
         # One in four, half of the distance each way; fewer than one in ten say nothing more.
         ([[1, 0, 0, 0], [1, 0, 0, 0]], 1.0),
         ([[0, 0, 0, 0], [0, 0, 0, 0]], 0.5 / np.sqrt(0.1)),
     ],
 )
 def test_points_lie_as_far_apart_as_their_number_says(
-    counts: list[list[int]], spacing_m: float
+    counts: list[list[int]], apart_m: float
 ) -> None:
     wall = replace(wall_at(0.0, "a"), count=np.array(counts, dtype=np.uint32))
     coarse = samples.wall(samples.facing_east(0.75, 4, 2, (3.0, 0.0, 1.0)), name="coarse")
-    assert walls(coarse, wall).spacing_m() == pytest.approx(spacing_m)
+    assert walls(coarse, wall).points_apart_m() == pytest.approx(apart_m)
+    assert walls(coarse, wall).spacing_m() == pytest.approx(max(0.5, apart_m))
 
 
 def test_points_of_cells_that_are_not_known_do_not_count() -> None:

@@ -32,7 +32,7 @@ class ColourPhotos(Method):
     """
 
     id: ClassVar[str] = "colour.photos"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism = "loose"
     metrics = (
         "coloured_share",

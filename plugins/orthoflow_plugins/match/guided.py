@@ -53,7 +53,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 10
+    result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -326,7 +326,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         cloud,
         slabs,
         [camera.viewing() for camera in cameras],
-        spacing_m=walls.spacing_m(),
+        spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
         n_least=_POINTS_LEAST,
         # Photos share the processors already.

@@ -68,7 +68,7 @@ class DsmBackward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_layers",

@@ -61,7 +61,7 @@ class DsmForward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_layers",

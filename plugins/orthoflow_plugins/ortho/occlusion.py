@@ -76,7 +76,7 @@ def find_occluders(
         cloud,
         [walls.slab(index) for index in range(len(walls.walls))],
         cameras,
-        spacing_m=walls.spacing_m(),
+        spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
         n_least=n_least,
         threads=threads,

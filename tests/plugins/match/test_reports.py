@@ -284,7 +284,7 @@ def test_what_stands_free_is_told_from_the_cloud_between_all_photos_and_walls(
     monkeypatch.setattr("orthoflow.geometry.occluders.occluders_before", occluders)
     slabs = [SimpleNamespace(front_m=0.1), SimpleNamespace(front_m=0.3)]
     walls = SimpleNamespace(
-        walls=["west", "east"], slab=lambda index: slabs[index], spacing_m=lambda: 0.004
+        walls=["west", "east"], slab=lambda index: slabs[index], points_apart_m=lambda: 0.004
     )
     cloud = SimpleNamespace(stations="stations")
     cameras: Any = [SimpleNamespace(viewing=lambda: "viewer")] * 3
