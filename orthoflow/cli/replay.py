@@ -8,10 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand, current_session
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import (
@@ -21,15 +22,18 @@ from orthoflow.cli.options import (
     json_option,
     output_option,
 )
-from orthoflow.cli.tables import echo, echo_distances, echo_json
+from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
 
 if TYPE_CHECKING:
     from orthoflow.engine.scheduling import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.records.distances import ProductDistance
+    from orthoflow.records.replay_metrics import ReplayedMetric
     from orthoflow.records.replaying import Replay
     from orthoflow.records.runs import Run
+
+_METRICS_MOST: Final = 5
 
 
 @click.command(cls=RecordCommand)
@@ -59,8 +63,9 @@ def replay(
     Takes workflow, parameters and seeds as recorded. The inputs come from the record, if they are
     in it, or are looked for by content where they were, beside the run, or where --input says.
     What is missing or not as it was is named before anything runs. Says of every product whether
-    it has the same bits, is equal within the tolerance of its type, or differs, and ends with 3
-    when one differs.
+    it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
+    differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
+    whose products are identical: by more than a millionth, or a count at all.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions
@@ -127,6 +132,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare and say how far the products lie apart."""
+        from orthoflow.records.replay_metrics import replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
 
         current_session().resume_hint = (
@@ -137,19 +143,23 @@ class _Call:
             echo(f"note: {note}", err=self.as_json)
         made = self._make()
         distances = self._distances(made)
-        differs = any(item.verdict == "different" for item in distances)
+        metrics = replayed_metrics(self.original, made, distances)
+        verdicts = [*(item.verdict for item in distances), *(item.verdict for item in metrics)]
+        differs = "different" in verdicts
         content = {
             "record": str(self.original.path),
             "replay": str(made.path),
             "ok": not differs,
             "notes": list(self.replay.notes),
             "products": [dataclasses.asdict(item) for item in distances],
+            "metrics": [dataclasses.asdict(item) for item in metrics],
         }
         if self.as_json:
             echo_json(content)
         else:
             echo()
             echo_distances(distances)
+            echo(*_metric_lines(metrics))
             echo(f"record of the replay: {made.path}", f"report: {self.folder / REPORT_FILE}")
         if differs:
             say_error(f"error: the replay of {self.original.path} differs, see above")
@@ -193,3 +203,29 @@ class _Call:
             [address for address in self.original.cells if address in made.cells],
             discover_catalog(),
         )
+
+
+def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
+    """Say how many metrics differ and which: what nothing excuses first, on a line of its own."""
+    what = "metrics, without times"
+    kinds = (
+        ("different", "differ though the products of their steps are identical"),
+        ("excused", "differ by rounding, as products do, or are not in the record"),
+    )
+    lines = []
+    for verdict, said in kinds:
+        if found := [_metric_text(item) for item in metrics if item.verdict == verdict]:
+            some = first_few(found, most=_METRICS_MOST)
+            lines.append(f"{what}: {len(found)} of {len(metrics)} {said}: {some}")
+    return lines or [f"{what}: {len(metrics)} same"]
+
+
+def _metric_text(item: ReplayedMetric) -> str:
+    sides = (item.recorded, item.replayed)
+    texts = ["-" if side is None else number(side) for side in sides]
+    if texts[0] == texts[1]:
+        texts = [repr(side) for side in sides]
+    if item.recorded_unit != item.replayed_unit:
+        units = (item.recorded_unit, item.replayed_unit)
+        texts = [f"{text} {unit}".rstrip() for text, unit in zip(texts, units, strict=True)]
+    return f"{item.cell}.{item.metric} {texts[0]} -> {texts[1]}"

@@ -318,6 +318,20 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     )
 
 
+def compare_metrics(left: Run, right: Run) -> tuple[Pair[ComparedMetric], ...]:
+    """Lay the numbers side by side of cells that both runs have by name; no times, no memory."""
+    both = [address for address in left.cells if address in right.cells]
+    rows = (
+        row
+        for address in both
+        for row in _pairs(address, *(_metrics(run.cells[address]) for run in (left, right)))
+    )
+    # A number that one side only calls a time is none.
+    return tuple(
+        row for row in rows if not all(side.is_cost for side in (row.left, row.right) if side)
+    )
+
+
 def _pairs(
     cell: str, left: Mapping[str, Side], right: Mapping[str, Side]
 ) -> tuple[Pair[Side], ...]:

@@ -63,6 +63,10 @@ def test_a_replay_computes_everything_anew_with_the_same_bits(studio: Studio) ->
         ("survey", "identical"),
         ("paint", "identical"),
     ]
+    assert [(row["metric"], row["verdict"]) for row in said["metrics"]] == [
+        ("offset_m", "same"),
+        ("painted_share", "same"),
+    ]
     made = read_record(studio.folder / "again" / "run.h5")
     first = read_record(studio.folder / "first" / "run.h5")
     assert [cell.cached_from for cell in made.cells] == ["", ""]
@@ -206,3 +210,21 @@ def test_a_failed_cell_fails_again_and_the_rest_is_compared(
     said = studio.json("replay", "first", "-o", "again")
     assert [(row["cell"], row["verdict"]) for row in said["products"]] == [("survey", "identical")]
     assert read_record(tmp_path / "again" / "run.h5").cells[1].status == "failed"
+
+
+def test_a_metric_that_the_replay_does_not_confirm_is_named(studio: Studio) -> None:
+    def change(cell: RecordedCell) -> RecordedCell:
+        [metric] = cell.metrics
+        return dataclasses.replace(cell, metrics=(dataclasses.replace(metric, value=7.0),))
+
+    write_changed(studio, change)
+    assert studio("verify", "first").exit_code == 0
+    done = studio("replay", "first", "-o", "again")
+    assert done.exit_code == 3, done.output
+    assert done.stdout.splitlines()[-4:-2] == [
+        "2 products: 2 identical",
+        (
+            "metrics, without times: 1 of 2 differ though the products of their steps are "
+            "identical: survey.offset_m 7 -> 1.5"
+        ),
+    ]

@@ -1,0 +1,80 @@
+"""Numbers of a replay beside those of the record: what excuses a difference, and what does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from orthoflow_provenance.model import Metric
+
+from orthoflow.records.distances import ProductDistance, Verdict
+from orthoflow.records.replay_metrics import ReplayedMetric, replayed_metrics
+from orthoflow.records.runs import Run
+from tests.report_runs import cell, given, metrics, record
+
+PATH = Path("run.h5")
+IDENTICAL: tuple[Verdict, Verdict] = ("identical", "identical")
+
+
+def run_of(*numbers: Metric) -> Run:
+    """A step whose product the step `crack` takes, which has the numbers."""
+    wall = cell("wall", outputs={"walls": given("", "a", "walls")})
+    crack = cell(
+        "crack",
+        inputs={
+            "files": given("inputs.scan", "c", "files"),
+            "w": given("wall.walls", "a", "walls"),
+        },
+        outputs={"found": given("", "b", "crack")},
+        metrics=numbers,
+    )
+    return Run(path=PATH, record=record([wall, crack]))
+
+
+def told(recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict]) -> tuple[ReplayedMetric, ...]:
+    ports = (("wall", "walls"), ("crack", "found"))
+    return replayed_metrics(
+        recorded,
+        made,
+        [
+            ProductDistance(
+                cell=step, port=port, type_name="t", verdict=verdict, left="l", right="r"
+            )
+            for (step, port), verdict in zip(ports, verdicts, strict=True)
+        ],
+    )
+
+
+@pytest.mark.parametrize(
+    ("recorded", "replayed", "verdicts", "expected"),
+    [
+        (2.5, 2.5, IDENTICAL, "same"),
+        (2.5, 2.5 + 1e-9, IDENTICAL, "excused"),
+        (2.5, 2.5001, IDENTICAL, "different"),
+        # Counts are not rounded, however many.
+        (3e7, 3e7 + 1, IDENTICAL, "different"),
+        (2.5, 2.6, ("identical", "within tolerance"), "excused"),
+        (2.5, 2.6, ("within tolerance", "identical"), "excused"),
+        (2.5, 2.6, ("identical", "not measured"), "excused"),
+    ],
+)
+def test_only_rounding_and_other_products_excuse_a_number(
+    recorded: float, replayed: float, verdicts: tuple[Verdict, Verdict], expected: str
+) -> None:
+    [found] = told(run_of(*metrics(rms_mm=recorded)), run_of(*metrics(rms_mm=replayed)), verdicts)
+    assert (found.recorded, found.replayed, found.verdict) == (recorded, replayed, expected)
+
+
+def test_what_the_record_alone_states_is_not_confirmed() -> None:
+    both, one = run_of(*metrics(n=1.0, rms_mm=2.0)), run_of(*metrics(n=1.0))
+    assert [item.verdict for item in told(both, one, IDENTICAL)] == ["same", "different"]
+    assert [item.verdict for item in told(one, both, IDENTICAL)] == ["same", "excused"]
+
+
+def test_times_are_left_out_but_for_a_number_that_one_side_calls_a_time() -> None:
+    [number] = metrics(n=1.0)
+    hidden = replace(number, unit="s")
+    assert told(run_of(hidden), run_of(replace(hidden, value=2.0)), IDENTICAL) == ()
+    [found] = told(run_of(hidden), run_of(number), IDENTICAL)
+    assert (found.recorded_unit, found.replayed_unit, found.verdict) == ("s", "1", "different")
