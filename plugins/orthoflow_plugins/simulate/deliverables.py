@@ -150,20 +150,21 @@ class ScanStep:
 
 
 def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
-    """Report metrics and the true orthoimage of the wall with the most points."""
+    """Report metrics and the true orthoimage of the main wall, which need not have most points."""
+    main = truth.planes.names.index("main wall")
     ctx.metric("n_points", len(cloud), "1")
     ctx.metric("n_true_planes", len(truth.planes), "1")
-    ctx.metric("main_wall_points", int(truth.planes.n_points[0]), "1")
+    ctx.metric("main_wall_points", int(truth.planes.n_points[main]), "1")
     ctx.metric("outlier_share", truth.n_spoilt / len(cloud), "1")
-    step = measured_step(truth, cloud, 0)
+    step = measured_step(truth, cloud, main)
     if step is not None:
         ctx.metric("scan_step_median_mm", 1000.0 * step.median_m, "mm")
         ctx.metric("scan_step_p90_mm", 1000.0 * step.p90_m, "mm")
     ctx.figure(
         "main_wall",
-        partial(_picture, truth, ctx.cores),
-        f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm: what "
-        "the run should come to; blurred or doubled edges in its orthoimage are errors.",
+        partial(_picture, truth, main, ctx.cores),
+        f"True orthoimage of the main wall at {_PICTURE_GSD_M * 1000:.0f} mm: what the run should "
+        "come to; blurred or doubled edges in its orthoimage are errors.",
     )
 
 
@@ -221,8 +222,9 @@ def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return inner
 
 
-def _picture(truth: Truth, cores: int) -> bytes:
-    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)
+def _picture(truth: Truth, plane: int, cores: int) -> bytes:
+    corners, normal = truth.planes.corners[plane], truth.planes.normal[plane]
+    frame = frame_over(corners, normal, gsd_m=_PICTURE_GSD_M)
     image = render_frame(
         truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2, cores=cores
     )

@@ -200,6 +200,16 @@ def test_the_scan_step_on_the_main_wall_is_as_asked(tmp_path: Path) -> None:
     assert shown.std() > 30.0
 
 
+def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
+    params = SimulateRoom.Params(scan_step_m=0.1, panorama_step_m=0.05)
+    truth = SimulateRoom().run(SimulateRoom.In(), params, context).truth
+    main = truth.planes.names.index("main wall")
+    assert main > 0
+    metrics = {metric.name: metric.value for metric in context.metrics}
+    assert metrics["main_wall_points"] == truth.planes.n_points[main]
+
+
 def test_one_to_four_stations_give_two_scans_each(tmp_path: Path) -> None:
     for count in (1, 4):
         cloud = simulate(tmp_path / str(count), **COARSE, n_stations=count).cloud
