@@ -16,18 +16,29 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import is_dataclass
+from enum import IntEnum
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, get_args, get_origin, get_type_hints
 
 import click
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli.program import program
-from orthoflow.report.metric_words import metric_words
+from orthoflow.files.sidecars import (
+    LAYER_MASK_MEANINGS,
+    ORTHO_MASK_MEANINGS,
+    SURFACE_MASK_MEANINGS,
+)
+from orthoflow.products import LayerMask, OrthoMask, SurfaceMask
+from orthoflow.records import COSTS
+from orthoflow.report.metric_words import metric_words, spelt_out
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.sdk import Method, port_specs
+from orthoflow.sdk.units import unit_of
 from orthoflow.workflow.methods import describe_method
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -41,18 +52,13 @@ ELSEWHERE: Final = {
     "plugins/README.md": "plugins-first.md",
     "provenance/SPEC.md": "record.md",
 }
-_LINK: Final = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
-_UNITS: Final = {
-    "_mm": "mm",
-    "_m": "m",
-    "_deg": "deg",
-    "_s": "s",
-    "_px": "px",
-    "_mib": "MiB",
-    "_cells": "cells",
-    "_grey": "grey levels",
-    "_share": "share",
+_MASKS: Final[dict[type, dict[object, str]]] = {
+    SurfaceMask: {**SURFACE_MASK_MEANINGS},
+    LayerMask: {**LAYER_MASK_MEANINGS},
+    OrthoMask: {**ORTHO_MASK_MEANINGS},
 }
+_METRICS_HEAD: Final = "| metric | what | unit | good side | of |\n|---|---|---|---|---|"
+_LINK: Final = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
 def written(folder: Path) -> None:
@@ -135,20 +141,84 @@ def _paragraphs(method: type[Method]) -> str:
 def _products(catalog: Catalog) -> Iterator[str]:
     yield (
         "# Products and their files\n\nWhat steps hand to each other. A run folder has their files "
-        "in `products/<step>/`.\n"
+        "in `products/<step>/`. The fields are those of the objects that `run.product(step, name)` "
+        "gives in Python; what a product consists of stands below the first that does.\n"
     )
-    for name in sorted(catalog.products):
-        spec = catalog.products[name].spec
-        product = _loaded(spec.target)
-        yield f"## {name}\n\n{spec.summary}\n"
-        text = inspect.getdoc(product) or ""
-        about, _, attributes = text.partition("Attributes:")
-        yield f"{about.strip()}\n"
-        if attributes:
-            yield "| field | content |\n|---|---|"
-            for field in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", attributes, re.MULTILINE):
-                yield f"| `{field[0]}` | {_cell(' '.join(field[1].split()))} |"
-            yield ""
+    products = {name: _loaded(catalog.products[name].spec.target) for name in catalog.products}
+    places = {product: name for name, product in products.items()}
+    for name in sorted(products):
+        yield f"## {name}\n\n{catalog.products[name].spec.summary}\n"
+        yield from _fields(products[name], places)
+        below = [part for part in _parts(products[name]) if part not in places]
+        while below:
+            part = below.pop(0)
+            if part not in places:
+                places[part] = part.__name__.lower()
+                yield f"### {part.__name__}\n"
+                yield from _fields(part, places)
+                below = [inner for inner in _parts(part) if inner not in places] + below
+
+
+def _fields(described: type, places: dict[type, str]) -> Iterator[str]:
+    """What a docstring says of a product, a part of one or an enumeration, fields as a table."""
+    about, _, attributes = (inspect.getdoc(described) or "").partition("Attributes:")
+    yield f"{about.strip()}\n"
+    said = {
+        name: " ".join(text.split())
+        for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", attributes, re.MULTILINE)
+    }
+    if issubclass(described, IntEnum):
+        meanings = _MASKS.get(described, {})
+        texts = {
+            member: meanings.get(member, "").partition(": ")[2] or said.get(member.name, "")
+            for member in described
+        }
+        is_told = any(texts.values())
+        yield "| number | name |" + " meaning |" * is_told + "\n|---|---|" + "---|" * is_told
+        for member, text in texts.items():
+            yield f"| {member:d} | `{member.name}` |" + f" {_cell(text)} |" * is_told
+    elif said:
+        parts = _parts_of_fields(described)
+        yield "| field | content |\n|---|---|"
+        for name, text in said.items():
+            named = ", ".join(
+                f"[{part.__name__}](#{places.get(part, part.__name__.lower())})"
+                for part in parts.get(name, ())
+            )
+            yield f"| `{name}` | {_cell(text)}{f' ({named})' if named else ''} |"
+    yield ""
+
+
+def _parts(described: type) -> list[type]:
+    """What the fields of a product, or of a part of one, are made of, in their order."""
+    return list(dict.fromkeys(chain.from_iterable(_parts_of_fields(described).values())))
+
+
+def _parts_of_fields(described: type) -> dict[str, list[type]]:
+    """The classes of ours in the annotation of each field; enumerations by their docstring."""
+    if not is_dataclass(described):
+        return {}
+    module = sys.modules[described.__module__]
+    named = dict(re.findall(r"^ +(\w+): .*int\d+ `(\w+)`", described.__doc__ or "", re.MULTILINE))
+    found: dict[str, list[type]] = {}
+    for name, hint in get_type_hints(described).items():
+        inside = [one for one in _flat(hint) if is_dataclass(one) or _is_numbered(one)]
+        if name in named:
+            inside.append(getattr(module, named[name]))
+        found[name] = [one for one in inside if isinstance(one, type)]
+    return found
+
+
+def _is_numbered(hint: object) -> bool:
+    return isinstance(hint, type) and issubclass(hint, IntEnum)
+
+
+def _flat(hint: object) -> Iterator[object]:
+    if get_origin(hint) is ClassVar:
+        return
+    yield hint
+    for inner in get_args(hint):
+        yield from _flat(inner)
 
 
 def _loaded(target: str) -> type:
@@ -160,26 +230,40 @@ def _loaded(target: str) -> type:
 def _metrics(catalog: Catalog) -> Iterator[str]:
     yield (
         "# Metrics\n\nWhat methods measure. `all_` in front: over all walls; `wall_<k>_`: of that "
-        "wall; `floor_`: what the intensity alone shows of itself.\n"
+        "wall; `floor_`: what the intensity alone shows of itself. On a wall `x` and `u` run to "
+        "the right, `y` and `v` down, as seen by who stands before it; `u` and `v` of a photo are "
+        "its columns and rows.\n"
     )
-    said: dict[str, set[str]] = {}
+    said: dict[str, list[str]] = {}
     for name in sorted(catalog.methods):
         for metric in describe_method(catalog, name).method.metrics:
-            said.setdefault(metric, set()).add(name)
-    kinds = sorted({method.partition(".")[0] for methods in said.values() for method in methods})
-    for kind in kinds:
-        yield f"## {kind}\n\n| metric | what | unit | good side | of |\n|---|---|---|---|---|"
-        for metric, methods in said.items():
-            own = [method for method in sorted(methods) if method.partition(".")[0] == kind]
-            if own and not metric.startswith(
-                ("all_", "floor_", "wall_", "*_", "worst_", "surf_floor")
-            ):
-                unit = next((unit for end, unit in _UNITS.items() if metric.endswith(end)), "")
-                sense = sense_of(re.sub(r"\[(\w)\w*\]", r"\1", metric))
-                good = "" if sense is Sense.NEITHER else sense.value
-                plain = re.sub(r"\[(\w)\w*\]", r"\1", metric)
-                yield f"| `{metric}` | {metric_words(plain)} | {unit} | {good} | {', '.join(own)} |"
+            said.setdefault(metric, []).append(name)
+    for kind in sorted({name.partition(".")[0] for names in said.values() for name in names}):
+        yield f"## {kind}\n\n{_METRICS_HEAD}"
+        for metric, names in said.items():
+            own = [name for name in names if name.partition(".")[0] == kind]
+            if not metric.startswith(("all_", "floor_", "wall_", "*_", "worst_", "surf_floor")):
+                for one in spelt_out(metric) if own else ():
+                    yield from _metric(one, own)
         yield ""
+    yield f"## every step\n\n{_METRICS_HEAD}"
+    for metric in COSTS:
+        yield from _metric(metric, ["all"])
+    yield ""
+
+
+def _metric(name: str, methods: list[str]) -> Iterator[str]:
+    """Rows of a metric: one for each thing that methods say by its name."""
+    unit = "" if name.startswith("n_") or name.endswith("_sigma") else unit_of(name)
+    if unit == "1":
+        unit = "share" if "share" in name.split("_") else ""
+    sense = sense_of(name)
+    good = "" if sense is Sense.NEITHER else sense.value
+    by_words: dict[str, list[str]] = {}
+    for method in methods:
+        by_words.setdefault(metric_words(name, method), []).append(method)
+    for words, own in by_words.items():
+        yield f"| `{name}` | {words} | {unit} | {good} | {', '.join(own)} |"
 
 
 def _commands() -> Iterator[str]:

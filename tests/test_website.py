@@ -50,9 +50,18 @@ def test_the_reference_has_every_method_product_metric_and_command(
     pages = {path.stem: path.read_text() for path in (tmp_path / "reference").glob("*.md")}
     assert {name for name in catalog.methods if f"### {name}\n" not in pages["methods"]} == set()
     assert {name for name in catalog.products if f"## {name}\n" not in pages["products"]} == set()
-    assert (
-        "| `rmse_[uv]_mm` | error along u (right), RMS | mm | less is better |" in pages["metrics"]
-    )
+    assert {
+        "| `rmse_v_mm` | error along v (down), RMS | mm | less is better | inspect.truth |",
+        "| `rms_mm` | check points, RMS | mm | less is better | inspect.checkpoints |",
+        "| `scale_ppm` | scale, from 1 | ppm |  | register.similarity |",
+        "| `peak_rss_mib` | memory | MiB | less is better | all |",
+    } <= set(pages["metrics"].splitlines())
+    # What a product consists of, and what its numbers stand for.
+    products = pages["products"]
+    assert "(#camera)" in products
+    assert "small turn dr" in products.partition("### Camera\n")[2].partition("\n#")[0]
+    assert "| 2 | `REJECTED` | it contradicts" in products
+    assert "| 2 | `FILLED` | inpainted from" in products
     assert "## orthoflow plugins new\n" in pages["commands"]
     assert "_ORTHOFLOW_COMPLETE=bash_source" in pages["commands"]
     # Nothing leads out of the site but to the web.

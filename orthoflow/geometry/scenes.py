@@ -34,13 +34,20 @@ class TextureKind(IntEnum):
     anywhere, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
     (0..1), period in metres, seed, spectral gap. The gap is 0 when the laser sees the pattern that
     the eye sees, and 1 when it sees another one.
+
+    Attributes:
+        PLAIN: one colour with smooth stains.
+        FRESCO: stains, rosettes that all differ, painted lines.
+        TEXTILE: one motif, repeated exactly.
+        TILES: checker of stained tiles with joints.
+        WOOD: grain along b.
     """
 
-    PLAIN = 0  # one colour with smooth stains
-    FRESCO = 1  # stains, rosettes that all differ, painted lines
-    TEXTILE = 2  # one motif, repeated exactly
-    TILES = 3  # checker of stained tiles with joints
-    WOOD = 4  # grain along b
+    PLAIN = 0
+    FRESCO = 1
+    TEXTILE = 2
+    TILES = 3
+    WOOD = 4
 
 
 # Fields of a scene with a row per rectangle.

@@ -22,7 +22,13 @@ _CORNERS_LEAST: Final = 3
 
 
 class OutlineSource(IntEnum):
-    """What a side of an outline was found by."""
+    """What a side of an outline was found by.
+
+    Attributes:
+        DEPTH: the depths of the wall's raster.
+        IMAGE: a photo, between the depths.
+        UNSEEN: nothing: the wall beside it was not measured.
+    """
 
     DEPTH = 0
     IMAGE = 1
@@ -36,7 +42,8 @@ class Opening:
     Attributes:
         wall: number of the wall, the place of its plane in `planes.json`.
         wall_name: what the wall is called.
-        kind: see `OpeningKind`.
+        kind: `through` (the laser saw what lies behind the wall), `niche` (its back was measured)
+            or `no data` (nothing came back).
         outline_m: (n, 2) float64 X and Y as the wall's GeoTIFF has them (metres from its top-left
             corner, Y upwards, or east and north of a map), counter-clockwise, not closed.
         outline_world: (n, 3) float64 metres, the same corners on the wall's plane.

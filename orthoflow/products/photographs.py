@@ -144,7 +144,13 @@ class Calibration(Product):
 
 
 class TieRole(IntEnum):
-    """What a tie is used for."""
+    """What a tie is used for.
+
+    Attributes:
+        CONTROL: it holds the photo.
+        CHECK: withheld from the orientation, to check it.
+        REJECTED: it contradicts the others, or its photo is not oriented.
+    """
 
     CONTROL = 0
     CHECK = 1
@@ -206,8 +212,11 @@ class Ties(Product):
         wall: (n,) int32 index of the wall, -1 where nobody said.
         pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64.
-        sigma_m: (n,) float64.
+        sigma_px: (n,) float64 standard deviation of each of u and v, as whoever measured the tie
+            states it, before any adjustment.
+        sigma_m: (n,) float64 the same of each of x, y and z. An adjustment expects of u and v the
+            variance sigma_px² plus that of sigma_m, turned into pixels by the derivative of the
+            projection.
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed - computed, NaN before an orientation.
         walls: the walls that the column `wall` refers to; empty when the matcher does not say.
@@ -291,9 +300,14 @@ class Camera:
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
-        covariance: (6, 6) float64 of (rotation vector, translation), or None.
-        sigma0_px: standard deviation of unit weight, pixels.
-        sigma_wall_m: predicted error on the wall, metres.
+        covariance: (6, 6) float64 of the pose as estimated, or None: of a small turn dr applied
+            after the rotation R0, exp(dr) R0, a rotation vector in camera axes, radians; then of
+            `translation_camera_from_world`, metres.
+        sigma0_px: the stated error of a tie's pixel coordinate (median `Ties.sigma_px` of the
+            control) times the standard deviation of unit weight, which is 1 where the ties deviate
+            from the pose as `Ties` states.
+        sigma_wall_m: error on the wall that `covariance` (and that of an estimated lens) predicts,
+            one standard deviation, metres.
     """
 
     photo: str

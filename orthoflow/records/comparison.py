@@ -217,21 +217,35 @@ class RunComparison:
             "parameters": Difference.of(self.shared(self.parameters)),
             "metrics": Difference.of(self.measured),
         }
-        differing = [f"{one.n_different} of {one.n_shared} {name}" for name, one in counted.items()]
+        differing = [
+            f"{one.n_different} of {one.n_shared} {name}"
+            for name, one in counted.items()
+            if one.n_shared
+        ]
+        apart = [name for name, one in counted.items() if not one.n_shared]
         n_products = sum(item.verdict == "different" for item in self.products)
         n_unknown = sum(item.verdict == "not measured" for item in self.products)
         unknown = f" ({n_unknown} more not measured)" if n_unknown else ""
-        differing.append(f"{n_products}{unknown} of {len(self.products)} products")
-        runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
+        if self.products:
+            differing.append(f"{n_products}{unknown} of {len(self.products)} products")
+        else:
+            apart.append("products")
         n_alone = sum(not row.is_shared for row in self.cells)
-        alone = f"; {n_alone} steps in one of them only" if n_alone else ""
-        return f"<RunComparison of {runs}: {', '.join(differing)} differ{alone}>"
+        said = (
+            f"{', '.join(differing)} differ" if differing else "",
+            f"no {', '.join(apart)} in common" if apart else "",
+            f"{n_alone} steps in one of them only" if n_alone else "",
+        )
+        runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
+        return f"<RunComparison of {runs}: {'; '.join(filter(None, said))}>"
 
     def _repr_html_(self) -> str:
         table = self.metric_table()
         is_cost = np.array([row.either.is_cost for row in self.metrics], dtype=np.bool_)
         moved = table[~is_cost & table.left.notna() & table.right.notna() & (table.difference != 0)]
         said = f"<p>{escape(shown(repr(self)))}</p>{self._parameters_html()}"
+        if not Difference.of(self.measured).n_shared:
+            return f"{said}<p>They have no number in common, time and memory left aside.</p>"
         if moved.empty:
             return (
                 f"{said}<p>No number that both runs have differs, time and memory left aside.</p>"

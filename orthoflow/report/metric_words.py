@@ -84,12 +84,12 @@ WORDS: Final[Mapping[str, str]] = {
     "n_misoriented": "photos called ok that are not",
     "n_control": "ties that hold the photos",
     "n_check": "ties that only check",
-    "control_rmse_px_median": "ties that hold, RMS, median photo",
-    "control_rmse_px_worst": "ties that hold, RMS, worst photo",
-    "check_rmse_px_median": "ties that only check, RMS, median photo",
-    "check_rmse_px_worst": "ties that only check, RMS, worst photo",
-    "check_rmse_mm_median": "ties that only check, RMS per axis over a photo, median photo",
-    "check_rmse_mm_worst": "ties that only check, RMS per axis over a photo, worst photo",
+    "control_rmse_px_median": "ties that hold, RMS per axis, median photo",
+    "control_rmse_px_worst": "ties that hold, RMS per axis, worst photo",
+    "check_rmse_px_median": "ties that only check, RMS per axis, median photo",
+    "check_rmse_px_worst": "ties that only check, RMS per axis, worst photo",
+    "check_rmse_mm_median": "ties that only check, RMS per axis on the wall, median photo",
+    "check_rmse_mm_worst": "ties that only check, RMS per axis on the wall, worst photo",
     "sigma_wall_mm_median": "expected error of the orientation on the wall, median photo",
     "sigma_wall_mm_worst": "expected error of the orientation on the wall, worst photo",
     "sigma0": "sigma of unit weight",
@@ -113,9 +113,9 @@ WORDS: Final[Mapping[str, str]] = {
     "ties_per_photo_median": "ties per photo, median",
     "n_wall_key_points": "key points of the walls",
     "n_by_hand": "ties measured by hand",
-    "held_out_rmse_px_median": "ties left out of the fit, RMS, median photo",
-    "held_out_rmse_px_worst": "ties left out of the fit, RMS, worst photo",
-    "sigma_px_median": "stated sigma of a tie, median",
+    "held_out_rmse_px_median": "ties left out of the fit, RMS per axis, median photo",
+    "held_out_rmse_px_worst": "ties left out of the fit, RMS per axis, worst photo",
+    "sigma_px_median": "stated sigma of a tie per axis, median",
     "match_wrong_share": "matches that are wrong",
     "match_wrong_share_own_wall": "matches with the photo's own wall that are wrong",
     "n_ties_kept": "ties that the orientation kept",
@@ -182,7 +182,9 @@ WORDS: Final[Mapping[str, str]] = {
     "n_invalid": "points the scanner calls invalid",
     "n_not_finite": "points that are no numbers",
     "n_withheld": "points withheld",
-    "extent_[xyz]_m": "extent along the axis",
+    "extent_x_m": "extent along x of the world",
+    "extent_y_m": "extent along y of the world",
+    "extent_z_m": "extent along z of the world",
     "scan_step_mm": "step of the scan",
     "scan_step_median_mm": "step of the scan on the main wall, median",
     "scan_step_p90_mm": "step of the scan on the main wall, 90 % are below",
@@ -306,15 +308,21 @@ WORDS: Final[Mapping[str, str]] = {
 }
 
 
-# Kinds whose metrics are described above, and names that say another thing in one of them.
+# Kinds whose metrics are described above, and names that say another thing in one of them, or in
+# one method.
 _KINDS: Final = frozenset(
     (
         *("colour", "face", "inspect", "match", "mosaic", "orient", "ortho", "plane", "raster"),
         *("read", "register", "segment", "simulate"),
     )
 )
-_OF_KIND: Final[Mapping[tuple[str, str], str]] = {
+_OF_SOME: Final[Mapping[tuple[str, str], str]] = {
     ("inspect", "rms_mm"): "check points, RMS",
+    ("inspect.checkpoints", "n_points"): "check points",
+    ("mosaic", "occluded_share"): "cells hidden from every photo",
+    ("ortho.pointcloud-direct", "void_share"): "cells that got no colour",
+    ("read.checkpoints", "n_points"): "check points",
+    ("register", "n_pairs"): "pairs of points",
     ("register", "rms_mm"): "points to their places, RMS",
 }
 
@@ -337,15 +345,15 @@ def words_of(name: str, method: str, declared: str = "") -> str:
     kind = method.partition(".")[0]
     if kind not in _KINDS and name not in COSTS:
         return name
-    return metric_words(name, kind)
+    return metric_words(name, method)
 
 
-def metric_words(name: str, kind: str = "") -> str:
+def metric_words(name: str, method: str = "") -> str:
     """Say what a metric is; its own name where nobody described it.
 
     Args:
         name: of the metric.
-        kind: of the methods that report it; some say another thing by a name.
+        method: that reports it, or its kind; some say another thing by a name.
 
     >>> metric_words("rmse_u_mm")
     'error along u (right), RMS'
@@ -357,7 +365,8 @@ def metric_words(name: str, kind: str = "") -> str:
     'check points, RMS; target'
     """
     rest, behind = name, []
-    while (words := _OF_KIND.get((kind, rest)) or WORDS.get(rest) or _by_pattern(rest)) is None:
+    owners = (method, method.partition(".")[0])
+    while (words := _words_at(owners, rest)) is None:
         found = next(_prefixes(rest), None)
         if found is None:
             return name
@@ -379,7 +388,31 @@ def is_described(name: str) -> bool:
     >>> is_described("rmse_[uv]_mm"), is_described("wall_[0-9]*_completeness"), is_described("odd")
     (True, True, False)
     """
-    return all(metric_words(one) != one for one in _spelt_out(name))
+    return all(metric_words(one) != one for one in spelt_out(name))
+
+
+def spelt_out(pattern: str) -> list[str]:
+    """Give the names that a declared pattern stands for; a `*` is one word or number.
+
+    >>> spelt_out("rmse_[uv]_mm"), spelt_out("void_*_share")
+    (['rmse_u_mm', 'rmse_v_mm'], ['void_*_share'])
+    """
+    if pattern in WORDS:
+        return [pattern]
+    plain = pattern.replace("[0-9]*", "1").replace("*", "some")
+    found = re.search(r"\[([a-z0-9]+)\]", plain)
+    if found is None:
+        return [plain]
+    return [
+        name
+        for letter in found[1]
+        for name in spelt_out(plain[: found.start()] + letter + plain[found.end() :])
+    ]
+
+
+def _words_at(owners: tuple[str, ...], name: str) -> str | None:
+    own = (_OF_SOME[owner, name] for owner in owners if (owner, name) in _OF_SOME)
+    return next(own, None) or WORDS.get(name) or _by_pattern(name)
 
 
 def _by_pattern(name: str) -> str | None:
@@ -393,18 +426,3 @@ def _prefixes(name: str) -> Iterator[tuple[str, int]]:
         if found := pattern.match(name):
             what = found.groupdict().get("what", "").replace("_", " ")
             yield said.format(what=what), found.end()
-
-
-def _spelt_out(pattern: str) -> list[str]:
-    """The names that a declared pattern stands for; a `*` is one word or number."""
-    if pattern in WORDS:
-        return [pattern]
-    plain = pattern.replace("[0-9]*", "1").replace("*", "some")
-    found = re.search(r"\[([a-z0-9]+)\]", plain)
-    if found is None:
-        return [plain]
-    return [
-        name
-        for letter in found[1]
-        for name in _spelt_out(plain[: found.start()] + letter + plain[found.end() :])
-    ]

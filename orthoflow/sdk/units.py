@@ -7,7 +7,7 @@ from typing import Final
 
 # What a part of a name stands for; `1` for numbers that have no unit, in whatever sense.
 UNITS: Final[Mapping[str, str]] = {
-    **{unit: unit for unit in ("m", "mm", "m2", "px", "deg", "rad", "s", "cells")},
+    **{unit: unit for unit in ("m", "mm", "m2", "px", "deg", "rad", "s", "cells", "ppm")},
     "mib": "MiB",
     "grey": "grey levels",
     "sigma": "sigmas",

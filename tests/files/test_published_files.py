@@ -318,6 +318,9 @@ def test_cameras_and_ties_are_told_completely(tmp_path: Path) -> None:
     assert json_of(tmp_path / "cameras.json") == {
         "pixel_convention": "OpenCV: the centre of the first (top-left) pixel is at (0, 0)",
         "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
+        "errors": "one standard deviation; sigma_wall_mm: that the orientation is expected to "
+        "cause on the wall; sigma0_px: of a pixel coordinate of a control tie, as stated, "
+        "times the sigma of unit weight",
         "cameras": {
             "b.jpg": {"status": "ok", **inner, **pose, "sigma0_px": 0.5},
             "a.jpg": {"status": "ok", **inner, **pose, "sigma_wall_mm": 250.0},

@@ -111,8 +111,8 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     )
     comparison = compared(*rows, alone=("wall",))
     assert repr(comparison) == (
-        "<RunComparison of 'r1' and 'r2': 0 of 0 inputs, 1 of 2 parameters, 1 of 2 metrics, "
-        "1 (1 more not measured) of 3 products differ; 1 steps in one of them only>"
+        "<RunComparison of 'r1' and 'r2': 1 of 2 parameters, 1 of 2 metrics, 1 (1 more not "
+        "measured) of 3 products differ; no inputs in common; 1 steps in one of them only>"
     )
     assert comparison.measured == rows[:2]
     table = comparison.metric_table()
@@ -125,6 +125,12 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     still = compared(*rows[1:], alone=("wall",))._repr_html_()
     assert still.endswith(
         "<p>No number that both runs have differs, time and memory left aside.</p>"
+    )
+    # What shares nothing is not alike.
+    apart = compared(rows[3], alone=("wall",))
+    assert "; no inputs, parameters, metrics in common; " in repr(apart)
+    assert apart._repr_html_().endswith(
+        "<p>They have no number in common, time and memory left aside.</p>"
     )
 
 

@@ -224,7 +224,7 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     other = record([cell("scan", metrics=metrics(n_points=9.0))], run_id="r2")
     write_record(tmp_path / "b" / "run.h5", other, lambda _digest: None)
     comparison = first.compare(tmp_path / "b")
-    assert repr(comparison).startswith("<RunComparison of 'r1' and 'r2': 0 of 0 inputs, ")
+    assert repr(comparison).startswith("<RunComparison of 'r1' and 'r2': ")
     table = comparison.metric_table().set_index(["cell", "metric"])
     assert tuple(table.loc[("scan", "n_points")]) == (7.0, 9.0, 2.0, "1")
     html = comparison._repr_html_()
