@@ -13,6 +13,7 @@ from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
+from orthoflow.report.rankings import Sense, count_of_photos, sense_of
 from orthoflow.workflow.cells import variants_text
 
 
@@ -21,12 +22,13 @@ class Measured:
     """A metric of one combination.
 
     Attributes:
-        value: the mean over the repeats.
+        value: the mean over the repeats; of errors of both signs that of their sizes.
         spread: standard deviation over the repeats, NaN without repeats.
         n_repeats: how many values there are.
         n_all: how many runs of the step came to their end, with a value or without.
         unit: `1` for counts and shares.
         environment: id of the environment that it was computed in.
+        is_of_sizes: the repeats are errors of both signs.
     """
 
     value: float
@@ -35,6 +37,7 @@ class Measured:
     n_all: int
     unit: str
     environment: str
+    is_of_sizes: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +95,12 @@ class Combination:
         if not found:
             return None
         values = np.array([row.value for row, _ in found])
+        # Their mean would be small where the repeats lie far apart, on both sides of the truth.
+        is_of_sizes = (
+            bool(values.min() < 0.0 < values.max()) and sense_of(metric, found[0][0]) is Sense.LESS
+        )
+        if is_of_sizes:
+            values = np.abs(values)
         return Measured(
             value=float(values.mean()),
             spread=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
@@ -99,7 +108,14 @@ class Combination:
             n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
             unit=found[0][0].unit,
             environment=found[0][1],
+            is_of_sizes=is_of_sizes,
         )
+
+    def n_photos(self, step: str, metric: str) -> float:
+        """How many photos a metric of a step sums up, of repeats their mean; NaN: of none."""
+        name = count_of_photos(metric)
+        count = self.measured(step, name) if name else None
+        return math.nan if count is None else count.value
 
 
 def is_missing(cell: RecordedCell) -> bool:

@@ -332,7 +332,8 @@ def _row(
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
         missing=tuple(cell.address for cell in one.missing),
         values=tuple(
-            _value(one.measured(column.step, column.metric), one, origins) for column in columns
+            _value(one.measured(column.step, column.metric), one, origins, column)
+            for column in columns
         ),
         time=_time(time_s, cost_group) if has_cost else Value(),
         memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
@@ -387,7 +388,7 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     }
 
 
-def _value(measured: Measured | None, one: Combination, origins: Origins) -> Value:
+def _value(measured: Measured | None, one: Combination, origins: Origins, column: Column) -> Value:
     if measured is None:
         return Value()
     repeated = measured.n_repeats > 1
@@ -400,12 +401,15 @@ def _value(measured: Measured | None, one: Combination, origins: Origins) -> Val
         if measured.n_repeats < measured.n_all
         else ""
     )
+    sizes = "the sizes of errors of both signs in " if measured.is_of_sizes else ""
+    of_what = f"{sizes}{measured.n_repeats} repeats"
     return Value(
         text=f"{text}{of_all}",
         sort=measured.value,
         spread=measured.spread,
         group=origins.letters(one, measured.environment),
-        note=(f"mean and standard deviation of {measured.n_repeats} repeats" if repeated else ""),
+        note=f"mean and standard deviation of {of_what}" if repeated else "",
+        n_photos=one.n_photos(column.step, column.metric),
     )
 
 

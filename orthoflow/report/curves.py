@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from html import escape
 from typing import Final, NamedTuple
@@ -152,7 +152,20 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
                 lines |= {", ".join(filter(None, [method, name])): own[name] for name in own}
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
                 shown_lines = dict(list(lines.items())[:_MOST_LINES])
-                yield _curve(alike[0], column, shown_lines, n_datasets=len(parts))
+                curve = _curve(alike[0], column, shown_lines, n_datasets=len(parts))
+                yield replace(curve, caption=curve.caption + _unequal_photos(combinations, column))
+
+
+def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
+    """Say where combinations sum up unequal numbers of photos of a dataset; else empty."""
+    counts: dict[str, set[float]] = {}
+    for one in combinations:
+        n_photos = one.n_photos(column.step, column.metric)
+        if one.failure is None and n_photos > 0.0:
+            counts.setdefault(one.assignment.get(DATA, ""), set()).add(n_photos)
+    if all(len(found) < 2 for found in counts.values()):
+        return ""
+    return " Not all sum up as many photos: without difficult ones errors are smaller."
 
 
 class _Value(NamedTuple):
@@ -194,14 +207,14 @@ def _lines(
 
 def _point(x: float, found: Sequence[_Value], *, is_over: bool, is_error: bool) -> _Point:
     is_baseline = any(one.is_baseline for one in found)
+    numbers = np.array([one.value for one in found])
+    if is_error:
+        # Errors of both signs would make each other small, and the most negative look best.
+        numbers = np.abs(numbers)
     if len(found) == 1:
         # A bar over datasets is how far they lie apart, not how far the repeats of one do.
-        y, spread = found[0].value, math.nan if is_over else found[0].spread
+        y, spread = float(numbers[0]), math.nan if is_over else found[0].spread
     else:
-        numbers = np.array([one.value for one in found])
-        if is_error:
-            # Errors of both signs would make each other small.
-            numbers = np.abs(numbers)
         y, spread = float(np.median(numbers)), median_deviation(numbers)
     return _Point(x=x, y=y, spread=spread, n=len(found), is_baseline=is_baseline)
 
@@ -231,12 +244,12 @@ def _curve(
     has_spread = any(math.isfinite(point.spread) for points in lines.values() for point in points)
     if n_datasets > 1:
         said = _behind([point for points in lines.values() for point in points], n_datasets)
-        said += ", of signed errors of their sizes" if column.sense is Sense.LESS else ""
     elif has_spread:
         said = "means of the repeats, bars their standard deviation"
     else:
         said = "one value each: without repeats nobody knows how far they scatter"
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
+    good += ", of signed errors their sizes" if column.sense is Sense.LESS else ""
     if any(point.is_baseline for points in lines.values() for point in points):
         good += "; the filled point is the baseline"
     shape = (

@@ -75,6 +75,7 @@ class MethodOverDatasets:
         spread: 1.4826 times the median absolute deviation from it; NaN without any.
         paired: against the reference; None for itself, and where neither more nor less is better.
         n_unlike: datasets on which both have a value, of environments that are not alike.
+        n_other_photos: datasets on which both have a value, of unequal numbers of photos.
         own: of the variants those that the step hangs on.
     """
 
@@ -90,6 +91,7 @@ class MethodOverDatasets:
     paired: Paired | None
     n_unlike: int
     own: str
+    n_other_photos: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +141,7 @@ class MetricOverDatasets:
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     """Compare the combinations of a run over its datasets, metric by metric.
 
-    Values of different environments are never paired.
+    Values of different environments, or over unequal numbers of photos, are never paired.
 
     Args:
         parts: dataset -> its part of the run.
@@ -315,10 +317,15 @@ def _methods(
         is_compared = against != "" and sense is not Sense.NEITHER
         theirs = measured[against] if is_compared else {}
         both = {name: value for name, value in values.items() if name in theirs}
-        ours = {
+        like = {
             name: value
             for name, value in both.items()
             if alike.are_alike(value.environment, theirs[name].environment)
+        }
+        ours = {
+            name: value
+            for name, value in like.items()
+            if not _other_photos(by_name[name], found[against][name], column)
         }
         rows.append(
             MethodOverDatasets(
@@ -336,11 +343,18 @@ def _methods(
                 median=float(np.median(numbers)) if numbers.size else math.nan,
                 spread=median_deviation(numbers) if numbers.size else math.nan,
                 paired=_paired(ours, theirs, sense),
-                n_unlike=len(both) - len(ours),
+                n_unlike=len(both) - len(like),
+                n_other_photos=len(like) - len(ours),
                 own=_own(by_name.values(), step),
             )
         )
     return tuple(rows)
+
+
+def _other_photos(one: Combination, other: Combination, column: Column) -> bool:
+    """Whether one sums up more photos than the other, which makes its errors no worse ones."""
+    ours, theirs = (each.n_photos(column.step, column.metric) for each in (one, other))
+    return abs(ours - theirs) > 0.0
 
 
 def _own(ways: Iterable[Combination], step: str) -> str:

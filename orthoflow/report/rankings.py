@@ -25,6 +25,7 @@ class Mark(Enum):
     BEST = "best"
     NEAR = "among the best, no difference shown"
     WORST = "worst"
+    FEWER = "of fewer photos, not ranked"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +39,7 @@ class Value:
         mark: how it stands among the values of its group.
         group: letters of its environment and data, empty when the table has one of each.
         note: more in words, e.g. how many repeats.
+        n_photos: photos that it sums up, NaN where it sums up none.
     """
 
     text: str = ""
@@ -46,6 +48,7 @@ class Value:
     mark: Mark = Mark.NONE
     group: str = ""
     note: str = ""
+    n_photos: float = math.nan
 
 
 def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]:
@@ -55,7 +58,8 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     quadrature), or without repeats not above a hundredth of the best (repeats or not a tenth of a
     memory, three tenths of a time), is marked as near the best and never as worst; the best is then
     only among the best, too, as are several that are alike. The worst is marked where every other
-    value is as far from it.
+    value is as far from it. What sums up fewer photos than another of its group is not ranked: who
+    refuses the difficult ones has smaller errors of the rest.
 
     Args:
         values: a column.
@@ -71,6 +75,10 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
             for index, value in enumerate(values)
             if value.group == group and math.isfinite(value.sort)
         ]
+        most = max((values[i].n_photos for i in members if values[i].n_photos > 0), default=0.0)
+        for index in [index for index in members if values[index].n_photos < most]:
+            members.remove(index)
+            marked[index] = replace(values[index], mark=Mark.FEWER)
         scores = {index: badness(values[index].sort, sense) for index in members}
         if len(set(scores.values())) < 2:
             continue
@@ -181,6 +189,25 @@ def sense_of(metric: str, row: MetricRow | None = None) -> Sense:
         if fnmatchcase(metric, pattern):
             return sense
     return Sense.NEITHER
+
+
+# Numbers that sum up photos, and what counts these in the same step.
+_OVER_PHOTOS: Final = {
+    "check_rmse_*": "n_oriented",
+    "control_rmse_*": "n_oriented",
+    "sigma_wall_mm_*": "n_oriented",
+    "pose_*": "n_oriented",
+    "held_out_rmse_*": "n_photos_matched",
+}
+
+
+def count_of_photos(metric: str) -> str:
+    """Name the number that says how many photos a metric sums up; empty where it sums up none.
+
+    >>> count_of_photos("check_rmse_mm_worst"), count_of_photos("rmse_u_mm")
+    ('n_oriented', '')
+    """
+    return next((n for pattern, n in _OVER_PHOTOS.items() if fnmatchcase(metric, pattern)), "")
 
 
 def badness(value: float, sense: Sense) -> float:

@@ -125,6 +125,41 @@ def test_the_first_failure_is_named_and_later_repeats_are_counted() -> None:
     assert (fine.failure, fine.n_failed_repeats) == (None, 0)
 
 
+def test_errors_of_both_signs_are_averaged_by_their_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(metric: str, *values: float) -> Any:
+        def rows(of: Any) -> list[Any]:
+            value = values[of.repeat]
+            return [SimpleNamespace(metric=metric, value=value, unit="mm", words="")]
+
+        monkeypatch.setattr(combinations, "cell_metrics", rows)
+        cells = tuple(cell("plane", repeat=repeat) for repeat in range(len(values)))
+        one = Combination(run=run(), assignment={}, cells=cells, is_baseline=False)
+        return one.measured("plane", metric)
+
+    both = found("plane_offset_mm", -1.0, 3.0)
+    assert (both.value, both.spread, both.is_of_sizes) == (2.0, pytest.approx(2**0.5), True)
+    # Of one sign the mean has it, too; and what has no good side is no error.
+    below = found("plane_offset_mm", -1.0, -3.0)
+    assert (below.value, below.is_of_sizes) == (-2.0, False)
+    assert (found("omega_deg", -1.0, 3.0).value, found("plane_offset_mm", -1.0).value) == (
+        1.0,
+        -1.0,
+    )
+
+
+def test_the_photos_behind_a_summary_are_counted_in_its_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def rows(_: Any) -> list[Any]:
+        return [SimpleNamespace(metric="n_oriented", value=2.0, unit="1", words="")]
+
+    monkeypatch.setattr(combinations, "cell_metrics", rows)
+    one = Combination(run=run(), assignment={}, cells=(cell("orient"),), is_baseline=False)
+    assert one.n_photos("orient", "check_rmse_mm_worst") == 2.0
+    assert math.isnan(one.n_photos("orient", "rmse_u_mm"))
+    assert math.isnan(one.n_photos("match", "held_out_rmse_px_worst"))
+
+
 def test_a_metric_is_the_mean_of_its_repeats_and_their_spread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -160,7 +160,7 @@ def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path
     (curve,) = curves_over(parts)
     told = re.findall(r"<title>[0-9.]+: ([0-9.-]+)</title>", curve.svg)
     assert [float(value) for value in told] == [0.02, 0.05, 0.1]
-    assert "of signed errors of their sizes" in curve.caption
+    assert "of signed errors their sizes" in curve.caption
 
 
 def test_over_datasets_the_points_are_medians(tmp_path: Path) -> None:
@@ -385,6 +385,39 @@ def test_bars_of_errors_end_at_zero(tmp_path: Path) -> None:
     assert min(value for _, value in ticks(svg)) == 0.0
     lows = numbers_of(r"M[\d.]+ ([\d.]+)V", "".join(re.findall(r'class="bar[^>]*', svg)))
     assert lows == [(floor,)] * 3
+
+
+def test_a_negative_error_of_one_dataset_is_no_good_one(tmp_path: Path) -> None:
+    cells = [
+        cell(
+            f"plane@plane=tolerance_m-{value:g}",
+            params={"tolerance_m": value},
+            metrics=metrics(plane_offset_mm=-value),
+        )
+        for value in (0.02, 0.05)
+    ]
+    one, nothing = held(tmp_path, cells), held(tmp_path, [])
+    for (curve,) in (curves(one), curves_over({"hall": one, "yard": nothing})):
+        assert re.findall(r"<title>[0-9.]+: ([0-9.-]+)</title>", curve.svg) == ["0.02", "0.05"]
+
+
+@pytest.mark.parametrize(("fewest", "is_said"), [(2.0, True), (3.0, False)])
+def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
+    tmp_path: Path, fewest: float, is_said: bool
+) -> None:
+    cells = [
+        cell(
+            f"orient@orient=limit-{value:g}",
+            params={"limit": value},
+            metrics=metrics(n_oriented=n_photos, check_rmse_mm_worst=value),
+        )
+        for value, n_photos in ((1.0, fewest), (2.0, 3.0))
+    ]
+    said = {
+        curve.title: "Not all sum up as many photos" in curve.caption
+        for curve in curves(held(tmp_path, cells))
+    }
+    assert list(said.values()) == [False, is_said]
 
 
 @pytest.mark.parametrize(("is_error", "y"), [(True, 3.0), (False, -2.0)])

@@ -174,10 +174,17 @@ def column(sense: Sense) -> Column:
     return Column(step="check", metric="rms_mm", label="", sense=sense)
 
 
-def combination(value: float | None, failure: str | None = None, *, n_repeats: int = 3) -> Any:
+def combination(
+    value: float | None,
+    failure: str | None = None,
+    *,
+    n_repeats: int = 3,
+    n_photos: float = math.nan,
+) -> Any:
     return SimpleNamespace(
         failure=failure,
         cells=(),
+        n_photos=lambda *_: n_photos,
         measured=lambda *_: None if value is None else measured(value, n_repeats=n_repeats),
     )
 
@@ -216,6 +223,18 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     first, second = module._methods(found, ("x", "y", "z"), partners, column(Sense.NEITHER), ALIKE)
     assert first.median == 3.0
     assert second.paired is None
+
+
+def test_errors_of_unequal_numbers_of_photos_are_not_paired() -> None:
+    found = {
+        "orient=a": {"x": combination(2.0, n_photos=3), "y": combination(2.0, n_photos=3)},
+        "orient=b": {"x": combination(1.0, n_photos=2), "y": combination(3.0, n_photos=3)},
+    }
+    partners = {"orient=a": "", "orient=b": "orient=a"}
+    _, second = module._methods(found, ("x", "y"), partners, column(Sense.LESS), ALIKE)
+    assert second.paired is not None
+    assert (second.paired.n, second.paired.wins, second.paired.losses) == (1, 0, 1)
+    assert (second.n_other_photos, second.n_unlike) == (1, 0)
 
 
 def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None:

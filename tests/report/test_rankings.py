@@ -24,6 +24,21 @@ def test_the_smallest_is_best_and_the_largest_is_worst() -> None:
     assert marks(of(-3.0), of(1.0), of(-0.5)) == ["WORST", "NONE", "BEST"]
 
 
+def test_who_sums_up_fewer_photos_is_not_ranked() -> None:
+    def over(sort: float, n_photos: float, group: str = "") -> Value:
+        return Value(text="x", sort=sort, n_photos=n_photos, group=group)
+
+    assert marks(over(7.0, 2), over(9.0, 3), over(11.0, 3)) == ["FEWER", "BEST", "WORST"]
+    assert marks(over(7.0, 2), over(9.0, 3)) == ["FEWER", "NONE"]
+    # Of other data there are other photos; and who does not count them is ranked.
+    assert marks(over(7.0, 2, "a"), over(9.0, 3, "b"), over(8.0, 2, "a")) == [
+        "BEST",
+        "NONE",
+        "WORST",
+    ]
+    assert marks(of(7.0), over(9.0, 3)) == ["BEST", "WORST"]
+
+
 def test_a_ratio_is_best_at_one_and_as_bad_at_half_as_at_double() -> None:
     found = marks(of(0.5), of(1.1), of(2.0), of(0.0), sense=Sense.ONE)
     assert found == ["NONE", "BEST", "NONE", "WORST"]

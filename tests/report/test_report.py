@@ -17,7 +17,7 @@ from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
 from orthoflow.report.combinations import Measured, combinations_of
-from orthoflow.report.comparisons import comparison_columns, comparison_table
+from orthoflow.report.comparisons import Column, comparison_columns, comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
@@ -431,9 +431,15 @@ def test_a_value_says_what_it_is_the_mean_of(
         value=2.0, spread=0.5, n_repeats=n_repeats, n_all=n_all, unit="", environment="e1"
     )
     (one,) = combinations_of(told)
-    value = comparisons._value(measured, one, comparisons.Origins.of([told]))
+    column = Column(step="plane", metric="plane_offset_mm", label="", sense=Sense.LESS)
+    value = comparisons._value(measured, one, comparisons.Origins.of([told]), column)
     assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
-    assert comparisons._value(None, one, comparisons.Origins.of([told])) == Value()
+    assert comparisons._value(None, one, comparisons.Origins.of([told]), column) == Value()
+    sizes = comparisons._value(
+        replace(measured, is_of_sizes=True), one, comparisons.Origins.of([told]), column
+    )
+    signed = f" the sizes of errors of both signs in {n_repeats} repeats"
+    assert sizes.note == (f"mean and standard deviation of{signed}" if n_repeats > 1 else "")
 
 
 def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
