@@ -126,7 +126,7 @@ WORDS: Final[Mapping[str, str]] = {
     "plane_angle_deg": "direction of the main plane, error",
     "plane_offset_mm": "position of the main plane, error",
     "plane_corner_max_mm": "largest error of the main plane at its corners",
-    "rms_mm": "points to their plane, RMS",
+    "rms_mm": "points to the first plane, RMS",
     "fit_rms_mm": "points to the first plane, RMS of those fitted",
     "omega_deg": "direction of the first normal (omega)",
     "phi_deg": "inclination of the first normal (phi)",
@@ -146,14 +146,14 @@ WORDS: Final[Mapping[str, str]] = {
     "detection_cpu_s": "processor time of the detection",
     "first_plane_cpu_s": "processor time until the first plane",
     "next_plane_cpu_s": "processor time of each further plane",
-    "skewness": "skewness of the distances",
-    "excess_kurtosis": "excess kurtosis of the distances",
-    "within_1_sigma": "distances within one sigma",
-    "within_2_sigma": "distances within two sigmas",
-    "within_3_sigma": "distances within three sigmas",
-    "thickness_mm": "thickness of the cloud",
-    "thickness_width_mm": "width that holds 95 % of the distances",
-    "thickness_scan_steps": "thickness over the scan step",
+    "skewness": "skewness of the distances to the first plane",
+    "excess_kurtosis": "excess kurtosis of the distances to the first plane",
+    "within_1_sigma": "distances to the first plane within one sigma",
+    "within_2_sigma": "distances to the first plane within two sigmas",
+    "within_3_sigma": "distances to the first plane within three sigmas",
+    "thickness_mm": "thickness of the cloud on the first plane",
+    "thickness_width_mm": "width that holds 95 % of the distances to the first plane",
+    "thickness_scan_steps": "thickness over the scan step on the first plane",
     "thickest_mm": "thickness of the cloud where it is thickest",
     "own_tolerance_mm": "tolerance taken from the cloud",
     "n_regions": "regions grown",
@@ -321,6 +321,8 @@ _OF_SOME: Final[Mapping[tuple[str, str], str]] = {
     ("inspect.checkpoints", "n_points"): "check points",
     ("mosaic", "occluded_share"): "cells hidden from every photo",
     ("ortho.pointcloud-direct", "void_share"): "cells that got no colour",
+    ("plane", "scan_step_mm"): "step of the scan on the first plane",
+    ("raster", "scan_step_mm"): "step of the scan on the first wall",
     ("read.checkpoints", "n_points"): "check points",
     ("register", "n_pairs"): "pairs of points",
     ("register", "rms_mm"): "points to their places, RMS",
@@ -336,7 +338,7 @@ def words_of(name: str, method: str, declared: str = "") -> str:
         declared: what its record says that the method calls it; empty where it says nothing.
 
     >>> words_of("rms_mm", "plane.hough2d"), words_of("rms_mm", "register.similarity")
-    ('points to their plane, RMS', 'points to their places, RMS')
+    ('points to the first plane, RMS', 'points to their places, RMS')
     >>> words_of("n_patches", "moisture.simple"), words_of("wall_s", "moisture.simple")
     ('n_patches', 'time')
     """

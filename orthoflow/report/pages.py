@@ -61,6 +61,7 @@ from orthoflow.report.pictures import (
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import (
     CHECKING,
+    OF_PLANE,
     Answer,
     Limit,
     answers,
@@ -410,7 +411,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     return _Section(
         run=run,
         prefix=prefix,
-        answers=tuple(_along_the_wall_shown(answers(run), every.of(main))),
+        answers=tuple(_of_the_wall_shown(answers(run), every.of(main))),
         is_measured=says_how_far_off(run),
         limits=limits(run),
         results=results(run),
@@ -438,13 +439,25 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     )
 
 
-def _along_the_wall_shown(told: Sequence[Answer], main: _Part) -> Iterator[Answer]:
-    """The numbers of the first screen, of ties along the wall whose picture is beside them."""
+def _of_the_wall_shown(told: Sequence[Answer], main: _Part) -> Iterator[Answer]:
+    """The numbers of the first screen, as they are on the wall whose picture is beside them."""
     wall = main.orthoimages[0].name if main.orthoimages else ""
-    rms_mm = {one.cell: one.check_rms_mm for one in main.overlays if one.wall == wall}
+    check_mm = {one.cell: one.check_rms_mm for one in main.overlays if one.wall == wall}
+    plane_mm = {
+        cell: row.rms_mm
+        for table in main.planes
+        for row in table.rows
+        if row.name == wall
+        for cell in (table.cell, *table.later)
+    }
     for answer in told:
-        found = rms_mm.get(answer.cell) if answer.metric == CHECKING else None
-        yield answer if found is None else answer.along(wall, found)
+        along = check_mm.get(answer.cell) if answer.metric == CHECKING else None
+        if along is not None:
+            yield answer.along(wall, along)
+        elif answer.metric == OF_PLANE and answer.cell in plane_mm:
+            yield answer.of_plane(wall, plane_mm[answer.cell])
+        else:
+            yield answer
 
 
 def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Ground, ...]:

@@ -44,6 +44,7 @@ _IMAGE: Final = re.compile(r"/wall_(\d+)_ortho\.tif$")
 _PLACE: Final = re.compile(r"(.*\S) \(([^()]+)\)")
 _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 CHECKING: Final = "check_rmse_mm_worst"
+OF_PLANE: Final = "rms_mm"
 # What a reader may take such a number for, and it is not.
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
@@ -78,6 +79,11 @@ class Answer:
                 f"{self.value} in the mean of the photo's two axes"
             ),
         )
+
+    def of_plane(self, wall: str, rms_mm: float) -> Answer:
+        """Say of points to their plane what they are on a wall, not on the first plane."""
+        value = _in_words(self.metric, rms_mm, "mm")
+        return replace(self, what=f"points to the plane of {wall}, RMS", value=value)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,7 +174,7 @@ def test_a_name_that_means_two_things_has_a_column_for_each(
     page = (tmp_path / "runs.html").read_text()
     heading = r'data-name="(\w+\.rms_mm|rms_mm)" data-key data-sort="number"><span>([^/]*)</span>'
     assert re.findall(heading, page.replace("<wbr>", "")) == [
-        ("plane.rms_mm", "points to their plane, RMS"),
+        ("plane.rms_mm", "points to the first plane, RMS"),
         ("points.rms_mm", "check points, RMS"),
     ]
     header = said("runs").splitlines()[0]

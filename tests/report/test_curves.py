@@ -16,7 +16,7 @@ from orthoflow.report import curves as module
 from orthoflow.report.curves import curves, curves_over, sweeps
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
-CUT = "points to their plane, RMS / mm, cut at its own tolerance"
+CUT = "points to the first plane, RMS / mm, cut at its own tolerance"
 
 
 def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
@@ -92,7 +92,7 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
         record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
     )
     titles = [[one.title.partition(" over ")[0] for one in curves(run)] for run in (plain, asked)]
-    error = "points to their plane, RMS / mm, cut at its own tolerance (plane)"
+    error = "points to the first plane, RMS / mm, cut at its own tolerance (plane)"
     assert titles == [[], [error, "planes found (plane)"]]
 
 

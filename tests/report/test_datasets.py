@@ -90,7 +90,7 @@ def methods(run: Run) -> dict[str, MethodOverDatasets]:
     (metric,) = over_datasets(parts_of(run))
     assert (metric.step, metric.label, metric.sense) == (
         "plane",
-        "points to their plane, RMS / mm",
+        "points to the first plane, RMS / mm",
         Sense.LESS,
     )
     return {method.name: method for method in metric.methods}
@@ -102,7 +102,7 @@ def test_oriented_photos_stand_in_a_column_of_their_own(rooms: HeldRun) -> None:
     told = replace(rooms.record, workflow_resolved=json.dumps(resolved))
     table = dataset_table(parts_of(replace(rooms, record=told)), {})
     assert [label for _, label in table.columns] == [
-        *("points to their plane, RMS / mm", "photos"),
+        *("points to the first plane, RMS / mm", "photos"),
     ]
     assert table.has_photos
     assert {row.photos.text for row in table.rows} == {"5 of 6"}
@@ -191,7 +191,7 @@ def test_distances_to_a_plane_are_not_ranked_where_its_tolerance_cuts_them(tmp_p
     both = replace(run, record=replace(run.record, cells=cells))
     cut, depth = sorted(over_datasets(parts_of(both)), key=lambda one: one.sense is Sense.LESS)
     assert (cut.label, cut.sense) == (
-        "points to their plane, RMS / mm, cut at its own tolerance",
+        "points to the first plane, RMS / mm, cut at its own tolerance",
         Sense.NEITHER,
     )
     assert depth.sense is Sense.LESS
@@ -283,7 +283,7 @@ def test_differences_are_told_in_the_sign_of_the_metric() -> None:
 
 def test_a_dataset_has_a_row_with_its_own_numbers(rooms: Run) -> None:
     table = dataset_table(parts_of(rooms), {"hall": "pages/hall.html"})
-    assert table.columns == (("plane", "points to their plane, RMS / mm"),)
+    assert table.columns == (("plane", "points to the first plane, RMS / mm"),)
     assert [row.name for row in table.rows] == list(RMS_MM)
     assert table.n_whole == 6
     hall, attic = table.rows[0], table.rows[2]

@@ -50,7 +50,7 @@ def test_cards_and_tables_say_the_same() -> None:
         ("flat_rms_after_once_mm", "RMS without outliers, rule applied once; flat"),
         ("a_stranger_s", "a_stranger_s"),
         ("all_", "all_"),
-        ("within_2_sigma", "distances within two sigmas"),
+        ("within_2_sigma", "distances to the first plane within two sigmas"),
         ("void_sparse_share", "cells between the scan's points"),
         ("void_other_share", "cells without a depth, by cause"),
     ],

@@ -61,7 +61,7 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     assert len(repr(run.figures["scan/plan"])) < 200
     html = run._repr_html_()
     assert len(html) < 5_000
-    assert "points to their plane, RMS" in html
+    assert "points to the first plane, RMS" in html
     assert "steps: 4 ok" in html
     assert "<img" not in html
     assert "&lt;Run" not in html

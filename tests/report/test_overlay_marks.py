@@ -247,7 +247,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert table is not None
     assert (table.steps, table.shows_runs, table.groups) == (("plane",), False, {})
     assert [(one.step, one.metric, one.label, one.sense) for one in table.columns] == [
-        ("plane", "rms_mm", "points to their plane, RMS / mm", Sense.LESS),
+        ("plane", "rms_mm", "points to the first plane, RMS / mm", Sense.LESS),
         ("plane", "omega_deg", "direction of the first normal (omega) / deg", Sense.NEITHER),
         ("check", "rmse_u_mm", "error along u (right), RMS / mm", Sense.LESS),
         ("check", "completeness", "painted, of the surface that is seen at all", Sense.MORE),

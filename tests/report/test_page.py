@@ -382,7 +382,7 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
         "[...document.querySelectorAll('.turned tbody th')].map(e => e.innerText)"
     )
     assert any("error along u (right), RMS / mm" in name for name in names)
-    assert not any("points to their plane" in name for name in names)
+    assert not any("points to the first plane" in name for name in names)
 
 
 def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:

@@ -22,8 +22,9 @@ from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.overlays import magnification_for, residuals_on_wall
-from orthoflow.report.pages import _along_the_wall_shown, _Ground, _Part, cited
+from orthoflow.report.pages import _Ground, _of_the_wall_shown, _Part, cited
 from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
+from orthoflow.report.plane_tables import PlaneRow, PlaneTable
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import answers, citations, limits
 from tests.report_runs import (
@@ -252,7 +253,7 @@ def test_ties_that_check_are_told_along_the_wall_beside_them() -> None:
         for wall, mm in (("wall 0", (2.52, 1.03)), ("wall 1", (9.0, 9.0)))
     ]
     main = _Part(orthoimages=(image,), overlays=tuple(over))
-    expected, along = _along_the_wall_shown(told, main)
+    expected, along = _of_the_wall_shown(told, main)
     assert expected == told[0]
     assert along.what == "ties that only check, RMS on wall 0 along u / along v"
     assert along.value == "2.52 / 1.03 mm"
@@ -261,7 +262,35 @@ def test_ties_that_check_are_told_along_the_wall_beside_them() -> None:
     )
     # Without a drawing of this wall, or a picture, the number of the photo stays.
     for less in (replace(main, overlays=tuple(over[1:])), replace(main, orthoimages=())):
-        assert tuple(_along_the_wall_shown(told, less)) == told
+        assert tuple(_of_the_wall_shown(told, less)) == told
+
+
+def test_points_are_told_to_the_plane_of_the_wall_beside_them() -> None:
+    told = answers(run(cell("plane", metrics=metrics(rms_mm=9.871)), cell("mosaic")))
+    wall, other = (
+        PlaneRow(
+            name=name,
+            omega_deg=0.0,
+            phi_deg=0.0,
+            offset_m=0.0,
+            sigma_mm=0.0,
+            size="",
+            n_points=3,
+            rms_mm=rms_mm,
+            thickness_mm=None,
+            scan_step_mm=None,
+        )
+        for name, rms_mm in (("wall 1", 15.84), ("wall 0", 9.871))
+    )
+    planes = PlaneTable(cell="turned", viewpoint="", rows=(other, wall), materials=())
+    image = Picture(uri="", title="", caption="", cell="mosaic", name="wall 1")
+    main = _Part(orthoimages=(image,), planes=(replace(planes, later=("plane",)),))
+    (answer,) = _of_the_wall_shown(told, main)
+    assert (answer.what, answer.value) == ("points to the plane of wall 1, RMS", "15.8 mm")
+    # Without a table of its cell, or a picture, it says which plane it is of.
+    for less in (replace(main, planes=(planes,)), replace(main, orthoimages=())):
+        (answer,) = _of_the_wall_shown(told, less)
+        assert (answer.what, answer.value) == ("points to the first plane, RMS", "9.87 mm")
 
 
 def test_advice_on_what_was_measured_is_the_first_limit() -> None:
@@ -313,7 +342,7 @@ def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
     for value, first in ((0.0, ("main wall of the scene", "not found")), (1.0, None)):
         check = cell("check", method="inspect.truth", metrics=metrics(main_found=value))
         told = [(one.what, one.value) for one in answers(run(plane, check))]
-        assert told == [*([first] if first else []), ("points to their plane, RMS", "1.6 mm")]
+        assert told == [*([first] if first else []), ("points to the first plane, RMS", "1.6 mm")]
 
 
 def test_whether_a_detector_found_what_there_is_has_columns_without_being_asked() -> None:
@@ -339,7 +368,7 @@ def test_what_a_stranger_calls_good_is_told_first() -> None:
     ]
     assert [(one.what, one.value, one.cell) for one in answers(run(*cells))] == [
         ("share of dents", "0.25", "dent"),
-        ("points to their plane, RMS", "1.6 mm", "plane"),
+        ("points to the first plane, RMS", "1.6 mm", "plane"),
     ]
     columns = comparison_columns(combinations_of(run(*cells)))
     assert [(one.metric, one.is_key) for one in columns] == [("dent_share", True), ("rms_mm", True)]
@@ -704,7 +733,7 @@ def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:
     first, second, last = table.glance
     assert (first.name, first.is_baseline) == ("plane=fine", True)
     assert first.best_in[:2] == (
-        "plane: points to their plane, RMS / mm",
+        "plane: points to the first plane, RMS / mm",
         "check: error along u (right), RMS / mm",
     )
     assert second.n_worst >= 2
