@@ -1,11 +1,13 @@
-"""What was meant by a number that has a comma, a unit, or stands behind another unit's name."""
+"""How values are written: numbers with a comma or a unit, names in another unit, nested lists."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from typing import Final
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Final, Literal
 
 from orthoflow.products.product import JsonValue
 
@@ -24,6 +26,70 @@ _WORDS: Final = {
     "s": "seconds",
 }
 _NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zµ°]*)")
+
+_LEAVES: Final[Mapping[object, str]] = {
+    **{int: "number", float: "number", str: "text", bool: "true or false", type(None): "null"},
+}
+
+
+def written_form(annotation: object, description: str) -> str:
+    """Say how a list or mapping of plain values is written; empty for other values.
+
+    Args:
+        annotation: the type of a parameter.
+        description: of it; where it writes such a value itself, this is what is said.
+
+    >>> written_form(tuple[tuple[float, float], ...] | None, "")
+    '[[number, number], ...]'
+    >>> written_form(tuple[tuple[float, float], ...], "Points [[x, y], ...] in metres.")
+    '[[x, y], ...]'
+    >>> written_form(float, "A length [m].")
+    ''
+    """
+    forms = [form for form in map(_form, _alternatives(annotation)) if form != "null"]
+    if not all(forms) or not any(form[0] in "[{" for form in forms):
+        return ""
+    return " or ".join(_written_in(description) or forms)
+
+
+def _alternatives(annotation: object) -> tuple[object, ...]:
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
+
+
+def _form(annotation: object) -> str:
+    """How a value of a type is written; empty where parts of it are no plain values."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _form(parts[0])
+    if origin is Literal:
+        return "text"
+    inner = [_form(part) for part in parts if part is not Ellipsis]
+    if not inner or not all(inner):
+        return _LEAVES.get(annotation, "")
+    if origin is tuple or origin is list:
+        more = [] if origin is tuple and Ellipsis not in parts else ["..."]
+        return f"[{', '.join((*inner, *more))}]"
+    if origin is dict:
+        return f"{{name: {inner[1]}, ...}}"
+    return " or ".join(inner) if len(_alternatives(annotation)) > 1 else ""
+
+
+def _written_in(description: str) -> list[str]:
+    """Lists and mappings that a text writes, outermost brackets each."""
+    return list(dict.fromkeys(_outermost(description)))
+
+
+def _outermost(text: str) -> Iterator[str]:
+    depth, start = 0, 0
+    for place, letter in enumerate(text):
+        if letter in "[{":
+            start = start if depth else place
+            depth += 1
+        elif letter in "]}" and depth:
+            depth -= 1
+            if not depth:
+                yield text[start : place + 1]
 
 
 def meant_number(parameter: str, text: object) -> str:

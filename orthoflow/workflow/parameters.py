@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import groupby
 from typing import Final, TypeAlias
 
 from pydantic import ValidationError
@@ -26,7 +27,7 @@ from orthoflow.files.yaml_positions import (
     read_yaml,
 )
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.hints import meant_number, meant_parameter
+from orthoflow.workflow.hints import meant_number, meant_parameter, written_form
 from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
@@ -35,6 +36,13 @@ Report: TypeAlias = Callable[[str], None]
 
 # Letters of a value that a message repeats.
 _SHOWN: Final = 60
+# What pydantic calls a list or a mapping of another form, and a value of another type in one.
+_OF_LISTS: Final = frozenset(
+    ("tuple_type", "list_type", "dict_type", "missing", "too_long", "too_short")
+)
+_OF_LEAVES: Final = frozenset(
+    ("float_type", "int_type", "string_type", "bool_type", "finite_number", "int_from_float")
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +160,10 @@ def resolve_params(
             info.method.Params.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         reports = {override.keys[0]: override.report for override in overrides}
-        reporter = _Reporter(variant=variant, info=info, reports=reports, log=log, blame=blame)
-        for details in error.errors():
-            reporter.report(details)
+        reporter = _Reporter(
+            variant=variant, info=info, as_set=as_set, reports=reports, log=log, blame=blame
+        )
+        reporter.report_all(error.errors())
         return ResolvedParams(as_set=as_set)
     except KeyboardInterrupt:
         raise
@@ -187,25 +196,43 @@ class _Reporter:
 
     variant: DraftVariant
     info: MethodInfo
+    as_set: Mapping[str, JsonValue]
     reports: Mapping[str, Report]
     log: ProblemLog
     blame: Report | None
 
-    def report(self, details: ErrorDetails) -> None:
-        location = details["loc"]
-        message = self._message(details)
+    def report_all(self, errors: Sequence[ErrorDetails]) -> None:
+        """Report each; but what is wrong with the form of one list or mapping is one problem."""
+        for first, group in groupby(errors, key=lambda details: details["loc"][:1]):
+            told = list(group)
+            if form := self._other_form(str(first[0]) if first else "", told):
+                self._report(first, form)
+                continue
+            for details in told:
+                self._report(details["loc"], self._message(details))
+
+    def _other_form(self, name: str, errors: Sequence[ErrorDetails]) -> str:
+        """Say how a parameter is written whose value has another form; empty where it has not."""
+        field_info = self.info.method.Params.model_fields.get(name)
+        kinds = {details["type"] for details in errors if len(details["loc"]) > 1}
+        kinds |= {details["type"] for details in errors} - {"missing"}
+        if field_info is None or not kinds & _OF_LISTS or not kinds <= _OF_LISTS | _OF_LEAVES:
+            return ""
+        form = written_form(field_info.annotation, field_info.description or "")
+        given = json.dumps(self.as_set.get(name), ensure_ascii=False)
+        given = given if len(given) <= _SHOWN else f"{given[:_SHOWN]} ..."
+        return form and f"{name} is written {form}, got {given}"
+
+    def _report(self, location: tuple[int | str, ...], message: str) -> None:
         name = str(location[0]) if location else ""
+        inside = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
         if report := self.reports.get(name, self.blame):
             # It names the parameter itself, but nothing inside it, and datasets not even that.
             is_named = name in self.reports and len(location) == 1
-            who = str(location[-1]) if location else f"the parameters of {self.info.id}"
+            who = inside[1:] or f"the parameters of {self.info.id}"
             report(message if is_named else f"{who}: {message}")
             return
-        path = "".join(
-            f"[{part}]" if isinstance(part, int) else f".{part}" for part in ("params", *location)
-        )
-        position = self._position(location)
-        self.log.add(position, f"{self.variant.path}{path}", message)
+        self.log.add(self._position(location), f"{self.variant.path}.params{inside}", message)
 
     def _message(self, details: ErrorDetails) -> str:
         location = details["loc"]

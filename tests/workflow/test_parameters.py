@@ -83,9 +83,44 @@ def test_a_parameter_without_a_default_is_asked_for() -> None:
     with pytest.raises(ValidationError) as caught:
         Params.model_validate({})
     told: Any = SimpleNamespace(id="plane.level")
-    reporter = module._Reporter(variant=told, info=told, reports={}, log=told, blame=None)
+    reporter = module._Reporter(
+        variant=told, info=told, as_set={}, reports={}, log=told, blame=None
+    )
     (details,) = caught.value.errors()
     assert reporter._message(details) == "plane.level needs parameter height_m"
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ({"near": [1, 2, 3]}, "near is written [[x, y, z], ...], got [1, 2, 3]"),
+        ({"near": 5}, "near is written [[x, y, z], ...], got 5"),
+        ({"near": [[1, 2, "a"]]}, 'near[0][2]: input should be a valid number, got the text "a"'),
+        (
+            {"crop": [0, 0, 2]},
+            "crop is written [number, number, number, number] or [[number, number], ...], "
+            "got [0, 0, 2]",
+        ),
+        ({"ink": {"a": 1, "b": 2}}, 'ink is written {name: [number, number], ...}, got {"a": 1'),
+    ],
+)
+def test_a_list_of_another_form_is_one_problem(value: dict[str, Any], told: str) -> None:
+    class Params(MethodParams):
+        near: tuple[tuple[float, float, float], ...] = Field((), description="At [[x, y, z], ...].")
+        crop: tuple[float, float, float, float] | tuple[tuple[float, float], ...] | None = Field(
+            None, description="Part."
+        )
+        ink: dict[str, tuple[float, float]] = Field(default_factory=dict, description="Inks.")
+
+    problems: list[str] = []
+    draft: Any = SimpleNamespace(
+        params=None, info=SimpleNamespace(id="a.b", method=SimpleNamespace(Params=Params))
+    )
+    ((key, given),) = value.items()
+    override = module.Override(report=problems.append, keys=(key,), value=given)
+    module.resolve_params(draft, [override], ProblemLog(file="flow.yaml", lines=("x",)))
+    (problem,) = problems
+    assert problem.startswith(told)
 
 
 def test_a_validator_that_fails_is_a_fault_of_its_plugin() -> None:

@@ -25,6 +25,7 @@ from orthoflow_plugins.plane.final_fit import fit_to_all, label, name_points
 from orthoflow_plugins.plane.measuring import measure_planes, measure_thickness, row_points
 from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare, thinned
+from orthoflow_plugins.plane.support import CELL_LEAST_M
 
 Report = Callable[[float, str], None]
 
@@ -36,9 +37,16 @@ _PLANE_FOUND: Final = "plane"
 _REJECTED_MOST: Final = 30
 
 _NO_PLANE: Final = (
-    "no plane holds {share:.2%} of the {count} points within {tolerance} m: raise tolerance_m "
-    "or fit_tolerance_m for rough or noisy walls, lower min_share for small ones, or raise "
-    "max_tilt_deg ({method})"
+    "no plane holds {share:.2%} of the {count} points within {tolerance} m; the cloud is {size}: "
+    "raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower min_share for small "
+    "ones, or raise max_tilt_deg{small} ({method})"
+)
+# Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
+_SMALL_M: Final = 1.0
+_SMALL: Final = (
+    ". It is small: is unit of read.scan right? A plane is found where it is {least} m wide and high at "
+    "least; points beside its edges bend one that is little larger: lower fit_tolerance_m to "
+    "0.005, with max_tilt_deg 45 where it leans, or state it (plane.given)"
 )
 
 _NO_INTENSITY: Final = (
@@ -250,6 +258,7 @@ def _found(
                 share=params.min_share,
                 count=len(cloud),
                 tolerance=params.tolerance_m,
+                **_said_of_size(cloud),
                 method=detector.method,
             )
         )
@@ -264,6 +273,14 @@ def _found(
     moments_s.append(_now(ctx))
     _report_times(ctx, np.diff(moments_s, axis=0))
     return whole, found
+
+
+def _said_of_size(cloud: PointCloud) -> dict[str, str]:
+    """Say how large a cloud is, and what helps where it is small: parts of `_NO_PLANE`."""
+    sides_m = [float(np.ptp(axis)) for axis in (cloud.x, cloud.y, cloud.z)]
+    size = " x ".join(f"{side_m:.3g}" for side_m in sides_m) + " m"
+    is_small = sorted(sides_m)[1] < _SMALL_M
+    return {"size": size, "small": _SMALL.format(least=2 * CELL_LEAST_M) if is_small else ""}
 
 
 def _now(ctx: StepContext) -> tuple[float, float]:

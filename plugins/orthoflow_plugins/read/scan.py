@@ -34,6 +34,9 @@ from orthoflow_plugins.read.stations import Stations, choose_stations
 Unit = Literal["m", "cm", "mm", "ft", "us-ft"]
 Corner = tuple[float, float, float]
 
+# Where two sides of a scan are shorter, it is rather in another unit than of a wall.
+_SMALL_M: Final = 1.0
+
 UNITS_M: Final[dict[Unit, float]] = {
     "m": 1.0,
     "cm": 0.01,
@@ -77,7 +80,7 @@ class ReadScan(Method):
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
-            description="Where a viewer stands, world metres (after unit was applied); tells the "
+            description="Where a viewer stands, [x, y, z] in world metres (unit applied); tells the "
             "front of a wall from its back when the files have no scanner positions.",
         )
         columns: str | None = Field(
@@ -325,6 +328,12 @@ def _precision(ctx: StepContext, assembly: CloudAssembly) -> dict[str, JsonValue
     return {"resolution_m": resolution, "rounding_m": rounding}
 
 
+def _warn_of_size(ctx: StepContext, sides_m: NDArray[np.float64]) -> None:
+    if np.median(sides_m) < _SMALL_M:
+        size = " x ".join(f"{side_m:.3g}" for side_m in sides_m)
+        ctx.warn(f"the scan is {size} m only: is unit of read.scan right?")
+
+
 def _extent(assembly: CloudAssembly) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lows = np.array([scan.low for scan in assembly.scans])
     highs = np.array([scan.high for scan in assembly.scans])
@@ -384,6 +393,7 @@ def _report_metrics(ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud
     ctx.metric("n_scans", len(assembly.scans), "1")
     ctx.metric("n_stations", 0 if cloud.stations is None else len(cloud.stations), "1")
     low, high = _extent(assembly)
+    _warn_of_size(ctx, high - low)
     for axis, name in enumerate("xyz"):
         ctx.metric(f"extent_{name}_m", float(high[axis] - low[axis]), "m")
     n_dropped = sum(count.n_read for count in counts) - len(cloud)

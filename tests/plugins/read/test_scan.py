@@ -288,6 +288,15 @@ def test_rounded_coordinates_are_warned_of_and_others_are_not(
     assert "the coordinates of b.xyz are rounded to 10 mm" in read.warnings
 
 
+def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    read(write_text(tmp_path / "a.xyz", points))
+    assert "is unit" not in read.warnings
+    read(write_text(tmp_path / "b.xyz", points), unit="mm")
+    assert "m only: is unit of read.scan right?" in read.warnings
+
+
 def test_rounding_is_told_in_metres_whatever_the_unit(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
