@@ -28,7 +28,11 @@ _WORDS: Final = {
 _NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zµ°]*)")
 
 _LEAVES: Final[Mapping[object, str]] = {
-    **{int: "number", float: "number", str: "text", bool: "true or false", type(None): "null"},
+    int: "number",
+    float: "number",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
 }
 
 

@@ -44,9 +44,9 @@ _NO_PLANE: Final = (
 # Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
 _SMALL: Final = (
-    ". It is small: is unit of read.scan right? A plane is found where it is {least} m wide and high at "
-    "least; points beside its edges bend one that is little larger: lower fit_tolerance_m to "
-    "0.005, with max_tilt_deg 45 where it leans, or state it (plane.given)"
+    ". It is small: is unit of read.scan right? A plane must be {least} m wide and high; points "
+    "beside its edges bend one that is little larger: lower fit_tolerance_m to 0.005, with "
+    "max_tilt_deg 45 where it leans, or state it (plane.given)"
 )
 
 _NO_INTENSITY: Final = (

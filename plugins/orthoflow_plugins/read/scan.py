@@ -80,7 +80,7 @@ class ReadScan(Method):
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
-            description="Where a viewer stands, [x, y, z] in world metres (unit applied); tells the "
+            description="Where a viewer stands, [x, y, z], world metres (unit applied); tells the "
             "front of a wall from its back when the files have no scanner positions.",
         )
         columns: str | None = Field(
