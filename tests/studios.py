@@ -77,7 +77,9 @@ def open_copy(finished: Studio, folder: Path, patch: pytest.MonkeyPatch) -> Stud
     """Open another studio with the run `first`, its input and its store."""
     opened = open_studio(folder, patch)
     for name in ("first", ".orthoflow"):
-        shutil.copytree(finished.folder / name, folder / name)
+        # Without the memory of where the files of the other studio lie.
+        ignored = shutil.ignore_patterns("digests.json")
+        shutil.copytree(finished.folder / name, folder / name, ignore=ignored)
     shutil.copyfile(finished.folder / "n.txt", folder / "n.txt")
     return opened
 

@@ -38,8 +38,8 @@ _HELP: Final = "\n\n".join(
         *(f"{name}: {entry.summary}." for name, entry in FORMATS.items()),
         (
             "--embed: run.h5 alone, which verifies and replays without any other file; what it "
-            "lacks so far comes from the store and from the input files, looked for by content or "
-            "given with --input."
+            "lacks so far comes from the store and from the input files, found by content, under "
+            "any name: where --input says, else as `replay` finds them."
         ),
         (
             "--split: of a run on several datasets a run folder each, with record, report and "

@@ -61,7 +61,8 @@ def replay(
     """Make RUN, a run folder or its run.h5, again from its record and its input files.
 
     Takes workflow, parameters and seeds as recorded. The inputs come from the record, if they are
-    in it, or are looked for by content where they were, beside the run, or where --input says.
+    in it, or are found by content, under any name: where --input says, else at the places that the
+    workflow names, beside the run, here, and where the store in .orthoflow saw them last.
     What is missing or not as it was is named before anything runs. Says of every product whether
     it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
     differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
@@ -81,11 +82,17 @@ def replay(
     folder = output or new_run_folder(f"{original.record.name}-replay", run_id)
     with (
         _store_folder(store, folder) as store_folder,
-        embedded_inputs(original, folder.parent) as extracted,
+        embedded_inputs(original, folder.parent) as laid_out,
     ):
         opened = Store(store_folder)
         planned = plan_replay(
-            original, discover_catalog(), opened, options, inputs=inputs, extracted=extracted
+            original,
+            discover_catalog(),
+            opened,
+            options,
+            inputs=inputs,
+            laid_out=laid_out,
+            earlier=_earlier_stores(),
         )
         call = _Call(
             original=original,
@@ -117,6 +124,13 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     finally:
         if not is_interrupted:
             shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _earlier_stores() -> tuple[Store, ...]:
+    """The store of runs made here: it has products, and remembers where input files lay."""
+    from orthoflow.engine.store import Store
+
+    return (Store(DEFAULT_STORE),) if DEFAULT_STORE.is_dir() else ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,12 +207,10 @@ class _Call:
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog.discovery import discover_catalog
-        from orthoflow.engine.store import Store
         from orthoflow.records.distances import RunProducts, product_distances
 
-        earlier = (Store(DEFAULT_STORE),) if DEFAULT_STORE.is_dir() else ()
         return product_distances(
-            RunProducts(run=self.original, stores=earlier),
+            RunProducts(run=self.original, stores=_earlier_stores()),
             RunProducts(run=made, stores=(self.store,)),
             [address for address in self.original.cells if address in made.cells],
             discover_catalog(),

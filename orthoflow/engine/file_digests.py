@@ -1,4 +1,7 @@
-"""SHA-256 of input files, remembered as long as the file system says they are the same."""
+"""SHA-256 of input files, remembered as long as the file system says they are the same.
+
+And where files lay: records name no folders, so this is how those of an earlier run are found.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ class FileDigests:
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
-        self._known = _read_memo(memo)
+        self._known, self._places = _read_memo(memo)
         self._is_dirty = False
 
     def digest_all(self, paths: Iterable[Path]) -> tuple[FileRef, ...]:
@@ -90,6 +93,24 @@ class FileDigests:
             identity=identity,
         )
 
+    def note_place(self, sha256: str, path: Path) -> None:
+        """Remember where a run found a file, unless it still lies where an earlier one did."""
+        earlier, place = self.place(sha256), path.absolute()
+        if earlier is None or (earlier != place and not self._is_known(earlier, sha256)):
+            self._places[sha256] = str(place)
+            self._is_dirty = True
+
+    def place(self, sha256: str) -> Path | None:
+        """Where a file of that digest lay, which may be gone or changed since."""
+        place = self._places.get(sha256)
+        return None if place is None else Path(place)
+
+    def _is_known(self, path: Path, sha256: str) -> bool:
+        try:
+            return self._known.get(file_identity(path)) == sha256
+        except (OSError, ValueError):
+            return False
+
     def save(self) -> None:
         """Keep what is new for the next run.
 
@@ -97,7 +118,7 @@ class FileDigests:
             StoreError: the disk refuses.
         """
         if self._is_dirty:
-            text = json.dumps({"files": self._known}, sort_keys=True)
+            text = json.dumps({"files": self._known, "places": self._places}, sort_keys=True)
             write_whole(self._memo, with_digest(text).encode())
             self._is_dirty = False
 
@@ -126,11 +147,16 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _read_memo(memo: Path) -> dict[str, str]:
+def _read_memo(memo: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Give identity -> digest, and digest -> path."""
     try:
         text = memo.read_text(encoding="utf-8")
         content = parse_json(text) if is_checked(text) else None
     except (OSError, ValueError):
-        return {}
-    files = content.get("files") if isinstance(content, dict) else None
-    return dict(files) if isinstance(files, dict) else {}
+        content = None
+    tables = content if isinstance(content, dict) else {}
+    files, places = (tables.get(name) for name in ("files", "places"))
+    return (
+        dict(files) if isinstance(files, dict) else {},
+        dict(places) if isinstance(places, dict) else {},
+    )

@@ -319,6 +319,16 @@ class _Planner:
         return self._earlier[method]
 
 
+def remember_places(inputs: Mapping[str, PlannedInput | None], store: Store) -> None:
+    """Let the store remember where the files of a run lie, for a replay or an export of it."""
+    digests = store.file_digests()
+    for given in inputs.values():
+        for file, path in zip(given.files, given.paths, strict=True) if given else ():
+            digests.note_place(file.sha256, path)
+    with contextlib.suppress(StoreError):
+        digests.save()
+
+
 def _digest_inputs(
     given: Mapping[str, InputFiles | None], store: Store
 ) -> dict[str, PlannedInput | None]:

@@ -34,6 +34,7 @@ from orthoflow.engine.plan import (
     RunPlan,
     known_inputs,
     needed_addresses,
+    remember_places,
 )
 from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
 from orthoflow.engine.run_folder import (
@@ -152,6 +153,7 @@ def execute(
     with store.in_use(), Journal(folder, plan.name, run_id=run_id) as journal:
         with writing_to(folder):
             (folder / LOGS).mkdir(exist_ok=True)
+        remember_places(plan.inputs, store)
         listen(
             RunStarted(
                 run_id=journal.run_id, n_cells=len(plan.cells), is_resumed=journal.is_resumed

@@ -110,11 +110,13 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
         published=tuple(file for file in published if file.path in copied),
     )
     path = folder / RECORD_FILE
-    with embedded_inputs(part, folder) as extracted:
+    with embedded_inputs(part, folder) as laid_out:
         files = {
             file.sha256: place
             for entry in record.inputs
-            for file, place in zip(entry.files, extracted.get(entry.name, ()), strict=False)
+            for file, place in zip(
+                entry.files, laid_out.extracted.get(entry.name, ()), strict=False
+            )
         }
         try:
             with writing_to(folder):

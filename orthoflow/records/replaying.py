@@ -17,7 +17,7 @@ from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.records.input_files import find_inputs
+from orthoflow.records.input_files import LaidOutInputs, find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
@@ -67,7 +67,8 @@ def plan_replay(
     options: RunOptions,
     *,
     inputs: Sequence[str] = (),
-    extracted: Mapping[str, tuple[Path, ...]] | None = None,
+    laid_out: LaidOutInputs | None = None,
+    earlier: Sequence[Store] = (),
 ) -> Replay:
     """Check that a run can be made again, and plan it. Nothing is computed.
 
@@ -77,7 +78,9 @@ def plan_replay(
         store: where the replay keeps its results.
         options: of the replay.
         inputs: `NAME=PATH`, each as behind `--input`.
-        extracted: input -> files that lay in the record, see `embedded_inputs`.
+        laid_out: the files that lay in the record, and those that now have other names, see
+            `embedded_inputs`; without it the files must have their names.
+        earlier: stores that may remember where input files lay.
 
     Raises:
         UnreplayableRunError: the record was changed, a method has another result version or takes
@@ -101,7 +104,13 @@ def plan_replay(
             check.add(cell)
     digests = store.file_digests()
     search = find_inputs(
-        workflow, run.record.inputs, run.folder, digests, given=inputs, extracted=extracted
+        workflow,
+        run.record.inputs,
+        run.folder,
+        digests,
+        given=inputs,
+        extracted=laid_out.extracted if laid_out else None,
+        noted=[one.file_digests() for one in earlier],
     )
     if check.others or search.problems:
         raise UnreplayableRunError((*check.others, *check.missing, *search.problems))
@@ -109,7 +118,13 @@ def plan_replay(
         raise MissingMethodsError(tuple(check.missing))
     if store.folder.is_dir():
         digests.save()
-    found = _with_files(workflow, search.paths)
+    paths = {
+        entry.name: laid_out.named(entry, search.paths[entry.name])
+        if laid_out
+        else search.paths[entry.name]
+        for entry in run.record.inputs
+    }
+    found = _with_files(workflow, paths)
     cells = [_cell(cell, workflow) for cell in run.record.cells]
     plan = plan_run(cells, found, catalog, store, options)
     return Replay(
@@ -245,7 +260,8 @@ class _MethodCheck:
             _add(
                 self.others,
                 f"step {cell.address}: the installed {cell.method} refuses the recorded "
-                f"parameter {name}: {first['msg']}",
+                f"parameter {name}: {first['msg']} (the record was made with "
+                f"{cell.distribution} {cell.distribution_version})",
             )
 
 

@@ -34,7 +34,7 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import DamageError, InputError, OrthoflowError, StoreError
-from orthoflow.records.input_files import embedded_inputs, find_inputs
+from orthoflow.records.input_files import MissingInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
@@ -315,8 +315,8 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         InvalidArgumentsError: `inputs` names no input of the workflow.
     """
     _check_products(run, store)
-    with embedded_inputs(run, path.parent) as extracted:
-        files = _input_files(run, store.file_digests(), inputs, extracted)
+    with embedded_inputs(run, path.parent) as laid_out:
+        files = _input_files(run, store.file_digests(), inputs, laid_out.extracted)
         record = dataclasses.replace(
             run.record,
             inputs=tuple(
@@ -445,7 +445,7 @@ def _input_files(
         workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
     )
     if search.problems:
-        raise InputError("; ".join(search.problems))
+        raise MissingInputsError(search.problems)
     return {
         file.sha256: place
         for entry in record.inputs

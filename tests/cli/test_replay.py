@@ -87,11 +87,34 @@ def test_a_replay_can_be_replayed_and_says_so_in_words(studio: Studio) -> None:
 
 def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     (studio.folder / "elsewhere").mkdir()
-    (studio.folder / "n.txt").rename(studio.folder / "elsewhere" / "n.txt")
+    renamed = studio.folder / "elsewhere" / "m.txt"
+    (studio.folder / "n.txt").rename(renamed)
     missing = refused(studio)
     assert "input number: n.txt (3 bytes, SHA-256 " in missing
     assert "is not to be found; give it with --input number=PATH" in missing
+    (studio.folder / "o.txt").write_text("1.6")
+    wrong = refused(studio, "--input", "number=o.txt")
+    assert "n.txt of the record is not among what was given, " in wrong
+    assert "o.txt (expected 3 bytes with the SHA-256 " in wrong
     done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
+    assert done.exit_code == 0, done.output
+    # The step saw it under its recorded name, which is part of what it was computed from.
+    assert "2 products: 2 identical" in done.stdout.splitlines()
+    assert not list(studio.folder.glob(".inputs-*"))
+    done = studio("export", "first", "--embed", "-o", "whole", "--input", f"number={renamed}")
+    assert done.exit_code == 0, done.output
+
+
+def test_an_input_is_found_under_another_name_and_where_a_run_found_it(studio: Studio) -> None:
+    (studio.folder / "n.txt").rename(studio.folder / "m.txt")
+    assert studio("export", "first", "--embed", "-o", "renamed").exit_code == 0
+    (studio.folder / "mydata" / "deep").mkdir(parents=True)
+    (studio.folder / "m.txt").rename(studio.folder / "mydata" / "deep" / "n.txt")
+    done = studio("export", "first", "--embed", "-o", "whole")
+    assert done.exit_code == 2
+    assert [*done.stderr.splitlines()[-2:-1], "error: 1 problem"] == done.stderr.splitlines()
+    studio.run("second", "--input", "number=mydata/deep")
+    done = studio("export", "second", "--embed", "-o", "whole")
     assert done.exit_code == 0, done.output
 
 

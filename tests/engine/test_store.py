@@ -545,6 +545,23 @@ def test_a_file_changed_just_now_is_not_remembered(tmp_path: Path) -> None:
     assert not (tmp_path / "digests.json").exists()
 
 
+def test_where_a_file_lay_is_remembered_until_it_lies_elsewhere(tmp_path: Path) -> None:
+    memo = tmp_path / "digests.json"
+    digests = FileDigests(memo)
+    first = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
+    second = settled_file(tmp_path / "copy.xyz", b"1 2 3\n")
+    sha256 = digests.digest(first).sha256
+    assert digests.place(sha256) is None
+    for path in (first, second):
+        digests.note_place(sha256, path)
+    digests.save()
+    again = FileDigests(memo)
+    assert again.place(sha256) == first
+    first.unlink()
+    again.note_place(sha256, second)
+    assert again.place(sha256) == second
+
+
 def test_a_damaged_memory_of_digests_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "digests.json").write_text("{")
     file = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
