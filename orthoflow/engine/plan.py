@@ -89,6 +89,11 @@ class RunOptions:
             raise ArgumentError(f"parts must be 0 or more, got {self.parts}")
 
     @property
+    def selection(self) -> Selection:
+        """Which steps to run."""
+        return Selection(only=self.only, from_=self.from_, until=self.until)
+
+    @property
     def all_cores(self) -> int:
         """Processors the run may use in all."""
         return self.cores or usable_cores()
@@ -186,8 +191,7 @@ def plan_run(
     """
     options = options or RunOptions()
     check_step_names(workflow, options.force, "--force")
-    selection = Selection(only=options.only, from_=options.from_, until=options.until)
-    selected = select_cells(workflow, tuple(cells), selection)
+    selected = select_cells(workflow, tuple(cells), options.selection)
     methods = {
         method: method_facts(method, catalog)
         for method in dict.fromkeys(cell.method for cell in selected if not cell.skip_reason)

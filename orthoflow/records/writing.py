@@ -273,6 +273,9 @@ def build_record(
     Raises:
         DamageError: the store lost a picture of the run.
     """
+    # What was left out on purpose is no difference of the results: a record says so.
+    overrides = (*workflow.overrides, *plan.options.selection.options)
+    workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
     recorder = _CellRecorder(outcome=outcome, plan=plan, store=store, embed=embed)
     cells = tuple(
@@ -290,7 +293,7 @@ def build_record(
         seed=workflow.seed,
         workflow_source=workflow.source,
         workflow_resolved=resolved_json(workflow),
-        overrides=tuple(workflow.overrides),
+        overrides=overrides,
         inputs=_recorded_inputs(plan, embed=embed),
         environments=_recorded_environments(results),
         cells=cells,

@@ -123,6 +123,12 @@ class Selection:
     from_: tuple[str, ...] = ()
     until: tuple[str, ...] = ()
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The options that say so, each as given; none where nothing is left out."""
+        options = {"--only": self.only, "--from": self.from_, "--until": self.until}
+        return tuple(f"{option} {name}" for option, names in options.items() for name in names)
+
 
 EVERYTHING: Final = Selection()
 
@@ -490,15 +496,8 @@ def _chosen_steps(workflow: Workflow, selection: Selection) -> set[str]:
         chosen &= set(selection.only)
     if not chosen:
         raise ArgumentError(
-            f"no step of workflow {workflow.name} is left by {_options(selection)} together"
+            f"no step of workflow {workflow.name} is left by {' '.join(selection.options)} together"
         )
     return chosen
 
 
-def _options(selection: Selection) -> str:
-    options = {
-        "--only": selection.only,
-        "--from": selection.from_,
-        "--until": selection.until,
-    }
-    return " ".join(f"{option} {name}" for option, names in options.items() for name in names)

@@ -355,7 +355,8 @@ class RunRecord:
         seed: seed of the workflow.
         workflow_source: the file as written.
         workflow_resolved: canonical JSON of the workflow with all overrides applied.
-        overrides: `--set` and other options that changed the workflow, as given.
+        overrides: `--set` and other options that changed the workflow or chose among its steps,
+            as given.
         inputs: the workflow's inputs.
         environments: each distinct one once.
         cells: in the order of the graph.

@@ -123,12 +123,16 @@ def test_a_forced_step_runs_again(finished: tuple[Path, str, str]) -> None:
     assert "1 of 2 steps cached" in again.stdout.splitlines()
 
 
-def test_until_leaves_out_what_follows(finished: tuple[Path, str, str]) -> None:
+def test_until_leaves_out_what_follows_and_says_so(finished: tuple[Path, str, str]) -> None:
     folder = finished[0]
     assert (
         orthoflow(folder, "run", "studio.yaml", "--until", "survey", "-o", "part").returncode == 0
     )
-    assert list(open_run(folder / "part").cells) == ["survey"]
+    part = open_run(folder / "part")
+    assert list(part.cells) == ["survey"]
+    assert part.record.overrides == ("--until survey",)
+    page = (folder / "part" / "report.html").read_text(encoding="utf-8")
+    assert "A part of the workflow was asked for: <code>--until survey</code>." in page
 
 
 def test_a_finished_folder_is_refused(finished: tuple[Path, str, str]) -> None:
