@@ -17,7 +17,7 @@ from orthoflow.alike import first_few
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
-from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, number
+from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
 from orthoflow.foreign_text import csv_text
 
 if TYPE_CHECKING:
@@ -166,7 +166,8 @@ def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[st
             echo_folded(f"{run.folder} {run.state}: {run.reason[:_LONGEST_REASON]}")
     for run in kept:
         if run.n_datasets > 1:
-            echo_folded(f"{run.folder}: medians of {run.n_datasets} datasets that have a value")
+            counts = {name: (run.n_values[name],) for name in names if name in run.n_values}
+            echo_folded(f"{run.folder}: {medians(counts, run.n_datasets)}")
     n_left_out = n_found - len(kept)
     others = f", {counted(n_left_out, 'other')} left out" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")
@@ -258,7 +259,7 @@ def _facts_text(facts: Mapping[str, object]) -> str:
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "swept", "shared"):
+    for name in ("labels", "n_values", "swept", "shared"):
         del values[name]
     return values | {"differs": dict(differs)}
 

@@ -25,6 +25,7 @@ from orthoflow.cli.tables import (
     echo_table,
     echo_warnings,
     first_rows,
+    medians,
     number,
     quality_places,
     say_more,
@@ -153,7 +154,9 @@ def _print_comparison(run: Run) -> bool:
             for methods in zip(*(one.methods for one in over), strict=True)
         ]
         said = who_leads(over, len(parts))
-        about = f"medians of {len(parts)} datasets, of repeats their mean"
+        shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
+        counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
+        about = f"of repeats their mean, {medians(counts, len(parts))}"
     elif table := comparison_table([run]):
         names = [f"{one.step}.{one.metric}" for one in table.columns]
         rows = [

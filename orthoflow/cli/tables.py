@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
@@ -214,6 +214,28 @@ def counted(count: int, noun: str) -> str:
     ('1 step', '3 steps')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def medians(counts: Mapping[str, Collection[int]], n_datasets: int) -> str:
+    """Say of how many datasets medians are.
+
+    Args:
+        counts: name of a number -> how many datasets have it, in each of its rows.
+        n_datasets: of the run.
+
+    >>> medians({"rms_mm": [2, 2], "depth_rmse_mm": [1, 1], "n_oriented": [0, 2]}, 2)
+    'medians of 2 datasets, of fewer where some have no value: depth_rmse_mm 1, n_oriented 0 to 2'
+    >>> medians({"rms_mm": [2]}, 2)
+    'medians of 2 datasets'
+    """
+    ends = {name: (min(found), max(found)) for name, found in counts.items()}
+    fewer = [
+        f"{name} {least}" if least == most else f"{name} {least} to {most}"
+        for name, (least, most) in ends.items()
+        if least < n_datasets
+    ]
+    of_fewer = f", of fewer where some have no value: {', '.join(fewer)}" if fewer else ""
+    return f"medians of {counted(n_datasets, 'dataset')}{of_fewer}"
 
 
 def _distance_text(distance: Distance) -> str:

@@ -52,6 +52,7 @@ class RunSummary:
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
             has it; of several datasets the median.
         n_datasets: that it ran on; 0 for a run on none.
+        n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
         facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
             baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
@@ -68,6 +69,7 @@ class RunSummary:
     started: str = ""
     metrics: Mapping[str, float] = field(default_factory=dict)
     n_datasets: int = 0
+    n_values: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
     swept: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
@@ -245,6 +247,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
                     if DATA in cell.assignment
                 }
             facts |= own
+    values = _values(run)
     return RunSummary(
         folder=folder,
         state=record.status,
@@ -252,8 +255,9 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         workflow=record.name,
         run_id=record.run_id,
         started=record.started,
-        metrics=_metrics(run),
+        metrics={name: statistics.median(found) for name, found in values.items()},
         n_datasets=len(parts),
+        n_values={name: len(found) for name, found in values.items()} if parts else {},
         labels=_labels(run),
         facts=facts,
         swept=_swept(record.cells, names),
@@ -288,10 +292,10 @@ def _swept(
     return found
 
 
-def _metrics(run: Run) -> dict[str, float]:
-    """Numbers of the baseline; of several datasets the median of those that have one.
+def _values(run: Run) -> dict[str, list[float]]:
+    """Numbers of the baseline, one of each dataset that has one.
 
-    Of errors with signs it is that of their sizes, as in the report.
+    Of several datasets errors with signs are given by their sizes, as in the report.
     """
     values: dict[str, list[float]] = {}
     parts = parts_of(run)
@@ -304,7 +308,7 @@ def _metrics(run: Run) -> dict[str, float]:
                 own |= {f"{row.step}.{row.metric}": value, row.metric: value}
         for name, value in own.items():
             values.setdefault(name, []).append(value)
-    return {name: statistics.median(found) for name, found in values.items()}
+    return values
 
 
 def _labels(run: Run) -> dict[str, str]:

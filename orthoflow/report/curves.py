@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from orthoflow.report.rankings import Sense
 from orthoflow.workflow.format import DATA
 
 _MOST_CURVES: Final = 12
+_LONGEST_NAME: Final = 120
 _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
@@ -36,19 +38,51 @@ _APART: Final = 5.0  # of the lines of one drawing, whose bars stand at the same
 _LETTER: Final = 6.2  # width of one, at the size of the drawing's text
 
 
+# The colours of the light page, for drawings that stand alone.
+_STYLE: Final = (
+    "svg{font:12px sans-serif;background:#fff;color:#1c2126}.axis,.line,.bar{fill:none}"
+    ".axis{stroke:#56606a}.grid{stroke:#d4d9de;stroke-width:.7}.line,.dot{stroke-width:2}"
+    ".line-0{stroke:#0b5fa5}.line-1{stroke:#8a4b00;stroke-dasharray:7 3}"
+    ".line-2{stroke:#1c6b35;stroke-dasharray:2 3}.line-3{stroke:#a11616;stroke-dasharray:9 3 2 3}"
+    ".line-4{stroke:#56606a}.line-5{stroke:#1c2126;stroke-dasharray:1 4}"
+    ".dot,.bar{stroke-dasharray:none}.dot{fill:#fff}.base{fill:currentColor}.bar{stroke-width:1.2}"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Curve:
     """One metric over one parameter.
 
     Attributes:
-        title: the metric, its step and the parameter.
+        name: the metric and the parameter by the names of their steps and themselves.
+        title: the metric, its step and the parameter, in words.
         svg: an `<svg>` element.
         caption: what the points and bars are, in words.
     """
 
+    name: str
     title: str
     svg: str
     caption: str
+
+    @property
+    def file(self) -> bytes:
+        """The drawing as an SVG file; on the page its style sheet colours the parts."""
+        head, _, drawn = self.svg.removeprefix("<svg").partition(">")
+        said = f"<style>{_STYLE}</style><desc>{escape(shown(self.caption))}</desc>"
+        alone = f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH:.0f}"{head}>{said}{drawn}'
+        return alone.encode("utf-8")
+
+
+def curve_files(run: Run, parts: Mapping[str, Run]) -> dict[str, bytes]:
+    """Give the drawings of a run, over its datasets where it has several, as SVG files by name."""
+    drawn = curves_over(parts) if len(parts) > 1 else curves(run)
+    # What a record calls its steps and metrics may be no name of a file.
+    names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)
+    return {
+        f"{index:02d}_{name}.svg": curve.file
+        for index, (name, curve) in enumerate(zip(names, drawn, strict=True), start=1)
+    }
 
 
 def curves(run: Run) -> tuple[Curve, ...]:
@@ -259,6 +293,7 @@ def _curve(
         else "Of two values a line shows the difference alone, and nothing of what lies between."
     )
     return Curve(
+        name=f"{column.step}.{column.metric}_over_{sweep.step}.{sweep.parameter}",
         title=title,
         svg=_Axes.of(
             [point for points in lines.values() for point in points],

@@ -499,5 +499,3 @@ def _chosen_steps(workflow: Workflow, selection: Selection) -> set[str]:
             f"no step of workflow {workflow.name} is left by {' '.join(selection.options)} together"
         )
     return chosen
-
-

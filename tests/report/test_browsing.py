@@ -154,14 +154,15 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
     told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
     run = HeldRun(path=tmp_path / "run.h5", record=told)
-    assert module._metrics(run)["rms_mm"] == module._metrics(run)["check.rms_mm"] == 2.0
+    assert sorted(module._values(run)["rms_mm"]) == [1.0, 2.0, 5.0]
     # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
-    assert module._metrics(run)["plane_offset_mm"] == 2.0
-    assert module._metrics(run)["omega_deg"] == -2.0
+    assert sorted(module._values(run)["plane_offset_mm"]) == [1.0, 2.0, 5.0]
+    assert sorted(module._values(run)["omega_deg"]) == [-5.0, -2.0, -1.0]
     alone = record(cells[1:2], workflow_resolved=json.dumps({"datasets": {"stairs": {}}}))
-    assert module._metrics(replace(run, record=alone))["plane_offset_mm"] == -2.0
+    assert module._values(replace(run, record=alone))["plane_offset_mm"] == [-2.0]
     summary = module._of_run(tmp_path, run)
-    assert summary.n_datasets == 3
+    assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
+    assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
     facts, labels = summary.facts, summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "check points, RMS"
     assert {name: facts[name] for name in facts if name.endswith("tries")} == {

@@ -8,12 +8,13 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
 from orthoflow.report import curves as module
-from orthoflow.report.curves import curves, curves_over, sweeps
+from orthoflow.report.curves import curve_files, curves, curves_over, sweeps
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
 CUT = "points to the first plane, RMS / mm, cut at its own tolerance"
@@ -399,6 +400,23 @@ def test_a_negative_error_of_one_dataset_is_no_good_one(tmp_path: Path) -> None:
     one, nothing = held(tmp_path, cells), held(tmp_path, [])
     for (curve,) in (curves(one), curves_over({"hall": one, "yard": nothing})):
         assert re.findall(r"<title>[0-9.]+: ([0-9.-]+)</title>", curve.svg) == ["0.02", "0.05"]
+
+
+def test_a_drawing_stands_alone_as_a_file(tmp_path: Path) -> None:
+    cells = [replace(one, step="a/b") for one in swept(0.02, 0.05)]  # type: ignore[type-var]
+    cells = [replace(one, assignment={"a/b": one.assignment["plane"]}) for one in cells]
+    [(name, data)] = curve_files(held(tmp_path, cells), {}).items()
+    assert name == "01_a_b.rms_mm_over_a_b.tolerance_m.svg"
+    root = ET.fromstring(data)
+    drawn = {name for one in root.iter() if (name := one.get("class"))}
+    style = root.findtext("{http://www.w3.org/2000/svg}style") or ""
+    assert {"axis", "grid", "line line-0", "dot line-0"} <= drawn
+    assert all(
+        f".{one}" in style
+        for names in drawn
+        for one in names.split()
+        if one not in ("curve", "beside")
+    )
 
 
 @pytest.mark.parametrize(("fewest", "is_said"), [(2.0, True), (3.0, False)])

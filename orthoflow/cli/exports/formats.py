@@ -66,7 +66,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "figures": Format(
         writer="results:export_figures",
-        summary="every figure as PNG or SVG",
+        summary="every figure as PNG or SVG, and the curves of sweeps",
         options=frozenset({"cell"}),
     ),
     "geojson": Format(
