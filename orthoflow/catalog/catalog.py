@@ -239,6 +239,9 @@ class Catalog:
         kind, _, name = method_id.partition(".")
         siblings = {other.partition(".")[2]: other for other in self._of_kind(kind)}
         if not siblings:
+            same = [other for other in self.methods if other.partition(".")[2] == method_id]
+            if same:
+                return f" (did you mean {' or '.join(same)}?)"
             return did_you_mean(method_id, self.methods)
         if near := nearest(name, siblings):
             return f" (did you mean {siblings[near]}?)"

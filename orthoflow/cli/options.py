@@ -134,7 +134,8 @@ def execution_options(command: _Decorated) -> _Decorated:
         "--executor",
         type=click.Choice(["local", "inline", "dask"]),
         default="local",
-        help="A process per step, all in this one (for debugging), or on the workers of dask.",
+        help="A process per step, all in this one (for debugging; a step's memory then holds what "
+        "earlier ones left, too), or on the workers of dask.",
     )(command)
     return click.option(
         "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."

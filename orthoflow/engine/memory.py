@@ -98,10 +98,12 @@ class MemorySampler:
         self._peak_anonymous = 0
         self._peak_files = 0
         self._peak_resident = 0
+        self._earlier_peak = 0
         self.processor_s = 0.0
 
     def __enter__(self) -> Self:
         self._note()
+        self._earlier_peak = self._peak_resident
         self._thread = start_beside(self._sample)
         return self
 
@@ -116,9 +118,11 @@ class MemorySampler:
         """Largest own memory in MiB.
 
         Between two samples the kernel's mark of all resident memory less the largest part that
-        mapped files ever took is a lower bound.
+        mapped files ever took is a lower bound; of a process in which other steps ran before, where
+        the mark rose.
         """
-        proven = self._peak_resident - self._peak_files
+        has_risen = self._peak_resident > self._earlier_peak
+        proven = self._peak_resident - self._peak_files if has_risen else 0
         return round(max(self._peak_anonymous, proven) / MIB, 1)
 
     def _sample(self) -> None:

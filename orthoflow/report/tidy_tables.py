@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -80,7 +81,10 @@ def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
 
 
 def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
-    """Give a header, then a row per metric and combination of what holds over all datasets."""
+    """Give a header, then a row per metric and combination of what holds over all datasets.
+
+    What nobody knows, p of two datasets say, is an empty cell.
+    """
     yield (
         *("step", "metric", "combination", "against", "datasets", "failed", "absent"),
         *(
@@ -102,16 +106,21 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
             yield (
                 *(metric.step, metric.metric, one.name, one.against),
                 *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
-                *(one.median, one.spread),
+                *map(_known, (one.median, one.spread)),
                 *(
                     ("",) * 7
                     if paired is None
                     else (
-                        *(paired.n, paired.wins, paired.losses, paired.median),
-                        *(paired.p, paired.effect, " ".join(paired.deciding)),
+                        *(paired.n, paired.wins, paired.losses, _known(paired.median)),
+                        *(_known(paired.p), _known(paired.effect), " ".join(paired.deciding)),
                     )
                 ),
             )
+
+
+def _known(value: float) -> float | None:
+    # No difference where more is better is -0.0.
+    return None if math.isnan(value) else value + 0.0
 
 
 def _status(one: Combination, cells: Sequence[RecordedCell]) -> str:

@@ -88,6 +88,9 @@ def load_workflow(
     if table is None:
         log.raise_any()
         raise WorkflowError(f"{name_or_path} holds no workflow")
+    if table.get(STEPS.name) is None:
+        # All else names steps: each of these names would be one more complaint.
+        log.raise_any()
     options = _Options(
         sets=tuple(sets),
         inputs=tuple(inputs),

@@ -27,6 +27,7 @@ from orthoflow.files.yaml_positions import (
     read_yaml,
 )
 from orthoflow.products.product import JsonValue
+from orthoflow.workflow.format import CALL, PARAMS
 from orthoflow.workflow.hints import meant_number, meant_parameter, written_form
 from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
@@ -34,6 +35,8 @@ from orthoflow.workflow.steps import DraftStep, DraftVariant
 
 Report: TypeAlias = Callable[[str], None]
 
+# Keys of a call that are written among its parameters.
+_BESIDE: Final = {key.name for key in CALL.keys} - {PARAMS.name}
 # Letters of a value that a message repeats.
 _SHOWN: Final = 60
 # What pydantic calls a list or a mapping of another form, and a value of another type in one.
@@ -242,6 +245,8 @@ class _Reporter:
                 known = tuple(self.info.method.Params.model_fields) if len(location) == 1 else ()
                 listed = f"; {self.info.id} has {', '.join(known) or 'none'}" if known else ""
                 meant = meant_parameter(name, known, details["input"]) or did_you_mean(name, known)
+                if known and name in _BESIDE:
+                    meant = f" ({name} stands beside params, not in it)"
                 return f"unknown parameter {name}{meant}{listed}"
             case "missing":
                 return f"{self.info.id} needs parameter {name}"

@@ -291,6 +291,8 @@ def test_an_unknown_method_gets_a_suggestion_of_its_kind(monkeypatch: pytest.Mon
         catalog.method("plane.voxels")
     with pytest.raises(WorkflowError, match=r"plain\.ransac \(did you mean plane\.ransac\?\)"):
         catalog.method("plain.ransac")
+    with pytest.raises(WorkflowError, match=r"ransac \(did you mean plane\.ransac\?\)"):
+        catalog.method("ransac")
 
 
 def test_an_unknown_method_mentions_plugins_that_failed(

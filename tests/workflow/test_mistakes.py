@@ -17,6 +17,11 @@ from tests.laboratories import (
 
 STEP = "x: {use: plane.hough2d, in: {cloud: cloud.cloud}%s}"
 CASES = {
+    "key of the call": (
+        STEP % ", params: {repeat: 3}",
+        "steps.x.params.repeat",
+        "unknown parameter repeat (repeat stands beside params, not in it); plane.hough2d has",
+    ),
     "unknown parameter": (
         STEP % ", params: {cel_m: 1}",
         "steps.x.params.cel_m",
@@ -259,6 +264,13 @@ def test_a_workflow_without_steps_is_refused(
     steps: str, message: str, catalog: Catalog, write: Path
 ) -> None:
     assert problems(f"orthoflow: 1\n{steps}\n", write, catalog)[0][2:] == ("steps", message)
+
+
+def test_without_steps_nobody_is_told_of_each_that_is_not_there(
+    catalog: Catalog, write: Path
+) -> None:
+    text = "orthoflow: 1\nstep: {x: 1}\ncompare: {baseline: {plane: a}}\n"
+    assert [one[2] for one in problems(text, write, catalog)] == ["steps", "step"]
 
 
 COMPARISONS = {
