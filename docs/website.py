@@ -57,6 +57,10 @@ _MASKS: Final[dict[type, dict[object, str]]] = {
     LayerMask: {**LAYER_MASK_MEANINGS},
     OrthoMask: {**ORTHO_MASK_MEANINGS},
 }
+_NO_SEARCH: Final = (
+    '<script>location.protocol === "file:" && document.documentElement.classList.add("by-file")'
+    "</script><style>.by-file .md-search, .by-file [for=__search] {display: none}</style>"
+)
 _METRICS_HEAD: Final = "| metric | what | unit | good side | of |\n|---|---|---|---|---|"
 _LINK: Final = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -315,6 +319,13 @@ def build(output: Path) -> None:
         quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
         if subprocess.run(command, check=False, env=quiet).returncode:
             raise SystemExit("the site has mistakes, see above")
+    # Browsers let no script read the index of words from a file.
+    for page in output.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        page.write_text(text.replace("</head>", f"{_NO_SEARCH}</head>", 1), encoding="utf-8")
+    sys.stdout.write(
+        f"open {output / 'index.html'}; for its search: python -m http.server -d {output}\n"
+    )
 
 
 if __name__ == "__main__":

@@ -114,7 +114,11 @@ def _described(name: str, node: Definition | None) -> Iterator[str]:
         yield f"{name}({bases})" if bases else name
         for item in node.body:
             if isinstance(item, ast.FunctionDef) and not item.name.startswith("_"):
-                yield f"{name}.{item.name}{_signature(item)}"
+                if any(ast.unparse(mark).endswith("property") for mark in item.decorator_list):
+                    returns = f": {ast.unparse(item.returns)}" if item.returns else ""
+                    yield f"{name}.{item.name}{returns} (property)"
+                else:
+                    yield f"{name}.{item.name}{_signature(item)}"
             elif isinstance(item, ast.AnnAssign) and not ast.unparse(item.target).startswith("_"):
                 has_default = " = ..." if item.value is not None else ""
                 annotation = ast.unparse(item.annotation)

@@ -239,7 +239,8 @@ def _parsed(lines: bytes) -> list[JournalLine]:
 
 def _is_finished(folder: Path) -> ArgumentError:
     return ArgumentError(
-        f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o"
+        f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o (in Python: "
+        "output=), or look at this one (orthoflow show; orthoflow.open_run)"
     )
 
 

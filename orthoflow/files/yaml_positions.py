@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Final, Protocol, TypeAlias
 
 from ruamel.yaml import YAML
@@ -188,7 +189,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
             yaml.parser.most_values = dialect.most_values
             node: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
-        raise _unreadable(error) from error
+        raise _unreadable(error, text) from error
     except YAMLError as error:
         raise _UnreadableError(
             _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
@@ -263,13 +264,16 @@ _OPENED: Final = {
 }
 
 
-def _unreadable(error: MarkedYAMLError) -> _UnreadableError:
+def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     """Say what the parser stumbled over where it was written, not where it was noticed."""
     problem, context = str(error.problem or ""), str(error.context or "")
     noticed = _mark_position(error.problem_mark)
     words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
     if "\\t" in problem:
         return _UnreadableError(noticed, "this is not YAML: a tab stands here; indent with spaces")
+    stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
+    if re.search(r":[\[{]$", text[: stumbled + 1]):
+        return _UnreadableError(noticed, "this is not YAML: put a space behind the colon")
     if context in _OPENED and error.context_mark is not None:
         opened = _mark_position(error.context_mark)
         where = f"noticed in line {noticed.line}"
@@ -316,6 +320,7 @@ class _Converter:
         if str(node.tag) not in (_TAG + "map", _TAG + "seq"):
             self._refuse_tag(node, position, path)
         if isinstance(node, SequenceNode):
+            self._doubt_commas(node, path)
             items = (
                 self.convert(item, f"{path}[{index}]", depth + 1)
                 for index, item in enumerate(node.value)
@@ -335,6 +340,25 @@ class _Converter:
         if not self.dialect.is_strict:
             self._merge(entries, position, path)
         return Table(position=position, entries=tuple(entries.values()))
+
+    def _doubt_commas(self, node: SequenceNode, path: str) -> None:
+        """Refuse what a decimal comma leaves of a number: `[0,02]` is 0 and 02."""
+        for index, (before, item) in enumerate(pairwise(node.value), start=1):
+            is_split = (
+                self.dialect.is_strict
+                and isinstance(before, ScalarNode)
+                and isinstance(item, ScalarNode)
+                and item.start_mark.index == before.end_mark.index + 1
+                and str(before.tag) == str(item.tag) == _TAG + "int"
+                and re.fullmatch(r"0\d+", str(item.value)) is not None
+            )
+            if is_split:
+                self.log.add(
+                    _mark_position(before.start_mark),
+                    f"{path}[{index - 1}]",
+                    f"{before.value},{item.value} is two numbers; decimals have a point: "
+                    f"{before.value}.{item.value}",
+                )
 
     def _key(self, node: Node, position: Position, path: str) -> tuple[str, bool]:
         """Give a key and whether it is text."""

@@ -167,8 +167,8 @@ class Run:
         if not outputs[port].embedded:
             raise RecordError(
                 f"{self.path} names {address}.{port} only by its digest: it is in the store of the "
-                f"run, from which `orthoflow export {shlex.quote(str(self.path))} --embed` puts "
-                "every product into a record"
+                f"run, from which `orthoflow export {shlex.quote(str(self.path))} --embed` (with "
+                "`--store` from another folder than the run's) puts every product into a record"
             )
 
     def product(self, address: str, port: str) -> Product:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import ArgumentError, PluginError
+from orthoflow.errors import ArgumentError, PluginError, RecordError
 from orthoflow.files.images import cells_webp
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
@@ -106,13 +107,17 @@ class OpenedRun(Run):
         from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
 
         output = self.cell(address).outputs.get(port)
+        if output is None or output.embedded:
+            return super().product(address, port)
         # Asking makes the folder of a store that is not there.
-        if output is not None and not output.embedded and Path(store).is_dir():
-            stored = Store(Path(store))
-            if stored.product_file(output.digest) is not None:
-                cls = discover_catalog().product_class(output.type_name)
-                return stored.get_product(output.digest, cls)
-        return super().product(address, port)
+        stored = Store(Path(store)) if Path(store).is_dir() else None
+        if stored is None or stored.product_file(output.digest) is None:
+            raise RecordError(
+                f"{self.path} names {address}.{port} only by its digest, and "
+                + (f"there is no store {store}" if stored is None else f"{store} has it not")
+                + ": name the store of the run, as store='FOLDER/.orthoflow'"
+            )
+        return stored.get_product(output.digest, discover_catalog().product_class(output.type_name))
 
     def verify(self) -> Verification:
         """Check all of the record and the published files beside it, as `orthoflow verify` does."""
@@ -220,6 +225,12 @@ def open_run(path: str | Path) -> OpenedRun:
     return OpenedRun(path=plain.path, record=plain.record)
 
 
+class NoFigureError(ArgumentError, KeyError):
+    """A run has no figure of a name; a `KeyError` as of every mapping, which says what there is."""
+
+    __str__ = Exception.__str__  # KeyError would put the sentence between quotes
+
+
 class Figures(Mapping[str, RecordedFigure]):
     """Pictures by name."""
 
@@ -227,7 +238,12 @@ class Figures(Mapping[str, RecordedFigure]):
         self._figures = dict(figures)
 
     def __getitem__(self, name: str) -> ShownFigure:
-        figure = self._figures[name]
+        figure = self._figures.get(name)
+        if figure is None:
+            raise NoFigureError(
+                f"the run has no figure {name}{did_you_mean(name, self._figures)}; it has "
+                f"{first_few(list(self._figures), most=_FIGURES_MOST) or 'none'}"
+            )
         return ShownFigure(**vars(figure))
 
     def __iter__(self) -> Iterator[str]:

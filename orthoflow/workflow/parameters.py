@@ -301,8 +301,10 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     try:
         log.raise_any()
     except InvalidWorkflowError as error:
+        # A shell would have parted it at the space.
+        way_out = "" if " " in raw.strip() else "; quote it"
         raise ArgumentError(
-            f"the value cannot be read as YAML: {error.problems[0].message}; quote it"
+            f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
         ) from error
     return parts, None if value is None else plain(value)
 

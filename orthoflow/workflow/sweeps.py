@@ -120,7 +120,8 @@ def _once(values: _Values) -> _Values:
         whole = int(value) if isinstance(value, float) and value.is_integer() else value
         text = json.dumps(whole, sort_keys=True)
         if text in kept:
-            report(f"{json.dumps(value)} is swept twice; leave one of them out")
+            comma = "; if it begins numbers, decimals have a point: 0.5" if value == 0 else ""
+            report(f"{json.dumps(value)} is swept twice; leave one of them out{comma}")
         kept.setdefault(text, (value, report))
     return list(kept.values())
 

@@ -246,13 +246,28 @@ def test_the_place_of_what_the_reader_refuses_is_told() -> None:
             (1, 10, "a"),
             "a key must be text, got 003; if it ends a number, decimals have a point: 0.003",
         ),
+        (
+            "a: [1, 0,05]",
+            (1, 8, "a[1]"),
+            "0,05 is two numbers; decimals have a point: 0.05",
+        ),
+        ("a: {b:[1, 2]}", (1, 7, ""), "this is not YAML: put a space behind the colon"),
         ("a: {1.5: x}", (1, 5, "a"), "a key must be text, got 1.5"),
         ("a: {: x}", (1, 6, "a"), "a key must be text, got nothing"),
         ("a: !foo {b: 1}", (1, 4, "a"), "tags are not allowed in a workflow, got !foo"),
         ("b: !foo [1]", (1, 4, "b"), "tags are not allowed in a workflow, got !foo"),
         (f"a: 0x{'1' * 999}", (1, 4, "a"), f"'0x{'1' * 98}...' is no int"),
     ],
-    ids=["decimal comma", "number", "nothing", "mapping", "list", "long"],
+    ids=[
+        "decimal comma",
+        "comma in a list",
+        "colon",
+        "number",
+        "nothing",
+        "mapping",
+        "list",
+        "long",
+    ],
 )
 def test_a_strange_value_is_told_in_whole(
     text: str, place: tuple[int, int, str], words: str
@@ -331,7 +346,9 @@ def test_a_key_that_is_no_word_is_told_once_and_stands_as_one() -> None:
 
 
 def test_what_the_library_tells_without_a_place_is_told_of_the_first_letter() -> None:
-    told = yaml_positions._unreadable(MarkedYAMLError("while composing", None, "odd  words", None))
+    told = yaml_positions._unreadable(
+        MarkedYAMLError("while composing", None, "odd  words", None), ""
+    )
     assert (str(told), told.position) == (
         "this is not YAML: while composing, odd words",
         Position(line=1, column=1),

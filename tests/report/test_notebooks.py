@@ -251,6 +251,7 @@ def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
 def test_products_that_a_record_only_names_come_from_the_store(tmp_path: Path) -> None:
     zeros = np.zeros(3, np.float32)
     cloud = PointCloud(origin=np.zeros(3), x=zeros, y=zeros, z=zeros, up=np.eye(3)[2])
+    other = PointCloud(origin=np.ones(3), x=zeros, y=zeros, z=zeros, up=np.eye(3)[2])
     store = Store(tmp_path / "store")
     digest = store.put_product(cloud).digest
     output = RecordedProduct(type_name="cloud", encoding_version=1, digest=digest)
@@ -258,8 +259,16 @@ def test_products_that_a_record_only_names_come_from_the_store(tmp_path: Path) -
         path=tmp_path / "run.h5", record=record([cell("scan", outputs={"cloud": output})])
     )
     assert len(run.product("scan", "cloud", store=tmp_path / "store")) == 3
-    with pytest.raises(RecordError, match=r"only by its digest: .* `orthoflow export .* --embed`"):
+    with pytest.raises(RecordError, match=r"by its digest, and there is no store .*, as store='F"):
         run.product("scan", "cloud", store=tmp_path / "none")
+    Store(tmp_path / "other").put_product(other)
+    with pytest.raises(
+        RecordError, match=r"other has it not: name the store of the run, as store="
+    ):
+        run.product("scan", "cloud", store=tmp_path / "other")
+    with pytest.raises(KeyError, match=r"^the run has no figure scan/plan; it has none$"):
+        run.figures["scan/plan"]
+    assert run.figures.get("scan/plan") is None
     assert not (tmp_path / "none").exists()
 
 
@@ -290,7 +299,7 @@ def test_what_is_wrong_with_a_workflow_is_raised(
         ({"scan": ["a.e57", Path("b.e57")]}, r"^input scan@hall: there is no file a\.e57 in the w"),
         ({"scan": 1}, r"^datasets=: hall\.scan: expected a text, got 1"),
         (0.1, r"^datasets=: hall: expected a mapping, got 0\.1"),
-        ({"scan": {1}}, r"^datasets=\['hall'\]\['scan'\] must be a path, a text, .* got \{1\}"),
+        ({"scan": {1}}, r"^datasets\['hall'\]\['scan'\] must be a path, a text, .* got \{1\}"),
     ):
         with pytest.raises(OrthoflowError, match=message):
             orthoflow.run("direct.yaml", datasets={"hall": said})  # type: ignore[dict-item]
