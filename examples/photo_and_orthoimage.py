@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import orthoflow
 from orthoflow.files.images import decode_image, encode_jpeg, stretch_to_grey
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry import eight_bits
 from orthoflow.products import Orthoimages, OrthoMask, Photos, Walls
 
 HEIGHT_PX = 360

@@ -189,7 +189,10 @@ class Catalog:
         Raises:
             PluginError: nobody brings the type, several do, or it fails to import.
         """
-        from orthoflow.catalog.loading import import_target  # noqa: PLC0415 - loads pydantic
+        from orthoflow.catalog.loading import (  # noqa: PLC0415 - loads pydantic
+            import_target,
+            product_complaint,
+        )
         from orthoflow.products.product import Product  # noqa: PLC0415 - loads numpy
 
         entry = self._product(type_name)
@@ -199,10 +202,15 @@ class Catalog:
                 f"product type {type_name} of {entry.distribution} breaks a rule: "
                 f"{entry.spec.target} must be a subclass of Product"
             )
-        if cls.type_name != type_name:
+        own = getattr(cls, "type_name", None)
+        if own != type_name:
             raise PluginError(
-                f"product type {type_name} of {entry.distribution} breaks a rule: its class says "
-                f"{cls.type_name}"
+                f"product type {type_name} of {entry.distribution} breaks a rule: it is announced "
+                f"as {type_name}, but {entry.spec.target} says type_name {own!r}"
+            )
+        if complaint := product_complaint(cls):
+            raise PluginError(
+                f"product type {type_name} of {entry.distribution} breaks a rule: {complaint}"
             )
         return cls
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import PluginError
+from orthoflow.products.product import Product
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec
 from orthoflow.sdk.methods import (
     Determinism,
@@ -81,7 +84,11 @@ def load_method(
     complaint = _class_complaint(method, spec)
     if not complaint:
         try:
-            complaint = _port_complaint(method, kind, product_types) or _mapping_complaint(method)
+            complaint = (
+                _port_complaint(method, kind, product_types)
+                or _mapping_complaint(method)
+                or next(filter(None, map(product_complaint, _products_of(method.Out))), "")
+            )
         except (PluginError, NameError, TypeError) as error:
             complaint = f"its ports cannot be read: {describe_error(error)}"
     if complaint:
@@ -94,6 +101,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     version: object = method.result_version
     citations: object = method.citations
     labels: object = method.metric_labels
+    strays = _undeclared(method)
     rules = {
         f"its class says id {own_id!r}": own_id == spec.id,
         "its Params must be a subclass of MethodParams": _is_subclass(
@@ -114,9 +122,61 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
             isinstance(labels, Mapping)
             and all(isinstance(label, MetricLabel) for label in labels.values())
         ),
+        f"metric_labels names {', '.join(strays)}, which metrics does not declare": not strays,
         "it has no run": method.run is not Method.run or bool(method.maps_over),
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
+
+
+def _undeclared(method: type[Method]) -> list[str]:
+    """Labels of metrics that a method does not declare, where it declares any."""
+    declared, labels = tuple(method.metrics), method.metric_labels
+    if not declared or not isinstance(labels, Mapping):
+        return []
+    return [
+        f"{label}{did_you_mean(label, declared)}"
+        for label in map(str, labels)
+        if not any(fnmatchcase(name, label) or fnmatchcase(label, name) for name in declared)
+    ]
+
+
+def product_complaint(cls: type[Product]) -> str:
+    """Say which name in the class of a product is none of its fields; empty when all are."""
+    own: Mapping[str, object] | None = getattr(cls, "__dataclass_fields__", None)
+    if own is None:
+        return f"{cls.__qualname__} must be a frozen dataclass"
+    within: Mapping[str, object] = dict.fromkeys(_names_within(cls, set()))
+    named = [("items", cls.items, own)] if cls.items else []
+    named += [("item_name", cls.item_name, within)] if cls.item_name != Product.item_name else []
+    named += [("tolerances", name, within) for name in cls.tolerances]
+    return next(
+        (
+            f"{attribute} of {cls.__qualname__} names {name}, which is no field"
+            f"{did_you_mean(name, known)}"
+            for attribute, name, known in named
+            if name not in known
+        ),
+        "",
+    )
+
+
+def _names_within(hint: object, seen: set[object]) -> Iterator[str]:
+    """Names of the fields of a dataclass, and of those in its fields."""
+    for part in typing.get_args(hint):
+        yield from _names_within(part, seen)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint not in seen:
+        seen.add(hint)
+        hints = typing.get_type_hints(hint)
+        for field in dataclasses.fields(hint):
+            yield field.name
+            yield from _names_within(hints[field.name], seen)
+
+
+def _products_of(ports: type[Ports]) -> Iterator[type[Product]]:
+    for hint in typing.get_type_hints(ports).values():
+        for cls in (hint, *typing.get_args(hint)):
+            if isinstance(cls, type) and issubclass(cls, Product):
+                yield cls
 
 
 def _is_subclass(candidate: object, parent: type) -> bool:
@@ -135,7 +195,14 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
                 f"input port {port.name} carries {kind.inputs[port.name]} in kind {kind.name}, "
                 f"not {port.type_name}"
             )
-    if {port.name: port.type_name for port in given.values()} != dict(kind.outputs):
+    for port in given.values():
+        wanted = kind.outputs.get(port.name, port.type_name)
+        if port.type_name != wanted:
+            return (
+                f"its output port {port.name} takes a class whose type_name is "
+                f"'{port.type_name}', not '{wanted}' as in kind {kind.name}"
+            )
+    if given.keys() != kind.outputs.keys():
         return (
             f"its outputs must be {_join(kind.outputs)} as in kind {kind.name}, got {_join(given)}"
         )

@@ -24,6 +24,11 @@ Unit = Literal["m", "px", "grey", "deg", "1"]
 _ARRAY: Final = "$array"
 # Arrays of more than this are memory-mapped, whatever their product: nobody holds them in memory.
 _LARGE_BYTES: Final = 1 << 30
+# What values that do not go with each other may raise where a product looks at itself.
+_NO_SENSE: Final = (
+    *(AttributeError, IndexError, KeyError),
+    *(TypeError, ValueError, GeometryError),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,15 +114,25 @@ class Product:
                 f"{cls.type_name} has encoding version {payload.encoding_version}, this orthoflow "
                 f"reads version {cls.encoding_version} and older: use the orthoflow that wrote it"
             )
-        if payload.encoding_version < cls.encoding_version:
+        stored = payload.encoding_version
+        if stored < cls.encoding_version:
             payload = cls.upgraded(payload)
-        return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
+        try:
+            return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
+        except _LackingFieldsError as error:
+            # Whoever mends it is the author of the class: a record that is read is sealed.
+            raise ProductError(
+                f"{error}: it has encoding_version {stored}, {cls.__name__} has "
+                f"{cls.encoding_version}; give new fields a default, or let "
+                f"{cls.__name__}.upgraded fill them in for versions below"
+            ) from error
 
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:
         """Give a payload of an older encoding as the present one has it.
 
-        Fields that are new have defaults; a subclass moves what stood elsewhere before.
+        Fields that are new have defaults, which are taken; a subclass moves what stood elsewhere
+        before. It is not asked where the version is the present one: raise that with the fields.
         """
         return dataclasses.replace(payload, encoding_version=cls.encoding_version)
 
@@ -170,6 +185,10 @@ def _json_scalar(value: object, name: str) -> JsonValue:
     raise ProductError(f"{name} holds a {type(value).__name__}, which no product can store")
 
 
+class _LackingFieldsError(ProductError):
+    """What was stored has no value for a field without a default."""
+
+
 def _decode_fields(
     cls: type, prefix: str, metadata: Mapping[str, JsonValue], arrays: Mapping[str, Array]
 ) -> object:
@@ -179,15 +198,21 @@ def _decode_fields(
         if field.name in metadata:
             name = prefix + field.name
             values[field.name] = _decode(hints[field.name], metadata[field.name], name, arrays)
+    lacking = [field.name for field in dataclasses.fields(cls) if _is_lacking(field, values)]
+    if lacking:
+        raise _LackingFieldsError(f"a stored {cls.__name__} lacks fields: {', '.join(lacking)}")
     try:
         return cls(**values)
-    except TypeError as error:
-        raise ProductError(f"a stored {cls.__name__} lacks fields: {error}") from error
     except ProductError:
         raise
-    except (AttributeError, IndexError, KeyError, ValueError, GeometryError) as error:
+    except _NO_SENSE as error:
         # Arrays of too few dimensions, where a product looks at its own before it judges them.
         raise ProductError(f"a stored {cls.__name__} makes no sense: {error}") from error
+
+
+def _is_lacking(field: dataclasses.Field[object], values: Mapping[str, object]) -> bool:
+    no_default = field.default is dataclasses.MISSING is field.default_factory
+    return field.init and no_default and field.name not in values
 
 
 @cache

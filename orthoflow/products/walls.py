@@ -260,7 +260,7 @@ class Orthoimage:
         wall: index of the wall in `Walls`.
         name: label of the wall.
         rgb: (rows, cols, 3) uint8, or uint16 of deep photos, as the sources have them, 0 where
-            nothing is shown; `geometry.levels.eight_bits` gives them in 8 bits.
+            nothing is shown; `geometry.eight_bits` gives them in 8 bits.
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.

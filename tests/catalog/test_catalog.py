@@ -19,6 +19,8 @@ from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.planes import Planes
+from orthoflow.products.product import Product
+from orthoflow.products.walls import Walls
 from orthoflow.sdk.methods import PortSpec
 from tests.laboratories import (
     LABORATORY,
@@ -317,7 +319,7 @@ CLASS = """\
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.planes import Planes, PointLabels
 from orthoflow.products.walls import Walls
-from orthoflow.sdk import Method, MethodParams, Ports
+from orthoflow.sdk import Method, MethodParams, MetricLabel, Ports
 
 class Mine(Method):
     id = "plane.mine"
@@ -356,9 +358,19 @@ CHANGES = {
         "    metric_labels = {'n': 'damp'}\n    Params",
         "metric_labels must give names a MetricLabel each",
     ),
+    "label of no metric": (
+        "    Params",
+        "    metrics = ('damp',)\n    metric_labels = {'dam': MetricLabel(words='d')}\n    Params",
+        "metric_labels names dam (did you mean damp?), which metrics does not declare",
+    ),
     "invented port": ("cloud: P", "cloud: PointCloud\n        more: P", "kind plane has no input"),
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
     "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),
+    "other output": (
+        "labels: PointLabels",
+        "labels: Planes",
+        "port labels takes a class whose type_name is 'planes', not 'labels' as in kind plane",
+    ),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
     "no items to map over": (
         "    Params",
@@ -403,6 +415,24 @@ def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
     catalog = with_plugin("made", text, tmp_path, monkeypatch, made_class=source)
     entry = catalog.method("plane.mine")
     assert entry.looked_at() is entry
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"items": "wals"}, "items of Own names wals, which is no field (did you mean walls?)"),
+        ({"item_name": "nam"}, "item_name of Own names nam, which is no field"),
+        ({"tolerances": {"rbg": 1}}, "tolerances of Own names rbg, which is no field"),
+        ({"items": "walls", "tolerances": {"depth_m": 1, "gsd_m": 1}}, ""),
+    ],
+)
+def test_names_in_a_product_are_those_of_its_fields(
+    change: dict[str, object], complaint: str
+) -> None:
+    own = type("Own", (Walls,), change)
+    assert loading.product_complaint(own).startswith(complaint)
+    assert bool(loading.product_complaint(own)) == bool(complaint)
+    assert loading.product_complaint(Product) == "Product must be a frozen dataclass"
 
 
 def test_a_port_of_a_source_carries_what_somebody_announces() -> None:
@@ -470,7 +500,9 @@ def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.Monke
     )
     publish = catalog.publisher("notes")
     assert publish is not None
-    with pytest.raises(PluginError, match=r"product type notes of press .* its class says planes"):
+    with pytest.raises(
+        PluginError, match=r"product type notes of press .* says type_name .planes."
+    ):
         catalog.product_class("notes")
 
 

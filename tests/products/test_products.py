@@ -226,7 +226,8 @@ def test_a_payload_that_lacks_an_array_is_refused() -> None:
 
 def test_a_payload_that_lacks_a_field_is_refused() -> None:
     payload = Payload(type_name="walls", encoding_version=1, metadata={}, arrays={})
-    with pytest.raises(ProductError, match="lacks fields"):
+    said = r"lacks fields: walls, .*: it has encoding_version 1, Walls has \d+; give new fields a"
+    with pytest.raises(ProductError, match=said):
         Walls.from_payload(payload)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry import eight_bits
 from orthoflow.products import Orthoimages, OrthoMask
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from pydantic import Field
