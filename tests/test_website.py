@@ -11,6 +11,7 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.workflow.methods import describe_method
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -32,6 +33,20 @@ def test_words_of_messages_are_said_somewhere() -> None:
     for line in table:
         for words in re.findall(r"`([^`]+)`", line.split("|")[1]):
             assert words in sources or words == "No space left on device", words
+
+
+def test_parameters_that_are_said_to_help_exist(catalog: Catalog) -> None:
+    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    kinds = {"cloud": "read", "wall": "raster"} | {kind: kind for kind in catalog.kinds}
+    named = re.findall(r"`([a-z]+)\.([a-z_]+)(?:=[^`]*)?`", text)
+    known = {
+        (name.partition(".")[0], parameter)
+        for name in catalog.methods
+        for parameter in describe_method(catalog, name).method.Params.model_fields
+    }
+    asked = {(kinds[step], parameter) for step, parameter in named if step in kinds}
+    assert len(asked) > 5
+    assert asked <= known
 
 
 def site() -> ModuleType:
