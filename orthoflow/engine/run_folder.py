@@ -27,6 +27,7 @@ from orthoflow.system import file_lock, flags
 JOURNAL: Final = "journal.jsonl"
 RECORD_FILE: Final = "run.h5"
 LOGS: Final = "logs"
+_ANOTHER: Final = "choose another folder with -o (in Python: output=)"
 _FORMAT: Final = "orthoflow/journal/1"
 _LONGEST_FILE_NAME: Final = 200  # bytes, with room for a suffix; file systems stop at 255
 
@@ -172,7 +173,7 @@ class Journal:
         if not self._lock.take(is_shared=False, waits=False):
             raise StoreError(
                 f"the run folder {self._folder} is in use by another run; wait for its end, or "
-                f"choose another folder with -o"
+                f"{_ANOTHER}"
             )
         lines = self._read_lines()
         if (self._folder / RECORD_FILE).exists():
@@ -185,7 +186,7 @@ class Journal:
         if first.workflow != name:
             raise ArgumentError(
                 f"{self._folder} holds an unfinished run of {first.workflow}, not of "
-                f"{name}; choose another folder with -o"
+                f"{name}; {_ANOTHER}"
             )
         self.run_id = first.run_id
         self.damaged = {line.address: line.what for line in lines if isinstance(line, CellDamaged)}
@@ -223,9 +224,7 @@ class Journal:
             raise self._damage() from error
 
     def _damage(self) -> StoreError:
-        return StoreError(
-            f"{self._path} is damaged; remove {self._folder} or choose another folder with -o"
-        )
+        return StoreError(f"{self._path} is damaged; remove {self._folder} or {_ANOTHER}")
 
 
 @cache
@@ -239,8 +238,8 @@ def _parsed(lines: bytes) -> list[JournalLine]:
 
 def _is_finished(folder: Path) -> ArgumentError:
     return ArgumentError(
-        f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o (in Python: "
-        "output=), or look at this one (orthoflow show; orthoflow.open_run)"
+        f"{folder} holds a finished run ({RECORD_FILE}); {_ANOTHER}, or look at this one "
+        "(orthoflow show, orthoflow.open_run)"
     )
 
 
@@ -255,8 +254,7 @@ def _check_folder(folder: Path) -> None:
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             what = "a link" if path.is_symlink() else "a pipe or a device"
             raise ArgumentError(
-                f"{folder} holds {what}, {path.name}, as no run makes them; choose another folder "
-                "with -o"
+                f"{folder} holds {what}, {path.name}, as no run makes them; {_ANOTHER}"
             )
     if (folder / RECORD_FILE).exists():
         lines: list[JournalLine] = []
@@ -267,9 +265,7 @@ def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         return
     if not (folder / JOURNAL).exists() and any(folder.iterdir()):
-        raise ArgumentError(
-            f"{folder} is not empty and holds no unfinished run; choose another folder with -o"
-        )
+        raise ArgumentError(f"{folder} is not empty and holds no unfinished run; {_ANOTHER}")
 
 
 def is_running(folder: Path) -> bool:
