@@ -16,6 +16,7 @@ import numpy as np
 from orthoflow.foreign_text import shown
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
+from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of, wanted_metrics
 from orthoflow.report.comparisons import Column, comparison_columns
@@ -74,8 +75,9 @@ class Curve:
         return alone.encode("utf-8")
 
 
-def curve_files(run: Run, parts: Mapping[str, Run]) -> dict[str, bytes]:
+def curve_files(run: Run) -> dict[str, bytes]:
     """Give the drawings of a run, over its datasets where it has several, as SVG files by name."""
+    parts = parts_of(run)
     drawn = curves_over(parts) if len(parts) > 1 else curves(run)
     # What a record calls its steps and metrics may be no name of a file.
     names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)

@@ -95,7 +95,11 @@ def test_a_run_from_python_is_one_of_the_command(studio: Studio) -> None:
         executor="inline",
     )
     record = opened.record
-    assert record.overrides == ("--set paint.grey=7", "--input number=n.txt")
+    assert record.overrides == (
+        "--set paint.grey=7",
+        "--input number=n.txt",
+        "--only survey",
+    )
     assert [(cell.address, cell.status) for cell in record.cells] == [("survey", "ok")]
     assert [file.name for entry in record.inputs for file in entry.files] == ["n.txt"]
     assert (studio.folder / "r" / "run.h5").is_file()

@@ -405,7 +405,7 @@ def test_a_negative_error_of_one_dataset_is_no_good_one(tmp_path: Path) -> None:
 def test_a_drawing_stands_alone_as_a_file(tmp_path: Path) -> None:
     cells = [replace(one, step="a/b") for one in swept(0.02, 0.05)]  # type: ignore[type-var]
     cells = [replace(one, assignment={"a/b": one.assignment["plane"]}) for one in cells]
-    [(name, data)] = curve_files(held(tmp_path, cells), {}).items()
+    [(name, data)] = curve_files(held(tmp_path, cells)).items()
     assert name == "01_a_b.rms_mm_over_a_b.tolerance_m.svg"
     root = ET.fromstring(data)
     drawn = {name for one in root.iter() if (name := one.get("class"))}

@@ -51,7 +51,6 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     """Write the figures of all cells and the curves of sweeps, or the figures of one cell."""
     from functools import partial
 
-    from orthoflow.records.datasets import parts_of
     from orthoflow.records.run_files import figure_files, write_files
     from orthoflow.report import write_figures
     from orthoflow.report.curves import curve_files
@@ -64,7 +63,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     left_out = ""
     if n_written < n_figures:
         left_out = f"; {n_figures - n_written} left out, damaged or more than a drawing"
-    curves = curve_files(run, parts_of(run)) if chosen.cell is None else {}
+    curves = curve_files(run) if chosen.cell is None else {}
     write_files(folder, {f"curves/{name}": partial(bytes, data) for name, data in curves.items()})
     drawn = f", {counted(len(curves), 'curve')}" if curves else ""
     return f"{counted(n_written, 'figure')}{drawn} and the graph{left_out}"

@@ -25,8 +25,8 @@ class Cells(SimpleNamespace):
 @pytest.mark.parametrize(
     ("cell", "n_written", "said"),
     [
-        (None, 3, "3 figures and the graph"),
-        (None, 1, "1 figure and the graph; 2 left out, damaged or more than a drawing"),
+        (None, 3, "3 figures, 1 curve and the graph"),
+        (None, 1, "1 figure, 1 curve and the graph; 2 left out, damaged or more than a drawing"),
         ("b", 1, "1 figure and the graph"),
     ],
 )
@@ -41,9 +41,13 @@ def test_figures_that_could_not_be_written_are_counted(
 
     monkeypatch.setattr("orthoflow.records.run_files.figure_files", lambda _, addresses: addresses)
     monkeypatch.setattr("orthoflow.report.write_figures", write_figures)
+    curves = {"01_a.svg": b"<svg/>"}
+    monkeypatch.setattr("orthoflow.report.curves.curve_files", lambda _: curves)
     told = module.export_figures(Cells(), tmp_path / "out", Choices(cell=cell))  # type: ignore[arg-type]
     assert told == said
     assert asked == [(True, (cell,) if cell else ("a", "b", "c"))]
+    written = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("curves/*")}
+    assert written == ({} if cell else curves)
 
 
 @pytest.mark.parametrize(
