@@ -40,6 +40,7 @@ Side = TypeVar("Side")
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 _ROWS_MOST: Final = 60  # of a table in a notebook
 _FEW: Final = 8
+_SAY_HOW_GOOD: Final = ("inspect", "orient")  # kinds of methods
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,6 +244,11 @@ class RunComparison:
         table = self.metric_table()
         is_cost = np.array([row.either.is_cost for row in self.metrics], dtype=np.bool_)
         moved = table[~is_cost & table.left.notna() & table.right.notna() & (table.difference != 0)]
+        # How good it is stands first, where only the first rows are shown.
+        kinds = {row.cell: row.either.method.partition(".")[0] for row in self.cells}
+        moved = moved.sort_values(
+            "cell", key=lambda cells: ~cells.map(kinds).isin(_SAY_HOW_GOOD), kind="stable"
+        )
         said = f"<p>{escape(shown(repr(self)))}</p>{self._parameters_html()}"
         if not Difference.of(self.measured).n_shared:
             return f"{said}<p>They have no number in common, time and memory left aside.</p>"

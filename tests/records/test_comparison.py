@@ -38,8 +38,9 @@ def compared(*metrics: Pair[ComparedMetric], alone: tuple[str, ...] = ()) -> Run
         seed=None, code={}, tools={}, error="",
     )  # fmt: skip
     cells = tuple(
-        Pair(cell=cell, name="facts", left=facts, right=None if cell in alone else facts)
+        Pair(cell=cell, name="facts", left=told_of, right=None if cell in alone else told_of)
         for cell in dict.fromkeys(row.cell for row in metrics)
+        for told_of in [replace(facts, method="inspect.b") if cell == "check" else facts]
     )
     return RunComparison(
         left=told,
@@ -126,6 +127,10 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     assert still.endswith(
         "<p>No number that both runs have differs, time and memory left aside.</p>"
     )
+    # What says how good it is stands first.
+    check = Pair(cell="check", name="rms_mm", left=number(2.0), right=number(3.0))
+    html = compared(*rows, check, alone=("wall",))._repr_html_()
+    assert html.index("<td>check</td>") < html.index("<td>plane</td>")
     # What shares nothing is not alike.
     apart = compared(rows[3], alone=("wall",))
     assert "; no inputs, parameters, metrics in common; " in repr(apart)
