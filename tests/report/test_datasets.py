@@ -27,6 +27,7 @@ from orthoflow.report.paired import (
 )
 from orthoflow.report.rankings import Sense
 from orthoflow.report.summaries import QUALITY
+from orthoflow.report.tidy_tables import _known, dataset_rows
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -106,6 +107,15 @@ def test_oriented_photos_stand_in_a_column_of_their_own(rooms: HeldRun) -> None:
     ]
     assert table.has_photos
     assert {row.photos.text for row in table.rows} == {"5 of 6"}
+
+
+def test_what_nobody_knows_is_an_empty_cell(tmp_path: Path) -> None:
+    header, *rows = dataset_rows(run_of(tmp_path, {"hall": (6.0, 1.0), "stairs": (3.0, 1.0)}))
+    found = [dict(zip(header, row, strict=True)) for row in rows]
+    assert {one["metric"] for one in found} == {"rms_mm"}
+    assert any(one["pairs"] and one["p"] is None for one in found)
+    assert all(math.isfinite(v) for row in rows for v in row if isinstance(v, float))
+    assert [str(_known(value)) for value in (-0.0, math.nan, -2.5)] == ["0.0", "None", "-2.5"]
 
 
 def test_errors_of_both_signs_do_not_make_each_other_small(tmp_path: Path) -> None:
