@@ -25,6 +25,7 @@ from orthoflow.cli.tables import (
     number,
     quality_places,
     say_more,
+    say_verify,
 )
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
+_READDRESSED_MOST: Final = 3
 
 
 @click.command(cls=RecordCommand)
@@ -49,7 +51,8 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     Steps are the same when their addresses are, or else when all that varies on their way has one
     method with the same parameters; what only one run has is counted apart. Of long tables
     the first rows are printed, of metrics those that say how good results are. --json has also
-    what is equal. Ends with 3 where the seal of a record does not hold.
+    what is equal. Ends with 3 where the seal of a record does not hold; of large arrays, which
+    are not read where digests are equal, `orthoflow verify` says so.
     """
     from orthoflow.engine.store import Store
     from orthoflow.records.comparison import compare_runs
@@ -63,6 +66,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
         echo_json(comparison_json(comparison))
     else:
         _print(comparison, most=None if is_whole else ROWS_MOST)
+        echo("", say_verify(first, second))
     return code_for(map(broken_seal, runs), "rely on nothing that is said of it here")
 
 
@@ -112,8 +116,10 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
     _print_pairs("steps", comparison.cells, str, most)
-    for theirs, ours in comparison.readdressed.items():
-        echo(f"the same, though called otherwise: {ours} (A), {theirs} (B)")
+    if comparison.readdressed:
+        pairs = [f"{ours} (A) is {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
+        named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
+        echo(f"the same, though called otherwise: {named}")
     _print_pairs(
         "parameters (* set, others are defaults)",
         comparison.shared(comparison.parameters),

@@ -84,7 +84,7 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--author",
     metavar="NAME",
-    help="ro-crate: who made the results, a name or https://orcid.org/...",
+    help="ro-crate: who made the results: a name, https://orcid.org/..., or both, the name first.",
 )
 @click.option(
     "--scale",

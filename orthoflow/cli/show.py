@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -29,6 +28,7 @@ from orthoflow.cli.tables import (
     number,
     quality_places,
     say_more,
+    say_verify,
     size,
 )
 from orthoflow.workflow.format import DATA
@@ -55,7 +55,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     Of many metrics those that say how good results are are printed, with --all every one; of a
     comparison a row per combination of variants, over datasets with their medians. Of a
     folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
-    the record does not hold.
+    the record does not hold; of large arrays, which are not read, `orthoflow verify` says so.
     """
     from orthoflow.engine.run_folder import RECORD_FILE
     from orthoflow.records.runs import open_run
@@ -80,8 +80,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
             _print_metrics(opened, most=None if is_whole else ROWS_MOST)
         _print_environments(opened)
         _print_files(opened)
-        verify = f"`orthoflow verify {shlex.quote(str(run))}`"
-        echo("", f"whether all of it is as it was written, says {verify}")
+        echo("", say_verify(run))
     return code_for([broken_seal(opened)], "rely on nothing that is said of it here")
 
 

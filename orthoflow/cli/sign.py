@@ -34,10 +34,7 @@ def sign(run: Path, key: Path) -> int:
 
     verification = verify_run(run)
     if verification.findings:
-        raise RecordError(
-            f"{verification.path} is not as it was written, so it is not signed: "
-            f"{verification.findings[0]}"
-        )
+        raise RecordError(f"{verification.wrong}, so it is not signed: {verification.findings[0]}")
     path = verification.path
     made = sign_record(path, key, lambda: _password(key))
     echo(f"signed: {path}{SIGNATURE_SUFFIX}, with the key {made.fingerprint}")

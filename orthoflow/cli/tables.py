@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
@@ -128,6 +130,16 @@ def say_more(n_rows: int, most: int | None) -> None:
     """Say how many rows of a table were left out, and how they are had."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, which --all prints")
+
+
+def say_verify(*runs: Path) -> str:
+    """Name what looks at the large arrays of runs, too.
+
+    >>> say_verify(Path("first"))
+    'whether all of it is as it was written, says `orthoflow verify first`'
+    """
+    commands = " and ".join(f"`orthoflow verify {shlex.quote(str(run))}`" for run in runs)
+    return f"whether all of it is as it was written, says {commands}"
 
 
 def quality_places(

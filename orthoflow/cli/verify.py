@@ -32,7 +32,7 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     key and the digest of the workflow, and compares the published files beside the record with
     theirs; one that is not there is noted. The report and its figures are not covered: `orthoflow
     report` makes them anew from the record. With --signer the record must be signed with that key.
-    Ends with 3 when something differs.
+    Ends with 3 when something differs, or RUN is no record or of a newer orthoflow.
     """
     from orthoflow.records.verification import verify_run
 
@@ -68,6 +68,8 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
 
 def _summary(verification: Verification) -> str:
     parts = [counted(verification.n_products, "product")]
+    if verification.n_named:
+        parts[0] += f" ({verification.n_named} more by digest only)"
     if verification.n_inputs:
         parts.append(counted(verification.n_inputs, "input file"))
     parts.append("seal ok")

@@ -47,7 +47,7 @@ _BIOSCHEMAS: Final = "https://bioschemas.org/profiles/ComputationalWorkflow/1.0-
 _REQUIREMENTS: Final = "https://pip.pypa.io/en/stable/reference/requirements-file-format/"
 _LANGUAGE: Final = "#orthoflow-workflow-format"
 _ENGINE: Final = "#engine"
-_ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]")
+_ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]$")
 _RUN: Final = "#run"
 _CONTEXT: Final[list[JsonValue]] = [
     f"{_CRATE}/context",
@@ -167,7 +167,8 @@ class _Crate:
         }
         yield self._root()
         if self.author:
-            yield {"@id": self._author_id, "@type": "Person", "name": self.author}
+            name = self.author.removesuffix(self._orcid).strip(" ,<(")
+            yield {"@id": self._author_id, "@type": "Person", "name": name or self.author}
         for profile, name in _PROFILES.items():
             version = profile.rpartition("/")[2]
             yield {"@id": profile, "@type": "CreativeWork", "name": name, "version": version}
@@ -213,7 +214,12 @@ class _Crate:
 
     @property
     def _author_id(self) -> str:
-        return self.author if _ORCID.fullmatch(self.author) else "#author"
+        return self._orcid or "#author"
+
+    @property
+    def _orcid(self) -> str:
+        found = _ORCID.search(self.author)
+        return found[0] if found else ""
 
     def _input_ids(self) -> tuple[str, ...]:
         return tuple(entities.file_id(file) for entry in self.record.inputs for file in entry.files)
@@ -449,12 +455,13 @@ def _how_to_read(record: RunRecord) -> str:
     """Say how somebody who has the crate alone looks at the record and checks the files."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
-    where = " in it" if given and all(given) else ""
+    is_whole = bool(given) and all(given)
+    source = "the input files, which lie in it" if is_whole else "the input files"
     return (
         f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
-        f"anew from the input files{where}; any HDF5 reader opens it, too. Paths in "
+        f"anew from {source}; any HDF5 reader opens it, too. Paths in "
         f"{WORKFLOW_FILE} are of the machine that it ran on."
     )
 

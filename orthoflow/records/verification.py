@@ -55,6 +55,7 @@ class Verification:
         notes: what could not be checked, a sentence each.
         seal: the digest that seals the record, 64 hexadecimal digits, as sheets show it; empty
             where the record itself is not as it was written.
+        n_named: products that the record names by their digests alone.
         n_products: products whose arrays lie in the record and were compared with their digest.
         n_inputs: input files that lie in the record and were compared with their digest.
         n_published: files beside the record that are as they were published.
@@ -67,6 +68,7 @@ class Verification:
     wrong: str = ""
     notes: tuple[str, ...] = ()
     seal: str = ""
+    n_named: int = 0
     n_products: int = 0
     n_inputs: int = 0
     n_published: int = 0
@@ -91,14 +93,17 @@ def verify_run(
         PluginError: `signer` is given, and the library cryptography is missing.
     """
     record_path = find_record(path)
-    findings = tuple(
-        f"{finding.place}: {finding.problem}" for finding in verify_record(record_path)
-    )
+    found = verify_record(record_path)
+    findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
     if findings:
-        wrong = f"{record_path} is not as it was written"
+        is_foreign = any(finding.is_foreign for finding in found)
+        wrong = "cannot be checked" if is_foreign else "is not as it was written"
+        wrong = f"{record_path} {wrong}"
         return Verification(path=record_path, findings=findings, wrong=wrong)
     with record_errors(record_path), open_record(record_path) as opened:
         record, seal = opened.record, opened.content_sha256
+    products = [product for cell in record.cells for product in cell.outputs.values()]
+    n_products = sum(product.embedded for product in products)
     check = _check_published(record_path.parent, record) if also_published else _PublishedCheck()
     signature = _check_signature(record_path, signer)
     return Verification(
@@ -108,9 +113,8 @@ def verify_run(
         notes=(*signature.notes, *check.notes),
         seal=seal,
         signed_with=signature.signed_with,
-        n_products=sum(
-            product.embedded for cell in record.cells for product in cell.outputs.values()
-        ),
+        n_products=n_products,
+        n_named=len(products) - n_products,
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=check.n_same,
     )

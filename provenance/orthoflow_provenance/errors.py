@@ -11,6 +11,10 @@ class RecordFormatError(ValueError):
     """
 
 
+class ForeignFormatError(RecordFormatError):
+    """The file is of another program, or of a later version of the format: it cannot be checked."""
+
+
 class InputFileError(RecordFormatError):
     """An input file that is to be embedded is missing, or not the one that was digested."""
 

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 RUN_FORMAT: Final = "orthoflow-run"
 # Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
 RUN_FORMAT_VERSION: Final = "1.4"
+PRODUCT_FORMAT: Final = "orthoflow-product"
+PRODUCT_FORMAT_VERSION: Final = "1.0"
 
 # What a figure may be, and what its file is called.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {

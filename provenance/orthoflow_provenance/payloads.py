@@ -25,12 +25,15 @@ from orthoflow_provenance.encoding import (
     write_text,
 )
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import JsonValue, PayloadLike
-from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.model import (
+    PRODUCT_FORMAT,
+    PRODUCT_FORMAT_VERSION,
+    JsonValue,
+    PayloadLike,
+)
+from orthoflow_provenance.safe import check_format, safe_open
 from orthoflow_provenance.sinks import create_file, create_group
 
-PRODUCT_FORMAT: Final = "orthoflow-product"
-PRODUCT_FORMAT_VERSION: Final = "1.0"
 PRODUCT_GROUP: Final = "product"
 
 _CHUNK_BYTES: Final = 1 << 20
@@ -153,35 +156,6 @@ def open_group(parent: h5py.Group, name: str) -> h5py.Group:
     if not isinstance(found, h5py.Group):
         raise RecordFormatError(f"{parent.name} lacks the group {name}")
     return found
-
-
-def check_format(file: h5py.File, name: str, version: str) -> None:
-    """Refuse files of another format, or of a later major version of this one.
-
-    Raises:
-        RecordFormatError: the file is such a one.
-    """
-    file_name = Path(file.filename).name
-    try:
-        found, found_version = (
-            text_attribute(file, "format"),
-            text_attribute(file, "format_version"),
-        )
-    except RecordFormatError as error:
-        raise RecordFormatError(
-            f"{file_name} must be of format {name}, but it names no format: it was not written by "
-            "orthoflow, or it is damaged"
-        ) from error
-    if found != name:
-        raise RecordFormatError(f"{file_name} must be of format {name}, got {found!r}")
-    major, _, minor = found_version.partition(".")
-    if not (major.isascii() and major.isdigit() and minor.isascii() and minor.isdigit()):
-        raise RecordFormatError(f"{file_name} has a format version {found_version!r} like no other")
-    if int(major) != int(version.partition(".")[0]):
-        raise RecordFormatError(
-            f"{file_name} has format version {found_version}, this program reads version "
-            f"{version}: use a newer orthoflow"
-        )
 
 
 def _check_payload(payload: PayloadLike) -> None:

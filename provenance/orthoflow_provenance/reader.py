@@ -37,8 +37,8 @@ from orthoflow_provenance.model import (
     RecordedProduct,
     RunRecord,
 )
-from orthoflow_provenance.payloads import StoredPayload, check_format, open_group, read_payload
-from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.payloads import StoredPayload, open_group, read_payload
+from orthoflow_provenance.safe import check_format, safe_open
 from orthoflow_provenance.seal import SEAL_ATTRIBUTE
 
 Entry = TypeVar("Entry")

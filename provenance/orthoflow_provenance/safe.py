@@ -10,8 +10,14 @@ from typing import Final
 
 import h5py
 
-from orthoflow_provenance.encoding import check_name, reading
-from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.encoding import HDF5_ERRORS, check_name, reading, text_attribute
+from orthoflow_provenance.errors import ForeignFormatError, RecordFormatError
+from orthoflow_provenance.model import (
+    PRODUCT_FORMAT,
+    PRODUCT_FORMAT_VERSION,
+    RUN_FORMAT,
+    RUN_FORMAT_VERSION,
+)
 
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _DEEPEST: Final = 32
@@ -20,6 +26,7 @@ _LARGEST_RATIO: Final = 1100
 _ALWAYS_ALLOWED_BYTES: Final = 64 << 20
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
+_LONGEST_FORMAT_BYTES: Final = 256
 # Groups, datasets and attributes; a cell with its products has some fifty.
 MOST_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
@@ -35,7 +42,9 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading after looking at every object in it.
 
     Raises:
-        RecordFormatError: the file is no HDF5 file or damaged, or holds links other than hard
+        ForeignFormatError: the file is no HDF5 file, or something of the following is so because
+            another program or a later version wrote it.
+        RecordFormatError: the file is damaged, or holds links other than hard
             links, an object that is reached twice or has an impossible name, external or virtual
             storage, filters other than shuffle, gzip and fletcher32, types outside the format, or
             datasets that unpack to far more than the file could hold.
@@ -45,7 +54,11 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
     with reading(path.name):
         file = h5py.File(path, "r", locking=False)
     try:
-        _Inspection(file, path).run()
+        try:
+            _Inspection(file, path).run()
+        except RecordFormatError as error:
+            # What a file is comes before what is forbidden in it.
+            raise _foreign(file) or error from error
         yield file
     finally:
         file.close()
@@ -55,7 +68,64 @@ def _check_signature(path: Path) -> None:
     with path.open("rb") as stream:
         start = stream.read(len(_SIGNATURE))
     if start != _SIGNATURE:
-        raise RecordFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+        raise ForeignFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+
+
+def check_format(file: h5py.File, name: str, version: str) -> None:
+    """Refuse files of another format, or of a later major version of this one.
+
+    Raises:
+        ForeignFormatError: the file is such a one.
+        RecordFormatError: its version is like no other.
+    """
+    file_name = Path(file.filename).name
+    try:
+        found, found_version = (
+            text_attribute(file, "format"),
+            text_attribute(file, "format_version"),
+        )
+    except RecordFormatError as error:
+        raise ForeignFormatError(
+            f"{file_name} must be of format {name}, but it names no format: it was not written by "
+            "orthoflow, or it is damaged"
+        ) from error
+    if found != name:
+        raise ForeignFormatError(f"{file_name} must be of format {name}, got {found!r}")
+    major, _, minor = found_version.partition(".")
+    if not (major.isascii() and major.isdigit() and minor.isascii() and minor.isdigit()):
+        raise RecordFormatError(f"{file_name} has a format version {found_version!r} like no other")
+    if int(major) != int(version.partition(".")[0]):
+        raise ForeignFormatError(
+            f"{file_name} has format version {found_version}, this program reads version "
+            f"{version}: use a newer orthoflow"
+        )
+
+
+def _foreign(file: h5py.File) -> ForeignFormatError | None:
+    """Say of a refused file that it is of another program or version; None of one of ours."""
+    try:
+        if not all(_is_short_text(file, name) for name in (b"format", b"format_version")):
+            name = Path(file.filename).name
+            return ForeignFormatError(
+                f"{name} is no record of orthoflow: it does not name that format; give a run.h5"
+            )
+        if text_attribute(file, "format") == PRODUCT_FORMAT:
+            check_format(file, PRODUCT_FORMAT, PRODUCT_FORMAT_VERSION)
+        else:
+            check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
+    except ForeignFormatError as error:
+        return error
+    except (RecordFormatError, *HDF5_ERRORS):
+        return None
+    return None
+
+
+def _is_short_text(file: h5py.File, name: bytes) -> bool:
+    """Whether an attribute is text as records have it: of fixed length, so that it may be read."""
+    if not h5py.h5a.exists(file.id, name):
+        return False
+    kind = h5py.h5a.open(file.id, name).get_type()
+    return _is_text(kind) and _is_plain(kind) and kind.get_size() <= _LONGEST_FORMAT_BYTES
 
 
 class _Inspection:

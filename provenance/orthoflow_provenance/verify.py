@@ -20,7 +20,7 @@ from orthoflow_provenance.encoding import (
     storable_text,
     text_attribute,
 )
-from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.errors import ForeignFormatError, RecordFormatError
 from orthoflow_provenance.inner_files import colliding, name_problem, path_problem
 from orthoflow_provenance.input_files import content_name
 from orthoflow_provenance.model import (
@@ -33,9 +33,9 @@ from orthoflow_provenance.model import (
     RunRecord,
     cost_metrics,
 )
-from orthoflow_provenance.payloads import array_datasets, check_format, open_group
+from orthoflow_provenance.payloads import array_datasets, open_group
 from orthoflow_provenance.reader import record_of
-from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.safe import check_format, safe_open
 from orthoflow_provenance.seal import (
     SEAL_ATTRIBUTE,
     SEAL_DATASET,
@@ -55,10 +55,12 @@ class Finding:
     Attributes:
         place: path in the file, with `@` before the name of an attribute.
         problem: one sentence.
+        is_foreign: the file is of another program or a later version, so nothing was checked.
     """
 
     place: str
     problem: str
+    is_foreign: bool = False
 
 
 def verify_record(path: Path) -> tuple[Finding, ...]:
@@ -71,7 +73,8 @@ def verify_record(path: Path) -> tuple[Finding, ...]:
         with safe_open(path) as file:
             return tuple(_findings(file))
     except RecordFormatError as error:
-        return (Finding(place="/", problem=str(error)),)
+        is_foreign = isinstance(error, ForeignFormatError)
+        return (Finding(place="/", problem=str(error), is_foreign=is_foreign),)
     except HDF5_ERRORS as error:
         problem = f"{path.name} cannot be read: {error}"
         return (Finding(place="/", problem=problem),)

@@ -14,9 +14,8 @@ from orthoflow_provenance.blocks import BLOCK_BYTES, block_indices, byte_blocks
 from orthoflow_provenance.compare import measure_payloads
 from orthoflow_provenance.encoding import set_attributes, text_attribute
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import JsonValue
-from orthoflow_provenance.payloads import check_format
-from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.model import RUN_FORMAT, RUN_FORMAT_VERSION, JsonValue
+from orthoflow_provenance.safe import check_format, safe_open
 
 from tests.provenance_records import Given
 
@@ -67,6 +66,7 @@ def test_rows_of_numbers_and_fixed_text_are_allowed(tmp_path: Path) -> None:
 def test_notes_have_one_place(tmp_path: Path, place: str) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file[place] = "text of variable length"
+        set_attributes(file, {"format": RUN_FORMAT, "format_version": RUN_FORMAT_VERSION})
     with pytest.raises(RecordFormatError, match="type outside"), safe_open(tmp_path / "a.h5"):
         pass
 

@@ -12,13 +12,16 @@ import h5py
 import numpy as np
 import pytest
 from orthoflow_provenance import safe
-from orthoflow_provenance.encoding import read_texts
+from orthoflow_provenance.encoding import read_texts, set_attributes
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import RUN_FORMAT, RUN_FORMAT_VERSION
 from orthoflow_provenance.reader import open_record
 from orthoflow_provenance.safe import safe_open
 from orthoflow_provenance.verify import verify_record
 
 SECRET = np.arange(5.0)
+# Of files that do not say that they are records, nothing else is said.
+NAMED = {"format": RUN_FORMAT, "format_version": RUN_FORMAT_VERSION}
 
 
 def external_link(file: h5py.File) -> None:
@@ -187,6 +190,7 @@ def test_forbidden_files_are_refused_with_a_sentence(
     path = tmp_path / "stranger.h5"
     with h5py.File(path, "w", libver=("v110", "v110")) as file:
         make(file)
+        set_attributes(file, NAMED)
     with pytest.raises(RecordFormatError) as refusal, safe_open(path):
         pass
     assert str(refusal.value).startswith("stranger.h5")
@@ -242,6 +246,7 @@ def test_notes_may_not_lead_out_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file.create_group("notes")["a"] = h5py.ExternalLink("secret.h5", "/")
+        set_attributes(file, NAMED)
     with pytest.raises(RecordFormatError, match="is a link into another file"), safe_open(path):
         pass
 
@@ -274,11 +279,12 @@ def test_more_objects_than_any_record_has_are_refused(
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for index in range(10):
             file.create_group(str(index)).attrs["a"] = index
-    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 21)
+        set_attributes(file, NAMED)
+    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 23)
     with safe_open(tmp_path / "a.h5"):
         pass
-    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 20)
-    refused = pytest.raises(RecordFormatError, match="more than 20 groups and attributes")
+    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 22)
+    refused = pytest.raises(RecordFormatError, match="more than 22 groups and attributes")
     with refused, safe_open(tmp_path / "a.h5"):
         pass
 

@@ -199,7 +199,12 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     for line in ("inputs: same", "workflow: same text", "steps: same", "environment: same"):
         assert line in shown.splitlines()
     assert "metrics: 0 of 2 differ" in shown.splitlines()
-    assert shown.splitlines()[-1] == "2 products: 2 identical"
+    verify = "`orthoflow verify first` and `orthoflow verify again`"
+    assert shown.splitlines()[-3:] == [
+        "2 products: 2 identical",
+        "",
+        f"whether all of it is as it was written, says {verify}",
+    ]
 
 
 def test_a_set_parameter_is_told_from_a_default(studio: Studio) -> None:
@@ -234,7 +239,7 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
     assert repr(told).endswith("differ; 2 steps in one of them only>")
     shown = studio("compare", "first", "swept").stdout
     assert "steps: 0 of 2 differ, 2 only in B" in shown
-    assert "the same, though called otherwise: paint (A), paint@paint=grey-128 (B)" in shown
+    assert "the same, though called otherwise: paint (A) is paint@paint=grey-128 (B)" in shown
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 
 

@@ -36,6 +36,8 @@ PREFIX wfrun: <https://w3id.org/ro/terms/workflow-run#>
 PREFIX codemeta: <https://codemeta.github.io/terms/>
 """
 
+ORCID = "https://orcid.org/0000-0002-1825-0097"
+
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
@@ -222,17 +224,22 @@ def test_a_license_can_be_given(studio: Studio) -> None:
 
 
 @pytest.mark.parametrize(
-    ("author", "identifier"),
-    [("A. Nemo", "#author"), ("https://orcid.org/0000-0002-1825-0097",) * 2],
+    ("author", "identifier", "name"),
+    [
+        ("A. Nemo", "#author", "A. Nemo"),
+        (ORCID, ORCID, ORCID),
+        (f"A. Nemo, {ORCID}", ORCID, "A. Nemo"),
+        (f"{ORCID} A. Nemo", "#author", f"{ORCID} A. Nemo"),
+    ],
 )
 def test_who_made_it_is_told_where_it_is_given(
-    studio: Studio, crate: dict[str, Any], author: str, identifier: str
+    studio: Studio, crate: dict[str, Any], author: str, identifier: str, name: str
 ) -> None:
     assert "author" not in entities(crate, "Dataset")[0]
     assert entities(crate, "Person") == []
     record = open_run(studio.folder / "first").record
     told: dict[str, Any] = crate_metadata(record, [], license_text="CC0", author=f" {author} ")
-    assert entities(told, "Person") == [{"@id": identifier, "@type": "Person", "name": author}]
+    assert entities(told, "Person") == [{"@id": identifier, "@type": "Person", "name": name}]
     assert entities(told, "Dataset")[0]["author"] == {"@id": identifier}
 
 
@@ -260,7 +267,10 @@ def test_of_a_record_that_holds_its_input_files_nobody_looks_for_them_elsewhere(
     studio: Studio,
 ) -> None:
     run = open_run(studio.folder / "first").record
-    for is_embedded, said in ((False, "the input files; "), (True, "the input files in it; ")):
+    for is_embedded, said in (
+        (False, "the input files; "),
+        (True, "the input files, which lie in it; "),
+    ):
         inputs = tuple(replace(entry, embedded=is_embedded) for entry in run.inputs)
         graph: dict[str, Any] = crate_metadata(replace(run, inputs=inputs), [], license_text="CC0")
         assert said in entities(graph, "Dataset")[0]["description"]

@@ -8,11 +8,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
 from orthoflow.errors import RecordError
 from orthoflow.records import verification as module
-from orthoflow.records.verification import Verification, published_state, require_unchanged
+from orthoflow.records.verification import (
+    Verification,
+    published_state,
+    require_unchanged,
+    verify_run,
+)
 
 CONTENT = b"a picture"
 
@@ -178,3 +185,55 @@ def test_a_record_without_a_signature_has_nothing_said_of_it(
     monkeypatch.setattr(module, "read_signature", lambda *_: None)
     found = module._check_signature(Path("r"), None)
     assert (found.findings, found.notes, found.signed_with) == ((), (), "")
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"creator": "CloudCompare"}, "x.h5 is no record of orthoflow: it does not name"),
+        ({"format": "colmap-db"}, "x.h5 is no record of orthoflow: it does not name"),
+        (
+            {"format": np.bytes_("colmap-db"), "format_version": np.bytes_("1"), "creator": "C"},
+            "x.h5 must be of format orthoflow-run, got 'colmap-db'",
+        ),
+        (
+            {"format": np.bytes_("orthoflow-run"), "format_version": np.bytes_("2.0")},
+            "x.h5 has format version 2.0, this program reads version ",
+        ),
+        # What a later version writes may be outside this one's format.
+        (
+            {
+                "format": np.bytes_("orthoflow-run"),
+                "format_version": np.bytes_("2.0"),
+                "creator": "C",
+            },
+            "x.h5 has format version 2.0, this program reads version ",
+        ),
+    ],
+)
+def test_a_file_of_another_program_or_version_cannot_be_checked(
+    tmp_path: Path, stated: dict[str, object], said: str
+) -> None:
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs.update(stated)
+    found = verify_run(path)
+    assert found.findings[0].startswith(f"/: {said}")
+    assert found.wrong == f"{path} cannot be checked"
+
+
+def test_a_record_with_something_forbidden_is_not_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs.update(
+            {
+                "format": np.bytes_("orthoflow-run"),
+                "format_version": np.bytes_("1.0"),
+                "creator": "C",
+            }
+        )
+    found = verify_run(path)
+    assert found.findings == (
+        "/: x.h5:/@creator has a type outside the format: the file is not opened",
+    )
+    assert found.wrong == f"{path} is not as it was written"
