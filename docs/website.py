@@ -208,7 +208,7 @@ def _parts_of_fields(described: type) -> dict[str, list[type]]:
     for name, hint in get_type_hints(described).items():
         inside = [one for one in _flat(hint) if is_dataclass(one) or _is_numbered(one)]
         if name in named:
-            inside.append(getattr(module, named[name]))
+            inside.append(getattr(module, named[name], None))
         found[name] = [one for one in inside if isinstance(one, type)]
     return found
 
