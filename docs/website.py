@@ -15,13 +15,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from enum import IntEnum
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
-from typing import ClassVar, Final, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Final, get_args, get_origin, get_type_hints
 
 import click
 
@@ -52,10 +52,10 @@ ELSEWHERE: Final = {
     "plugins/README.md": "plugins-first.md",
     "provenance/SPEC.md": "record.md",
 }
-_MASKS: Final[dict[type, dict[object, str]]] = {
-    SurfaceMask: {**SURFACE_MASK_MEANINGS},
-    LayerMask: {**LAYER_MASK_MEANINGS},
-    OrthoMask: {**ORTHO_MASK_MEANINGS},
+_MASKS: Final[Mapping[type, Mapping[Any, str]]] = {
+    SurfaceMask: SURFACE_MASK_MEANINGS,
+    LayerMask: LAYER_MASK_MEANINGS,
+    OrthoMask: ORTHO_MASK_MEANINGS,
 }
 _NO_SEARCH: Final = (
     '<script>location.protocol === "file:" && document.documentElement.classList.add("by-file")'
