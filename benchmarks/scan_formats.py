@@ -40,8 +40,10 @@ from orthoflow.products import InputFiles, Planes, PointCloud, Ties, Truth, Wall
 
 FORMATS = ("e57 with rows", "e57 without", "laz", "random order")
 CELLS_M = (0.002, 0.004, 0.008)
-# Right before the station; farther off points lie farther apart.
+# Right before the station; farther off points lie farther apart. Drawn within a twentieth, as one
+# step would meet the same edges of the wall in the same places in every room.
 _STEP_M = 0.00356
+_STEP_SHARE = 0.05
 # The main wall and what stands out of it or goes into it is seen by its own scan alone.
 _BEFORE_WALL_M = 0.5
 _ALONG_COSINE = 0.99
@@ -125,9 +127,10 @@ def scanned_room(
     seed: int, panorama_step_m: float, photo_gsd_m: float = 0.0025
 ) -> SimulateRoom.Out:
     """A room from one station, its main wall at one density."""
+    drawn = np.random.default_rng(seed).uniform(1.0 - _STEP_SHARE, 1.0 + _STEP_SHARE)
     params = SimulateRoom.Params.model_validate(
         {
-            "scan_step_m": _STEP_M,
+            "scan_step_m": drawn * _STEP_M,
             "panorama_step_m": panorama_step_m,
             "n_stations": 1,
             "photo_layout": "quick",

@@ -49,6 +49,7 @@ _BEYOND_MOST_M: Final = 0.1
 # Relief that covers less than this share of the wall decides no buffer.
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
+_RELIEF_USUAL_M: Final = 0.15
 # Which planes adjoin: angle, and on which part of the side points of theirs lie between so far
 # and so far before the wall, or behind it. The undersides of cornices are not as deep.
 _ADJOINING_COSINE: Final = 0.7
@@ -395,8 +396,12 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
 def _bounds(
     planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
 ) -> Iterator[_Bound]:
-    """The planes that adjoin a wall along one of its sides, of several on a side the innermost."""
-    found: dict[Side, _Bound] = {}
+    """The planes that adjoin a wall along one of its sides, of several on a side the innermost.
+
+    But a part of an adjoining wall that stands out of it farther on, as a chimney breast does, ends
+    nothing: the wall's own surface goes on to the next.
+    """
+    found: dict[Side, list[_Bound]] = {}
     for other in range(len(planes)):
         if other == index or abs(float(planes.normal[other] @ rectangle.normal_world)) > (
             _ADJOINING_COSINE
@@ -405,10 +410,12 @@ def _bounds(
         bound = _bound(planes, other, rectangle, size_m)
         if bound is None or not _stands(bound, size_m, around):
             continue
-        before = found.get(bound.side)
-        if before is None or bound.beyond_m < before.beyond_m:
-            found[bound.side] = bound
-    yield from found.values()
+        found.setdefault(bound.side, []).append(bound)
+    for bounds in found.values():
+        bounds.sort(key=lambda bound: bound.beyond_m)
+        while len(bounds) > 1 and _goes_on(bounds[0], bounds[1], size_m, around):
+            del bounds[0]
+        yield bounds[0]
 
 
 def _bound(
@@ -448,13 +455,16 @@ def _bound(
 
 @dataclass(frozen=True, kw_only=True)
 class _Around:
-    """Points beside a wall that lie clearly before or behind it, in metres of the rectangle.
+    """Points in and beside a wall, in metres of its rectangle.
 
     Attributes:
-        places_m: (3, n) right of and below the top-left corner, and before the plane.
+        places_m: (3, n) right of and below the top-left corner, and before the plane, of those that
+            lie clearly before or behind it.
+        own_m: (3, n) of those on the plane, or on the relief that most walls have.
     """
 
     places_m: NDArray[np.float64]
+    own_m: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -476,24 +486,39 @@ class _Around:
         found = points_in(
             points, Slab(frame=frame, front_m=farthest_m, behind_m=farthest_m), threads=1
         )
-        chosen = np.abs(found.depth_m) > nearest_m
-        right_m, down_m = gsd_m * found.places[chosen].T - growth_m
-        return cls(places_m=np.stack([right_m, down_m, found.depth_m[chosen]]))
+        right_m, down_m = gsd_m * found.places.T - growth_m
+        places_m, off_m = np.stack([right_m, down_m, found.depth_m]), np.abs(found.depth_m)
+        return cls(
+            places_m=places_m[:, off_m > nearest_m], own_m=places_m[:, off_m < _RELIEF_USUAL_M]
+        )
 
 
 def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
     """Whether points of a plane run along a side of a wall, out of it or back."""
     places_m = around.places_m
     is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
+    return any(
+        _runs_along(bound, places_m[:, is_there], size_m)
+        for is_there in (is_near & (places_m[2] > 0.0), is_near & (places_m[2] < 0.0))
+    )
+
+
+def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
+    """Whether a wall has points between two planes beside it."""
+    places_m = around.own_m
+    is_between = inner.offset_m + inner.slopes @ places_m < -inner.noise_m
+    is_between &= outer.offset_m + outer.slopes @ places_m > outer.noise_m
+    return _runs_along(inner, places_m[:, is_between], size_m)
+
+
+def _runs_along(bound: _Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
+    """Whether places (3, n) lie along enough of a bound's side."""
     along = 1 if bound.side in {"left", "right"} else 0
     length_m = size_m[along]
     n_steps = max(1, round(length_m / _BESIDE_STEP_M))
-    for is_there in (is_near & (places_m[2] > 0.0), is_near & (places_m[2] < 0.0)):
-        steps = np.floor(places_m[along, is_there] / length_m * n_steps).astype(np.int64)
-        steps = steps[(steps >= 0) & (steps < n_steps)]
-        if len(np.unique(steps)) >= _BESIDE_SHARE * n_steps:
-            return True
-    return False
+    steps = np.floor(places_m[along] / length_m * n_steps).astype(np.int64)
+    steps = steps[(steps >= 0) & (steps < n_steps)]
+    return len(np.unique(steps)) >= _BESIDE_SHARE * n_steps
 
 
 def _sigma_m(planes: Planes, index: int) -> float:

@@ -472,6 +472,7 @@ def test_of_several_planes_beside_one_side_the_innermost_bounds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(extents, "_stands", lambda bound, *_: bound.beyond_m != 0.1)
+    monkeypatch.setattr(extents, "_goes_on", lambda *_: False)
     planes = planes_of(
         (0.0, WIDTH_M),
         (0.0, HEIGHT_M),
@@ -483,6 +484,36 @@ def test_of_several_planes_beside_one_side_the_innermost_bounds(
     # That of 0.1 does not stand there.
     sides = {bound.side: bound.beyond_m for bound in found}
     assert sides == {"left": pytest.approx(0.3), "top": pytest.approx(0.2)}
+
+
+@pytest.mark.parametrize(
+    ("share", "off_m", "depth_m", "left_m"),
+    [
+        # Of the wall's own points between the planes at 0.1 and 0.3 m, along most of the side.
+        (0.4, 0.2, 0.01, 0.3),
+        (0.28, 0.2, 0.01, 0.1),
+        (0.4, 0.05, 0.01, 0.1),
+        (0.4, 0.35, 0.01, 0.1),
+        # On its relief, too; what stands farther before the wall is not its own.
+        (0.4, 0.2, 0.14, 0.3),
+        (0.4, 0.2, 0.16, 0.1),
+    ],
+)
+def test_a_plane_ends_no_wall_that_goes_on_behind_it_to_the_next(
+    monkeypatch: pytest.MonkeyPatch, share: float, off_m: float, depth_m: float, left_m: float
+) -> None:
+    monkeypatch.setattr(extents, "_stands", lambda *_: True)
+    planes = planes_of(
+        (0.0, WIDTH_M),
+        (0.0, HEIGHT_M),
+        *(upright(-beyond, (0.0, 3.0), towards=1.0) for beyond in (0.3, 0.1)),
+    )
+    up = np.arange(0.05, HEIGHT_M * share, 0.1)
+    points = np.column_stack([np.full(len(up), -off_m), np.full(len(up), -depth_m), up])
+    rectangle, size_m = rectangle_of(planes), (WIDTH_M, HEIGHT_M)
+    around = extents._Around.of(sampled(scenes.cloud_of(points)), rectangle, size_m)
+    (found,) = extents._bounds(planes, 0, rectangle, size_m, around)
+    assert found.beyond_m == pytest.approx(left_m)
 
 
 def test_what_lies_well_before_or_behind_a_wall_and_no_farther_than_a_metre_stands_there() -> None:
@@ -523,12 +554,13 @@ def test_points_along_three_tenths_of_a_side_tell_that_something_stands_there(
     along = np.append(along, np.linspace(-0.9, -0.1, 50))
     off = np.full(len(along), off_m)
     places = [off, along] if side == "left" else [along, off]
-    around = extents._Around(places_m=np.stack([*places, np.full(len(along), before_m)]))
+    places_m = np.stack([*places, np.full(len(along), before_m)])
+    around = extents._Around(places_m=places_m, own_m=places_m[:, :0])
     assert extents._stands(bound, (WIDTH_M, HEIGHT_M), around) == stands
     # Some before and some behind the plane do not add up.
     mixed = around.places_m.copy()
     mixed[2, ::2] *= -1.0
-    mixed_around = extents._Around(places_m=mixed)
+    mixed_around = extents._Around(places_m=mixed, own_m=mixed[:, :0])
     assert not extents._stands(bound, (WIDTH_M, HEIGHT_M), mixed_around)
 
 
