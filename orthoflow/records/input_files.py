@@ -40,14 +40,6 @@ _MOST_LISTED: Final = 10_000
 _FOLDERS_ABOVE: Final = 3
 
 
-class MissingInputsError(InputError):
-    """Input files of a record are not to be found; `problems` says which, a sentence each."""
-
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(problems))
-
-
 @dataclass(frozen=True, kw_only=True)
 class InputSearch:
     """What a search found.

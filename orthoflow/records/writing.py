@@ -34,10 +34,11 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import DamageError, InputError, OrthoflowError, StoreError
-from orthoflow.records.input_files import MissingInputsError, embedded_inputs, find_inputs
+from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
+from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 if TYPE_CHECKING:

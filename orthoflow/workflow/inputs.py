@@ -26,6 +26,16 @@ _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
 
 
+class MissingInputsError(InputError):
+    """Input files are missing; `problems` says which, of many the first."""
+
+    def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
+        self.problems = tuple(problems)
+        n_more = len(problems) - most
+        more = [f"and {n_more} more have no files"] if n_more > 0 else []
+        super().__init__("\n".join([*problems[:most], *more]))
+
+
 def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, WorkflowInputSpec]:
     """Read the section `inputs`.
 
@@ -139,10 +149,10 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
             found[spec.name] = _resolve(spec)
         except InputError as error:
             missing.append(str(error))
+    if len(missing) == 1:
+        raise InputError(missing[0])
     if missing:
-        n_more = len(missing) - _MOST_LISTED
-        more = [f"and {n_more} more inputs have no files"] if n_more > 0 else []
-        raise InputError("; ".join([*missing[:_MOST_LISTED], *more]))
+        raise MissingInputsError(missing, most=_MOST_LISTED)
     return found
 
 
