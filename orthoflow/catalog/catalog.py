@@ -177,7 +177,8 @@ class Catalog:
                     raise PluginError(f"method {method_id} cannot be used: {plugin}")
             raise WorkflowError(
                 f"unknown method {method_id}{self._suggest(method_id)}{self._hint_at_broken()}; "
-                f"`orthoflow plugins list` names all"
+                "`orthoflow plugins list` names all; one of a plugin of your own is known after "
+                "`pip install -e .` in its folder"
             )
         if entry.state != "fine":
             raise PluginError(entry.problem)

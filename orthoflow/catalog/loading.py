@@ -87,7 +87,7 @@ def load_method(
             complaint = (
                 _port_complaint(method, kind, product_types)
                 or _mapping_complaint(method)
-                or next(filter(None, map(product_complaint, _products_of(method.Out))), "")
+                or next(filter(None, map(product_complaint, _products_of(*_hints(method.Out)))), "")
             )
         except (PluginError, NameError, TypeError) as error:
             complaint = f"its ports cannot be read: {describe_error(error)}"
@@ -172,8 +172,12 @@ def _names_within(hint: object, seen: set[object]) -> Iterator[str]:
             yield from _names_within(hints[field.name], seen)
 
 
-def _products_of(ports: type[Ports]) -> Iterator[type[Product]]:
-    for hint in typing.get_type_hints(ports).values():
+def _hints(ports: type[Ports]) -> tuple[object, ...]:
+    return tuple(typing.get_type_hints(ports).values())
+
+
+def _products_of(*hints: object) -> Iterator[type[Product]]:
+    for hint in hints:
         for cls in (hint, *typing.get_args(hint)):
             if isinstance(cls, type) and issubclass(cls, Product):
                 yield cls
@@ -198,9 +202,10 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
     for port in given.values():
         wanted = kind.outputs.get(port.name, port.type_name)
         if port.type_name != wanted:
+            cls = next(iter(_products_of(typing.get_type_hints(method.Out)[port.name])))
             return (
-                f"its output port {port.name} takes a class whose type_name is "
-                f"'{port.type_name}', not '{wanted}' as in kind {kind.name}"
+                f"its output port {port.name} is {wanted} in kind {kind.name}, but "
+                f"{cls.__module__}:{cls.__qualname__} says type_name '{port.type_name}'"
             )
     if given.keys() != kind.outputs.keys():
         return (

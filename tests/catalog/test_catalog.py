@@ -369,7 +369,7 @@ CHANGES = {
     "other output": (
         "labels: PointLabels",
         "labels: Planes",
-        "port labels takes a class whose type_name is 'planes', not 'labels' as in kind plane",
+        "is labels in kind plane, but orthoflow.products.planes:Planes says type_name 'planes'",
     ),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
     "no items to map over": (
