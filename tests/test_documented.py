@@ -156,7 +156,7 @@ def _of_orthoflow(command: Documented, catalog: Catalog) -> str:
 
 
 def _of_python(words: list[str], folder: Path) -> str:
-    if words[:2] == ["-m", "venv"]:
+    if words[:2] == ["-m", "venv"] or words[:2] == ["-m", "http.server"]:
         return ""
     if words[:2] == ["-m", "pip"]:
         return _of_pip(words[2:])
@@ -201,8 +201,16 @@ def _of_script(path: Path, words: list[str], folder: Path) -> str:
     return "; ".join(said)
 
 
+# Programs of others that documents let a reader install.
+_OF_OTHERS: Final = frozenset(("ipykernel", "nbclient", "roc-validator"))
+
+
 def _of_pip(words: list[str]) -> str:
-    (wanted,) = [word for word in words[1:] if not word.startswith("-")]
+    named = [word for word in words[1:] if not word.startswith("-")]
+    ours = [word for word in named if word not in _OF_OTHERS]
+    if words[0] == "install" and named and not ours:
+        return ""
+    (wanted,) = ours
     found = re.fullmatch(r"(?:\.|orthoflow-tls)(?:\[([\w,]+)\])?", wanted)
     if words[0] != "install" or found is None:
         return f"installs {wanted}"
