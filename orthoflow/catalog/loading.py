@@ -130,8 +130,9 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
 
 def _undeclared(method: type[Method]) -> list[str]:
     """Labels of metrics that a method does not declare, where it declares any."""
-    declared, labels = tuple(method.metrics), method.metric_labels
-    if not declared or not isinstance(labels, Mapping):
+    declared: object = method.metrics
+    labels: object = method.metric_labels
+    if not (declared and isinstance(declared, tuple | list) and isinstance(labels, Mapping)):
         return []
     return [
         f"{label}{did_you_mean(label, declared)}"
