@@ -134,7 +134,7 @@ def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) ->
     assert done.returncode == 2
     said = done.stderr
     assert "input number@a: there is no file a.txt beside the table gone.csv:3 (" in said
-    at = "; gone.csv:4:3: b.number: input number@b: "
+    at = "\ngone.csv:4:3: b.number: input number@b: "
     assert f"{at}there is no file b.txt beside the table gone.csv:4 (" in said
 
 
