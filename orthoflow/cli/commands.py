@@ -77,7 +77,9 @@ class Command(click.Command):
         except click.UsageError as error:
             broken = (one for one in given if one.count("[") > one.count("]"))
             found = next(broken, "")
-            if not found or "unexpected extra argument" not in error.message:
+            # Behind a space, a negative number looks like an option.
+            is_number = isinstance(error, click.NoSuchOption) and error.option_name[1:2].isdigit()
+            if not found or not (is_number or "unexpected extra argument" in error.message):
                 raise
             sentence = (
                 f"{error.message.rstrip('.')}; {found} was taken apart at its spaces: put all of "

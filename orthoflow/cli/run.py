@@ -176,7 +176,11 @@ class Call:
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine.scheduling import execute
+        from orthoflow.workflow.doubts import doubts_about
 
+        # Before minutes pass, and once more in the summary.
+        for doubt in doubts_about(self.workflow):
+            say_error(f"workflow: warning: {doubt}")
         with make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress:
             return execute(
                 self.plan,

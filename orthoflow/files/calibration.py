@@ -218,7 +218,11 @@ class _Reader:
             return None
         section = document.get("cameras") if isinstance(document, Table) else None
         if not isinstance(document, Table) or section is None:
-            self._add(_START, "expected the key cameras with one entry per photo name or pattern")
+            self._add(
+                _START,
+                "expected the key cameras with one entry per photo name or pattern, as cameras: "
+                f"{{'*': {{{', '.join(f'{key}: ...' for key in _REQUIRED)}}}}}",
+            )
             return None
         self._refuse_unknown(document, ("cameras",), "")
         if not isinstance(section.value, Table) or not section.value.entries:

@@ -11,9 +11,9 @@ from typing import Final
 
 from orthoflow.records.metrics import MetricRow
 
-# Without repeats nobody knows how far values of the same method lie apart. What is nearer than this
-# share of the best is no difference then; times and memory scatter more, times from run to run by
-# so much (docs/performance.md), whatever their repeats in one run say.
+# Without repeats of both nobody knows how far values of the same method lie apart. What is nearer
+# than this share of the best is no difference then; times and memory scatter more, times from run
+# to run by so much (docs/performance.md), whatever their repeats in one run say.
 _ALIKE_SHARE: Final = 0.01
 _ALIKE_COST_SHARES: Final = {"_s": 0.3, "_mib": 0.1}
 
@@ -55,11 +55,11 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     """Mark the best and the worst of each group; a group whose values are all alike has neither.
 
     A value whose distance from the best is not above both their standard deviations together (in
-    quadrature), or without repeats not above a hundredth of the best (repeats or not a tenth of a
-    memory, three tenths of a time), is marked as near the best and never as worst; the best is then
-    only among the best, too, as are several that are alike. The worst is marked where every other
-    value is as far from it. What sums up fewer photos than another of its group is not ranked: who
-    refuses the difficult ones has smaller errors of the rest.
+    quadrature), or where one of them has no repeats not above a hundredth of the best (repeats or
+    not a tenth of a memory, three tenths of a time), is marked as near the best and never as worst;
+    the best is then only among the best, too, as are several that are alike. The worst is marked
+    where every other value is as far from it. What sums up fewer photos than another of its group
+    is not ranked: who refuses the difficult ones has smaller errors of the rest.
 
     Args:
         values: a column.
@@ -117,7 +117,7 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
 def _spread(one: Value, other: Value, metric: str) -> float:
     known = [value.spread for value in (one, other) if math.isfinite(value.spread)]
     costs = [share for end, share in _ALIKE_COST_SHARES.items() if metric.endswith(end)]
-    share = max([*costs, 0.0 if known else _ALIKE_SHARE])
+    share = max([*costs, 0.0 if len(known) == 2 else _ALIKE_SHARE])
     return max(math.hypot(*known), share * abs(other.sort))
 
 

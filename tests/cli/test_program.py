@@ -144,8 +144,9 @@ def test_every_listing_verb_has_json(command: str) -> None:
     assert "--json" in CliRunner().invoke(program, [*command.split(), "--help"]).output
 
 
-def test_a_value_that_the_shell_took_apart_is_told_so() -> None:
-    words = ["run", "direct.yaml", "--set", "wall.near=[[1,", "2,", "3]]"]
+@pytest.mark.parametrize("second", ["2,", "-2,", "-0.5,"])
+def test_a_value_that_the_shell_took_apart_is_told_so(second: str) -> None:
+    words = ["run", "direct.yaml", "--set", "wall.near=[[1,", second, "3]]"]
     result = CliRunner().invoke(program, words)
     assert result.exit_code == 2
     assert "wall.near=[[1, was taken apart at its spaces" in result.output

@@ -477,8 +477,10 @@ def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None
     assert done.stdout == f"studio is fine: 2 steps\nwarning: {said}\n"
     answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
     assert (answer["ok"], answer["warnings"]) == (True, [said])
-    # Whoever has not checked reads it where the run ends.
+    assert orthoflow(tmp_path, "plan", "studio.yaml").stderr == f"workflow: warning: {said}\n"
+    # Whoever has not checked reads it before anything runs, and where the run ends.
     done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE)
+    assert done.stderr.startswith(f"workflow: warning: {said}\n")
     assert f"warning, workflow: {said}" in done.stdout.splitlines()
 
 

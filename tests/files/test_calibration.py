@@ -277,7 +277,7 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
     [
         ("", "calibration.yaml:1:1: the calibration file is empty"),
         ("~\n", "calibration.yaml:1:1: the calibration file is empty"),
-        ("- 1\n", "calibration.yaml:1:1: expected the key cameras"),
+        ("- 1\n", "photo name or pattern, as cameras: {'*': {width: ..., height: ..., "),
         ("camera: 3\n", "calibration.yaml:1:1: expected the key cameras"),
         ("cameras: {}\n", "1:1: cameras: expected one entry per photo name or pattern"),
         (

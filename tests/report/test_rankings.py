@@ -95,6 +95,9 @@ def test_with_repeats_their_spread_alone_says_what_differs() -> None:
     # Half a hundredth, and five times as much as both scatter.
     assert marks(near, of(100.5, 0.1), far) == ["BEST", "NONE", "WORST"]
     assert marks(of(100.0), of(100.5), of(200.0)) == ["NEAR", "NEAR", "WORST"]
+    # Of one only, nobody knows how far the other scatters.
+    assert marks(near, of(100.5), far) == ["NEAR", "NEAR", "WORST"]
+    assert marks(near, of(101.5), far) == ["BEST", "NONE", "WORST"]
 
 
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:

@@ -21,6 +21,8 @@ _CELLS_ASKED: Final = 1 << 26
 _LONGEST_PX: Final = 1400
 # Causes of empty cells are told in words where so many of a wall are.
 _EMPTY_WORTH_WORDS: Final = 0.1
+# Where a cell that has points has so many, no cell is empty for want of larger ones.
+_DENSE_POINTS: Final = 4.0
 # A net leaves a few cells void along the rim of every wall.
 _VOID_WORTH_WORDS: Final = 0.01
 
@@ -114,11 +116,18 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
         if wall.count.any() and of_wall.share >= _EMPTY_WORTH_WORDS:
-            ctx.warn(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {_causes(of_wall)}")
+            is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
+            causes = _causes(of_wall, is_dense=is_dense)
+            ctx.warn(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {causes}")
 
 
-def _causes(empty: Emptiness) -> str:
+def _causes(empty: Emptiness, *, is_dense: bool) -> str:
     """Causes of empty cells in words, the largest first, with what would change them."""
+    sparse = (
+        "lie beside what was scanned (recover_gap_cells closes narrow gaps)"
+        if is_dense
+        else "lie between the scan's points (raise gsd_m or recover_gap_cells)"
+    )
     behind = (
         f"lie behind the buffer, about {empty.behind_m:.2g} m behind the plane (raise "
         "buffer_behind_m if that is the wall)"
@@ -130,7 +139,7 @@ def _causes(empty: Emptiness) -> str:
     causes = [
         (empty.behind_share, behind),
         (empty.hidden_share, hidden),
-        (empty.sparse_share, "lie between the scan's points (raise gsd_m or recover_gap_cells)"),
+        (empty.sparse_share, sparse),
         (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees"),
     ]
     causes.sort(key=lambda cause: -cause[0])

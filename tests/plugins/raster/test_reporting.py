@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,19 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
         "buffer_behind_m if that is the wall); 6% show nothing that was scanned: glass, or what no "
         "station sees; 3% have smaller causes"
     )
+
+
+@pytest.mark.parametrize(
+    ("counts", "is_dense"), [([[8, 0, 0, 1]], True), ([[7, 0, 0, 0.9]], False)]
+)
+def test_larger_cells_are_advised_only_where_cells_lack_points(
+    listener: Listener, counts: list[list[float]], *, is_dense: bool
+) -> None:
+    raster = replace(wall([[1, 1, 1, 1]]), count=np.array(counts))
+    reporting.report_empty(listener.context, [raster], [emptiness(sparse=0.5)])
+    [said] = listener.warnings
+    assert ("raise gsd_m" in said) != is_dense
+    assert ("beside what was scanned" in said) == is_dense
 
 
 def test_a_tenth_of_empty_cells_is_worth_words_and_a_hundredth_of_a_cause(
