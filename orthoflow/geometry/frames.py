@@ -91,10 +91,10 @@ class WallFrame:
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
         """World points (n, 3), metres, of wall positions (n, 2) = (column, row) and depths (n,)."""
-        in_plane = self.gsd_m * (
-            pixels_wall[:, :1] * self.u_world + pixels_wall[:, 1:2] * self.v_world
-        )
-        lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels_wall)), self.normal_world)
+        # Whoever asks for one place in a notebook gives a list of two numbers.
+        pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
+        in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
+        lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
         points: NDArray[np.float64] = self.origin_world + in_plane + lifted
         return points
 

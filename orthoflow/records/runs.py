@@ -158,7 +158,13 @@ class Run:
                 yield Payload(**shared_fields(self.output(address, port), Payload))
 
     def _check_embedded(self, address: str, port: str) -> None:
-        outputs = self.cell(address).outputs
+        cell = self.cell(address)
+        outputs = cell.outputs
+        if not outputs and cell.error_message:
+            how = "failed" if cell.status == "failed" else "was skipped"
+            raise ArgumentError(
+                f"the step {address} gave no {port!r}, it {how}: {cell.error_message}"
+            )
         if port not in outputs:
             raise ArgumentError(
                 f"the step {address} has no output {port!r}; it has "

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from html import escape
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -262,10 +263,11 @@ def _behind(points: Sequence[_Point], n_datasets: int) -> str:
         return f"each of the only one of {n_datasets} datasets that has a value, without bars"
     counted = f"{least}" if least == most else f"{least} to {most}"
     of_all = f" of {n_datasets}" if least < n_datasets else ""
+    apart = ", no line between those of unlike numbers" if least < most else ""
     where = ", where there is more than one" if least == 1 else ""
     return (
         f"medians of {counted}{of_all} datasets, bars 1.4826 times the median absolute "
-        f"deviation{where}"
+        f"deviation{where}{apart}"
     )
 
 
@@ -413,7 +415,9 @@ class _Axes:
 
     def _line(self, index: int, points: Sequence[_Point]) -> str:
         at = [(self.across(point.x), self.down(point.y)) for point in points]
-        way = "L".join(f"{x:.1f} {y:.1f}" for x, y in at)
+        # The hard datasets are often those that a value fails on: no line says that it is better.
+        joins = ["", *("L" if one.n == next_.n else "M" for one, next_ in pairwise(points))]
+        way = "".join(f"{join}{x:.1f} {y:.1f}" for join, (x, y) in zip(joins, at, strict=True))
         bars = "".join(
             f"M{x:.1f} {self.down(max(point.y - point.spread, self.floor)):.1f}"
             f"V{self.down(min(point.y + point.spread, self.ceiling)):.1f}"

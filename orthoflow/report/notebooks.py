@@ -311,6 +311,8 @@ class WallImage:
     def to_xarray(self) -> Any:  # Any: of a library that need not be there
         """Give an `xarray.DataArray` with metres along the wall, y upwards, as the GeoTIFF has.
 
+        Its coordinate `is_shown` (y, x) tells cells that are black from those that show nothing.
+
         Raises:
             PluginError: xarray is not installed.
         """
@@ -327,9 +329,10 @@ class WallImage:
                 "y": top - frame.gsd_m * (np.arange(frame.height) + 0.5),
                 "x": left + frame.gsd_m * (np.arange(frame.width) + 0.5),
                 "band": ["red", "green", "blue"],
+                "is_shown": (("y", "x"), self.is_shown),
             },
             name=self.image.name,
-            attrs={"unit": "m", "gsd_m": frame.gsd_m},
+            attrs={"unit_of_x_and_y": "m", "gsd_m": frame.gsd_m},
         )
 
     def __array__(

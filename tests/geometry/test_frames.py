@@ -65,6 +65,13 @@ def test_points_are_as_far_from_a_raster_as_from_its_rectangle(
         np.testing.assert_allclose(both, [away_m, away_m], atol=1e-9)
 
 
+def test_one_place_may_be_a_list_of_two_numbers() -> None:
+    frame, depth_m = turned(), 0.2
+    expected = frame.world_from_wall(np.array([[30.5, 12.0]]), np.array([depth_m]))
+    for place in ([30.5, 12.0], [[30.5, 12.0]], (30.5, 12.0), np.array([30.5, 12.0])):
+        np.testing.assert_array_equal(frame.world_from_wall(place, depth_m), expected)
+
+
 @pytest.mark.parametrize(("crs", "corner"), [(None, (0.0, 0.0)), ("EPSG:32632", (1.0, 2.0))])
 def test_rasters_count_from_their_corner_and_maps_from_the_world(
     crs: str | None, corner: tuple[float, float]

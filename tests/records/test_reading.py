@@ -315,6 +315,16 @@ def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
     assert cell_file_name(address) != cell_file_name(other)
 
 
+@pytest.mark.parametrize(("status", "how"), [("failed", "failed"), ("skipped", "was skipped")])
+def test_of_a_step_without_a_result_the_reason_is_said(run: Run, status: str, how: str) -> None:
+    cell = dataclasses.replace(
+        run.cells["cloud"], status=status, outputs={}, error_message="no file"
+    )
+    other = dataclasses.replace(run, record=dataclasses.replace(run.record, cells=(cell,)))
+    with pytest.raises(ArgumentError, match=f"the step cloud gave no 'cloud', it {how}: no file"):
+        other.payload("cloud", "cloud")
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [

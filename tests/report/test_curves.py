@@ -176,6 +176,7 @@ def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> N
     parts = {"calm": held(tmp_path, fine), "dark": held(tmp_path, failing)}
     (curve,) = curves_over(parts)
     assert "medians of 1 to 2 of 2 datasets, bars" in curve.caption
+    assert "no line between those of unlike numbers" in curve.caption
     nothing = held(tmp_path, [replace(one, status="failed") for one in swept(0.02, 0.05, 0.1)])
     (curve,) = curves_over({"calm": held(tmp_path, fine), "broken": nothing})
     assert "each of the only one of 2 datasets that has a value, without bars" in curve.caption

@@ -201,7 +201,10 @@ def test_an_orthoimage_is_handed_on_with_metres_along_its_wall(
     x, y = array.coords["x"], array.coords["y"]
     np.testing.assert_allclose(x, np.linspace(left, left + columns * step, 2 * columns + 1)[1::2])
     np.testing.assert_allclose(y, np.linspace(top, top - rows * step, 2 * rows + 1)[1::2])
-    assert array.attrs == {"unit": "m", "gsd_m": step}
+    assert array.attrs == {"unit_of_x_and_y": "m", "gsd_m": step}
+    dims, shown = array.coords["is_shown"]
+    assert dims == ("y", "x")
+    np.testing.assert_array_equal(shown, image.is_shown)
 
 
 def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:

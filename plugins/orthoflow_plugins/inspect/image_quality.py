@@ -219,7 +219,8 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
 
     # A few million cells have edges enough.
     image = cells.fullest_part(_TILE_CELLS)
-    if not image.valid.any():
+    # Of one row or column nobody can tell how steep it is.
+    if not image.valid.any() or min(image.valid.shape) < 2:
         return np.zeros((0, _ALONG.size))
     # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.
     grey = _closed(image)

@@ -215,3 +215,11 @@ def test_where_nothing_is_shown_there_are_no_profiles() -> None:
     nowhere = np.zeros((40, 61), dtype=np.bool_)
     image = GreyImage(grey=edge(), valid=nowhere, region=nowhere)
     assert image_quality._edge_profiles(image).shape == (0, image_quality._ALONG.size)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1)])
+def test_one_row_of_cells_has_no_profiles(shape: tuple[int, int]) -> None:
+    everywhere = np.ones(shape, dtype=np.bool_)
+    grey = np.arange(everywhere.size, dtype=np.float64).reshape(shape)
+    image = GreyImage(grey=grey, valid=everywhere, region=everywhere)
+    assert image_quality._edge_profiles(image).shape == (0, image_quality._ALONG.size)
