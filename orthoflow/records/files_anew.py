@@ -45,7 +45,10 @@ def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterat
         folder = scratch / "run"
         folder.mkdir()
         made = publish_products(folder, run.record.cells, files_of)
-        tell(f"{run.path} lies alone: its rasters are made anew of the products in it")
+        tell(
+            f"{run.path} lies alone: its rasters are made anew of the products in it, and "
+            "other files that were published are left out"
+        )
         record = replace(run.record, published=made)
         yield replace(opened, record=record, files_folder=folder)
 

@@ -242,9 +242,10 @@ class _Places:
         yield from self.files
         if self.files:
             return
-        noted = (memory.place(file.sha256) for memory in memories)
-        yield from (path for path in noted if path is not None)
-        for folder in self.folders:
+        noted = [memory.place(file.sha256) for memory in memories]
+        seen_last = [path for path in noted if path is not None]
+        yield from seen_last
+        for folder in dict.fromkeys((*self.folders, *(path.parent for path in seen_last))):
             yield from self.listings.of_size(folder, file.size_bytes)
 
 

@@ -253,6 +253,6 @@ def _missing_note(missing: list[str], n_published: int) -> str:
             "checked"
         )
     return (
-        f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/ any more: "
+        f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/: "
         f"{first_few(missing)}"
     )

@@ -29,7 +29,7 @@ _CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
 FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean")
 # Seconds of the clock beyond those of the processor, and how many times these, that a machine with
 # other work is known by.
-_BUSY_S: Final = 5.0
+_BUSY_S: Final = 2.0
 _BUSY_TIMES: Final = 3.0
 # Seconds of loading and compiling in which a compiler was at work.
 _COMPILING_S: Final = 5.0

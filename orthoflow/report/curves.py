@@ -31,7 +31,7 @@ _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
-_SHARES: Final = ("label_*", "*completeness*", "*_iou*", "*_share*")
+_SHARES: Final = ("main_found", "label_*", "*completeness*", "*_iou*", "*_share*")
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
 # Above, the button that enlarges lies over the drawing.

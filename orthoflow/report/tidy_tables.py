@@ -106,7 +106,7 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
             yield (
                 *(metric.step, metric.metric, one.name, one.against),
                 *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
-                *map(_known, (one.median, one.spread)),
+                *map(_known, (one.median, one.spread if one.n > 1 else math.nan)),
                 *(
                     ("",) * 7
                     if paired is None

@@ -145,4 +145,4 @@ def test_a_missing_published_file_is_noted(studio: Studio) -> None:
     (studio.folder / "first" / "products" / "metrics.csv").unlink()
     done = studio("verify", "first")
     assert done.exit_code == 0
-    assert "published files are not in products/ any more: products/metrics.csv" in done.stdout
+    assert "published files are not in products/: products/metrics.csv" in done.stdout

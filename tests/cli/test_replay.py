@@ -116,6 +116,10 @@ def test_an_input_is_found_under_another_name_and_where_a_run_found_it(studio: S
     studio.run("second", "--input", "number=mydata/deep")
     done = studio("export", "second", "--embed", "-o", "whole")
     assert done.exit_code == 0, done.output
+    # Beside the place where it lay, too.
+    deep = studio.folder / "mydata" / "deep"
+    (deep / "n.txt").rename(deep / "k.txt")
+    assert studio("export", "second", "--embed", "-o", "beside").exit_code == 0
 
 
 def test_a_changed_input_is_named_before_anything_runs(studio: Studio) -> None:

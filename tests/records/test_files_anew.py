@@ -48,7 +48,9 @@ def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
         # What was made is what the run now calls its own.
         states = {published_state(found.folder, file) for file in found.record.published}
         assert states == {"same"}
-    assert said == [f"{alone.path} lies alone: its rasters are made anew of the products in it"]
+    left_out = "and other files that were published are left out"
+    made_anew = "its rasters are made anew of the products in it"
+    assert said == [f"{alone.path} lies alone: {made_anew}, {left_out}"]
     assert not ortho.exists()
 
 

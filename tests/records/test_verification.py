@@ -87,7 +87,7 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
         ),
     )
     assert found.notes == (
-        "2 of 5 published files are not in products/ any more: products/gone, products/same/below",
+        "2 of 5 published files are not in products/: products/gone, products/same/below",
     )
     assert checked(folder, "same") == module._PublishedCheck(n_same=1)
     # A record that travels alone.
