@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow import products
 from orthoflow.catalog.catalog import Catalog, MethodEntry
+from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.errors import PluginError
 from orthoflow.sdk import PortSpec, port_specs
+from orthoflow.sdk.hooks import FILES
+from orthoflow.version import DISTRIBUTION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +39,7 @@ class KindPorts:
         inputs: in the kind's order.
         outputs: likewise.
         imports: module -> names, for the product classes.
+        needs: requirements of other plugins that bring the kind, its start or a product.
         start_module: module of an installed method of the kind, empty without one.
         start_class: its class.
         start_id: its id.
@@ -44,6 +48,7 @@ class KindPorts:
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
     imports: Mapping[str, tuple[str, ...]]
+    needs: tuple[str, ...] = ()
     start_module: str = ""
     start_class: str = ""
     start_id: str = ""
@@ -89,6 +94,11 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
             _port(catalog, port, handed.get(port.type_name, "")) for port in given.values()
         ),
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
+        needs=_needs(
+            catalog,
+            [port.type_name for port in (*taken.values(), *given.values())],
+            [entry.distribution, *([start.distribution] if start else [])],
+        ),
         start_module=module,
         start_class=class_name,
         start_id=start.spec.id if start else "",
@@ -105,7 +115,22 @@ def taken_ports(catalog: Catalog, takes: Sequence[str]) -> KindPorts:
         inputs=tuple(Port(name=name, class_name=_class_of(catalog, name)[1]) for name in takes),
         outputs=(),
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
+        needs=_needs(catalog, takes, ()),
     )
+
+
+def _needs(
+    catalog: Catalog, type_names: Iterable[str], besides: Iterable[DistributionInfo]
+) -> tuple[str, ...]:
+    """Requirements of what others than orthoflow bring, in the order of their names."""
+    of_types = (catalog.products[name].distribution for name in type_names if name != FILES)
+    # `>=` takes no local part of a version.
+    versions = {
+        one.name: one.version.partition("+")[0]
+        for one in (*of_types, *besides)
+        if one.name != DISTRIBUTION
+    }
+    return tuple(f"{name}>={version}" for name, version in sorted(versions.items()))
 
 
 def _loadable(catalog: Catalog, kind: str) -> MethodEntry | None:
@@ -130,7 +155,7 @@ def _port(catalog: Catalog, port: PortSpec, same_as: str) -> Port:
 
 
 def _class_of(catalog: Catalog, type_name: str) -> tuple[str, str]:
-    if type_name == products.InputFiles.type_name:
+    if type_name == FILES:
         return products.__name__, products.InputFiles.__name__
     module, _, name = catalog.products[type_name].spec.target.partition(":")
     return (products.__name__, name) if name in products.__all__ else (module, name)

@@ -12,6 +12,7 @@ from typing import Final
 
 import jinja2
 
+from orthoflow import products, sdk
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.wording import did_you_mean
@@ -21,6 +22,8 @@ from orthoflow.scaffold.kinds import KindPorts, kind_ports, taken_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
+# What a written module may import by name.
+_IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 
@@ -59,13 +62,16 @@ class Project:
 
     @property
     def class_name(self) -> str:
-        """Name of the method's class."""
-        return _class_name(self.name)
+        """Name of the method's class, no other class's of its module."""
+        name = _class_name(self.name)
+        others = {self.product_class, *map(_class_name, self.takes), *_IMPORTED}
+        return f"{name}Method" if name in others else name
 
     @property
     def product_class(self) -> str:
-        """Name of the class of its own product."""
-        return _class_name(self.product)
+        """Name of the class of its own product, likewise."""
+        name = _class_name(self.product)
+        return f"{name}Product" if name in _IMPORTED else name
 
 
 def _class_name(name: str) -> str:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory, mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import OrthoflowError
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.errors import OrthoflowError, PluginError
 from orthoflow.geometry import up_vector, wall_axes
 from orthoflow.products import InputFiles, Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.photographed import PHOTOGRAPHED
 from orthoflow.testing.surveyed import SURVEYED
+from orthoflow.testing.trials import Trial, run_trial
 
 
 class ExampleError(OrthoflowError, LookupError):
@@ -27,7 +30,8 @@ def example_inputs(
 ) -> dict[str, Product | InputFiles]:
     """Give what a method requires, from one scene: the photographed wall or the simulated room.
 
-    A truth is given wherever a method takes it.
+    A truth is given wherever a method takes it. A product type of a plugin is made by an installed
+    method that gives it.
 
     Args:
         method: the class.
@@ -36,6 +40,12 @@ def example_inputs(
     Raises:
         ExampleError: there is no example for a port.
     """
+    return _example_inputs(method, besides, within=())
+
+
+def _example_inputs(
+    method: type[Method], besides: Collection[str], *, within: tuple[str, ...]
+) -> dict[str, Product | InputFiles]:
     ports = port_specs(method.In)
     required = {port.type_name for port in ports.values() if port.required}
     scene = PHOTOGRAPHED if required & {"photos", "cameras", "ties"} else {}
@@ -43,7 +53,7 @@ def example_inputs(
     for name, port in ports.items():
         if name not in besides and (port.required or port.type_name == "truth"):
             make = scene.get(port.type_name)
-            found[name] = make() if make else example(port.type_name)
+            found[name] = make() if make else _example(port.type_name, within)
     return found
 
 
@@ -51,17 +61,49 @@ def example(type_name: str) -> Product | InputFiles:
     """Give a small product of a type, the same in every process.
 
     Raises:
-        ExampleError: the type is a plugin's own, or nothing is known of it here.
+        ExampleError: the type is a plugin's own, and no installed method makes one of the other
+            examples.
     """
+    return _example(type_name, within=())
+
+
+def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
+    """Give an example; `within` are the types whose examples are being made of it."""
     if type_name == "files":
         return _example_files()
     make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
-    if make is None:
-        raise ExampleError(
-            f"there is no example of a {type_name} product: give one in `inputs` of "
-            "conformance_cases"
-        )
-    return make()
+    if make is not None:
+        return make()
+    if type_name not in within:
+        for method, port in _givers(discover_catalog(), type_name):
+            try:
+                inputs = _example_inputs(method, (), within=(*within, type_name))
+                with TemporaryDirectory(prefix="orthoflow-example-") as folder:
+                    trial = Trial(method=method, inputs=inputs)
+                    return run_trial(trial, Path(folder), draws=False).outputs[port]
+            except Exception:  # noqa: BLE001 - a foreign method may raise anything
+                continue
+    raise ExampleError(
+        f"there is no example of a {type_name} product, and no installed method makes one of the "
+        "suite's examples: give one in `inputs` of conformance_cases"
+    )
+
+
+def _givers(catalog: Catalog, type_name: str) -> Iterator[tuple[type[Method], str]]:
+    """Installed methods that give a type of a plugin, each with the port that carries it."""
+    if type_name not in catalog.products:
+        return
+    for entry in catalog.methods.values():
+        kind = entry.kind
+        if kind is None or not (kind.is_source or type_name in kind.outputs.values()):
+            continue
+        try:
+            method = entry.load()
+        except PluginError:
+            continue
+        for port in port_specs(method.Out).values():
+            if port.type_name == type_name:
+                yield method, port.name
 
 
 def example_room(

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import venv
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from orthoflow.cli import program
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
-from orthoflow.testing import conformance_cases
+from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
 from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.doubts import doubts_about
@@ -100,6 +101,53 @@ def test_a_new_kind_brings_its_product_and_passes_the_suite(
     assert [cell.params["factor"] for cell in cells] == [1.0, 2.0]
     assert [cell.skip_reason for cell in cells] == ["", ""]
     assert doubts_about(workflow) == ()
+
+
+def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    projects = (
+        # Named as its product, which would be one class name twice.
+        Project(name="firsts", kind="first", product="firsts", takes=("cloud",)),
+        Project(name="then-own", kind="then", product="thens", takes=("firsts", "cloud")),
+        Project(name="first-again", kind="first"),
+    )
+    for project in projects:
+        write_project(project, tmp_path, discover_catalog())
+        install(tmp_path / project.name, monkeypatch)
+    for project in projects:
+        text = (tmp_path / project.name / "pyproject.toml").read_text(encoding="utf-8")
+        needed = tomllib.loads(text)["project"]["dependencies"]
+        assert needed[0].startswith("orthoflow-tls>=")
+        assert needed[1:] == ([] if project is projects[0] else ["firsts>=0.1.0"])
+    then = discover_catalog().method("then.then-own").load()
+    inputs = example_inputs(then)
+    assert {name: type(given).__name__ for name, given in inputs.items()} == {
+        "firsts": "Firsts",
+        "cloud": "PointCloud",
+    }
+    made = run_trial(Trial(method=then, inputs=inputs), tmp_path / "scratch", draws=False)
+    assert made.metrics[0].value > 0
+
+
+@pytest.mark.parametrize(
+    ("project", "names"),
+    [
+        (Project(name="planes", kind="plane"), ("PlanesMethod", "")),
+        (
+            Project(name="parts", kind="part", product="parts", takes=("cloud",)),
+            ("PartsMethod", "Parts"),
+        ),
+        (
+            Project(name="damp-map", kind="leak", product="point_cloud", takes=("damp_map",)),
+            ("DampMapMethod", "PointCloudProduct"),
+        ),
+    ],
+)
+def test_no_class_has_the_name_of_another_one_beside_it(
+    project: Project, names: tuple[str, str]
+) -> None:
+    assert (project.class_name, project.product_class) == names
 
 
 @pytest.mark.parametrize(

@@ -139,5 +139,5 @@ def test_what_a_method_gets_is_of_one_scene_and_a_truth_wherever_it_takes_one(
     assert example_inputs(Surveying) == {"walls": "walls of SURVEYED", "truth": "truth of SURVEYED"}
     assert example_inputs(Surveying, besides=("walls", "truth")) == {}
     assert example("ties") == "ties of PHOTOGRAPHED"
-    with pytest.raises(ExampleError, match="there is no example of a dent product: give one in"):
+    with pytest.raises(ExampleError, match="there is no example of a dent product, and no "):
         example("dent")
