@@ -66,7 +66,9 @@ def replay(
     What is missing or not as it was is named before anything runs. Says of every product whether
     it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
     differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
-    whose products are identical: by more than a millionth, or a count at all.
+    whose products are identical: by more than a millionth, or a count at all; and where it cannot
+    be replayed because an input is missing or altered, the record was edited, or a method is of
+    another version; with 4 where methods are missing and nothing else is wrong.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions

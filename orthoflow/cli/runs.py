@@ -56,7 +56,7 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     metavar="'METRIC > X'",
     multiple=True,
     help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter (of "
-    "a sweep, of one of its values).",
+    "a sweep, of one of its values; step.variant.parameter for those of a variant).",
 )
 @click.option(
     "--sort",
@@ -259,7 +259,7 @@ def _facts_text(facts: Mapping[str, object]) -> str:
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "n_values", "swept", "shared"):
+    for name in ("labels", "n_values", "swept", "shared", "variants"):
         del values[name]
     return values | {"differs": dict(differs)}
 

@@ -31,7 +31,8 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     Recomputes the seal, the digest of every product and input file in the record, every cache
     key and the digest of the workflow, and compares the published files beside the record with
     theirs; one that is not there is noted. The report and its figures are not covered: `orthoflow
-    report` makes them anew from the record. With --signer the record must be signed with that key.
+    report` makes them anew from the record; nor is what else lies in the folder, logs and the
+    description of a crate, say. With --signer the record must be signed with that key.
     Ends with 3 when something differs, or RUN is no record or of a newer orthoflow.
     """
     from orthoflow.records.verification import verify_run

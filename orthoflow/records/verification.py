@@ -28,13 +28,16 @@ from orthoflow.records.runs import (
     find_record,
     record_errors,
 )
-from orthoflow.records.signatures import check_signature, read_signature
+from orthoflow.records.signatures import SIGNATURE_SUFFIX, check_signature, read_signature
 
 # What shows the record; its digests would have to be in it.
 _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 
 # Every number and text of a record is smaller; large are only arrays of products and input files.
 _SEALED_BYTES: Final = 1 << 20
+
+# A crate has its description, two files of the workflow and one per environment.
+_UNCOVERED_MOST: Final = 8
 
 PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
@@ -104,7 +107,7 @@ def verify_run(
         record, seal = opened.record, opened.content_sha256
     products = [product for cell in record.cells for product in cell.outputs.values()]
     n_products = sum(product.embedded for product in products)
-    check = _check_published(record_path.parent, record) if also_published else _PublishedCheck()
+    check = _check_published(record_path, record) if also_published else _PublishedCheck()
     signature = _check_signature(record_path, signer)
     return Verification(
         path=record_path,
@@ -178,14 +181,18 @@ class _PublishedCheck:
     n_same: int = 0
 
 
-def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
+def _check_published(path: Path, record: RunRecord) -> _PublishedCheck:
+    folder = path.parent
     states = list(in_order(lambda file: published_state(folder, file), record.published))
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
     notes: tuple[str, ...] = (_missing_note(missing, len(checked)),) if missing else ()
-    if views := [name for name in _VIEWS if os.path.lexists(folder / name)]:
-        notes += (_views_note(folder, views),)
+    views = [name for name in _VIEWS if os.path.lexists(folder / name)]
+    # A record that travels alone lies among files that are none of its own.
+    others = _uncovered(path, record) if views or len(missing) < len(checked) else []
+    if views or others:
+        notes += (_uncovered_note(folder, views, others),)
     return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
 
 
@@ -238,11 +245,27 @@ def require_unchanged(run: Run, *paths: Path) -> None:
             raise RecordError(f"{path} cannot be read: {state}")
 
 
-def _views_note(folder: Path, views: list[str]) -> str:
+def _uncovered(path: Path, record: RunRecord) -> list[str]:
+    """What lies beside a record and is neither named in it nor shows it, sorted."""
+    known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, *_VIEWS}
+    _, folders, files = next(os.walk(path.parent), ("", [], []))
+    beside = sorted({*folders, *files} - known)
+    named = {file.path for file in record.published}
+    for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):
+        paths = [Path(place, name).relative_to(path.parent).as_posix() for name in below]
+        beside += sorted(set(paths) - named)
+    return beside
+
+
+def _uncovered_note(folder: Path, views: list[str], others: list[str]) -> str:
+    rest = first_few(others, most=_UNCOVERED_MOST)
+    if not views:
+        return f"not covered: {rest}, which the record does not name"
     shows, them = ("shows", "it") if len(views) == 1 else ("show", "them")
     return (
         f"not covered: {', '.join(views)}, which {shows} the record; `orthoflow report "
         f"{shlex.quote(str(folder))}` makes {them} anew"
+        + (f"; nor what else the record does not name: {rest}" if others else "")
     )
 
 

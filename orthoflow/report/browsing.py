@@ -59,6 +59,8 @@ class RunSummary:
             version), and inputs by `input <name>`.
         swept: of facts whose variants of the same method take several values, all of them.
         shared: of facts of one of several datasets, their name without it.
+        variants: all values of parameters as `--set` names them for one variant,
+            `step.variant.parameter`; of one with a sweep those of all that it became.
     """
 
     folder: Path
@@ -74,16 +76,19 @@ class RunSummary:
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
     swept: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
     shared: Mapping[str, str] = field(default_factory=dict)
+    variants: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
         """What `values` knows something of."""
-        return (*self.metrics, *self.facts, *self.shared.values())
+        return (*self.metrics, *self.facts, *self.shared.values(), *self.variants)
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
         """Give a metric or a fact: of a sweep all values, without a dataset those of every one."""
         if name in self.metrics:
             return (self.metrics[name],)
+        if name in self.variants:
+            return self.variants[name]
         facts = [name, *(fact for fact, short in self.shared.items() if short == name)]
         return tuple(
             value
@@ -262,7 +267,23 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         facts=facts,
         swept=_swept(record.cells, names),
         shared=shared,
+        variants=_variants(record.cells),
     )
+
+
+def _variants(cells: Sequence[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
+    found: dict[str, list[JsonValue]] = {}
+    for cell in cells:
+        variant = cell.assignment.get(cell.step, "")
+        if not variant or cell.repeat or cell.status == "skipped":
+            continue
+        # A sweep puts its parameters and their values behind the name that `--set` takes.
+        swept = [variant.find(f"-{parameter}-") for parameter in cell.params]
+        names = {variant, variant[: min((at for at in swept if at > 0), default=None)]}
+        for name in names:
+            for parameter, value in cell.params.items():
+                found.setdefault(f"{cell.step}.{name}.{parameter}", []).append(value)
+    return {name: tuple(values) for name, values in found.items()}
 
 
 def _swept(

@@ -78,6 +78,11 @@ def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
     notes = [line for line in verified.stdout.splitlines() if line.startswith("note: ")]
     assert (verified.exit_code, len(notes)) == (0, 1), verified.stdout
     assert notes[0].startswith("note: not covered: report.html, ")
+    environment = next((studio.folder / "crate").glob("requirements-*.txt")).name
+    assert notes[0].endswith(
+        f"; nor what else the record does not name: {environment}, ro-crate-metadata.json, "
+        "workflow-resolved.json, workflow.yaml"
+    ), notes[0]
 
 
 def test_a_record_with_changed_arrays_is_not_handed_on(

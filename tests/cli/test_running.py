@@ -161,7 +161,7 @@ def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     note, seal, last = checked.stdout.splitlines()
     assert note == (
         "note: not covered: report.html, figures, which show the record; `orthoflow report r` "
-        "makes them anew"
+        "makes them anew; nor what else the record does not name: journal.jsonl, logs"
     )
     assert re.fullmatch(r"seal: sha256:[0-9a-f]{64}", seal)
     assert last == "verified: 2 products, seal ok, 11 published files unchanged"

@@ -120,6 +120,10 @@ def test_a_sweep_differs_from_a_single_run_in_all_its_values(
     }
     assert folders("--where", "plane.cell_m = 0.02") == ["swept"]
     assert folders("--where", "plane.cell_m = 0.05") == ["alone", "swept"]
+    # By the names that --set takes for a variant, whether a sweep made several of it or not.
+    assert folders("--where", "plane.fine.cell_m = 0.02") == ["swept"]
+    assert folders("--where", "plane.fine.cell_m = 0.05") == ["alone", "swept"]
+    assert folders("--where", "plane.fine-cell_m-0_05.cell_m = 0.05") == ["swept"]
 
 
 def test_json_and_csv_have_every_number(runs: Path) -> None:

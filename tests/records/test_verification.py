@@ -73,10 +73,12 @@ def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.Mo
 
 def checked(folder: Path, *names: str) -> Any:
     record: Any = SimpleNamespace(published=[published(f"products/{name}") for name in names])
-    return module._check_published(folder, record)
+    return module._check_published(folder / "run.h5", record)
 
 
 def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
+    for name in set(STATES) - {"same", "other", "link", "folder", "gone", "same/below"}:
+        (folder / "products" / name).unlink()
     found = checked(folder, "same", "other", "link", "gone", "same/below")
     assert found.n_same == 1
     assert found.changed == (
@@ -89,7 +91,8 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
     assert found.notes == (
         "2 of 5 published files are not in products/: products/gone, products/same/below",
     )
-    assert checked(folder, "same") == module._PublishedCheck(n_same=1)
+    (note,) = checked(folder, "same").notes
+    assert note == "not covered: products/link, products/other, which the record does not name"
     # A record that travels alone.
     (note,) = checked(folder, "gone").notes
     assert note == (
@@ -104,6 +107,11 @@ def test_what_shows_a_record_is_not_covered(folder: Path) -> None:
     (note,) = checked(folder, "same").notes
     assert note.startswith(f"not covered: {module._VIEWS[0]}, {module._VIEWS[1]}, which show")
     assert f"`orthoflow report {folder}`" in note
+    for name in ("run.h5", "run.h5.sig", "workflow.yaml"):
+        (folder / name).touch()
+    (folder / "logs").mkdir()
+    (note,) = checked(folder, *STATES).notes[1:]
+    assert note.endswith("; nor what else the record does not name: logs, workflow.yaml")
 
 
 def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
