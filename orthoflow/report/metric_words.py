@@ -324,6 +324,8 @@ _OF_SOME: Final[Mapping[tuple[str, str], str]] = {
     ("plane", "scan_step_mm"): "step of the scan on the first plane",
     ("raster", "scan_step_mm"): "step of the scan on the first wall",
     ("read.checkpoints", "n_points"): "check points",
+    ("read.scan", "thickness_mm"): "thickness of the cloud in pieces of about 10 cm",
+    ("read.scan", "thickness_scan_steps"): "that thickness over the distance of neighbours",
     ("register", "n_pairs"): "pairs of points",
     ("register", "rms_mm"): "points to their places, RMS",
 }

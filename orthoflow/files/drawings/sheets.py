@@ -55,7 +55,7 @@ def axes_of(frame: WallFrame, up: NDArray[np.float64] | None) -> Axes:
         )
     if up is not None and float(frame.v_world @ up) < -math.cos(math.radians(1.0)):
         height = float(frame.origin_world @ up)
-        said = f"X along the wall from its left edge, H height: {_axis_words(up)}, m"
+        said = f"X along the wall from the image's left edge, H height: {_axis_words(up)}, m"
         return Axes(across=(0.0, 1.0), down=(height, float(frame.v_world @ up)), said=said)
     said = "X to the right and Y upwards from the top-left corner of the orthoimage, m"
     return Axes(across=(0.0, 1.0), down=(0.0, -1.0), said=said)

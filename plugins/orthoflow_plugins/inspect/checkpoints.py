@@ -43,7 +43,7 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
 )
-from orthoflow_plugins.inspect.missed_points import missed_points, said_of_missed
+from orthoflow_plugins.inspect.missed_points import missed_points, said_of_missed, with_reasons
 from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
@@ -130,18 +130,19 @@ class InspectCheckpoints(Method):
             ctx.progress(index / len(inputs.checkpoints.names), inputs.checkpoints.names[index])
             points.append(finder.find(index))
         found = [k for k, point in enumerate(points) if np.isfinite(point.place).all()]
-        if not found:
-            raise MethodError(
-                f"none of the {len(points)} check points was found in an orthoimage: measure them "
-                "(columns wall, u_px, v_px, or map_x, map_y), or check that scan and points have "
-                "one coordinate system (inspect.checkpoints)"
-            )
-        for doubt in doubts(points, inputs.checkpoints, pictures):
-            ctx.warn(doubt)
         is_simulated = inputs.truth is not None
         missed = missed_points(
             points, inputs.checkpoints, pictures, inputs.walls, is_simulated=is_simulated
         )
+        if not found:
+            raise MethodError(
+                f"none of the {len(points)} check points was found in an orthoimage: "
+                f"{with_reasons(missed)}; measure them (columns wall, u_px, v_px or map_x, map_y), "
+                "or check that scan and points have one unit and one coordinate system "
+                "(inspect.checkpoints)"
+            )
+        for doubt in doubts(points, inputs.checkpoints, pictures):
+            ctx.warn(doubt)
         # In a simulated room points are hidden on purpose.
         if missed and not is_simulated:
             ctx.warn(said_of_missed(missed, len(points)))

@@ -52,17 +52,22 @@ def missed_points(
     return found
 
 
+def with_reasons(missed: Mapping[str, str]) -> str:
+    """Name the first few of what `missed_points` gives, each with its reason."""
+    named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
+    more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
+    return f"{', '.join(named)}{more}"
+
+
 def said_of_missed(missed: Mapping[str, str], n_points: int) -> str:
     """Say in one sentence which of the points count nowhere; empty where all do."""
     if not missed:
         return ""
-    named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
-    more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
     ways = ["measure them in an orthoimage"]
     if any(_BESIDE.search(reason) for reason in missed.values()):
         ways.append("let margin_m of raster.grid make walls larger")
     return (
-        f"{len(missed)} of {n_points} check points count nowhere: {', '.join(named)}{more}; "
+        f"{len(missed)} of {n_points} check points count nowhere: {with_reasons(missed)}; "
         f"{', or '.join(ways)}"
     )
 

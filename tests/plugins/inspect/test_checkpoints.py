@@ -227,7 +227,9 @@ def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -
 def test_what_is_not_found_is_said(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     far = points_at(np.array([[50.0, 50.0, 50.0]]))
-    with pytest.raises(MethodError, match="none of the 1 check points was found"):
+    with pytest.raises(
+        MethodError, match=r"none of the 1 check points was found in an orthoimage: \S+ \(.* beyond"
+    ):
         inspect(tmp_path, far, walls)
     with pytest.raises(MethodError, match="there is no picture to find check points in"):
         inspect(tmp_path, far, inspect_scenes.walls(source="none"))
