@@ -68,8 +68,9 @@ def main() -> None:
         cloud = room.cloud
         planes, wall = main_wall_found(cloud, room.truth)
         if chosen.no_stations:
-            cloud = replace(cloud, stations=None, stations_source=None, scan=None)
-            cloud = replace(cloud, row=None, column=None)
+            cloud = replace(
+                cloud, stations=None, stations_source=None, scan=None, row=None, column=None
+            )
         for gsd_m in CELLS_M:
             rule = RasterGrid.Params(gsd_m=gsd_m, buffer_m=0.3, ranks=(wall,))
             rastered = RasterGrid.In(cloud=cloud, planes=planes)

@@ -16,12 +16,11 @@ raster, beyond the `buf`fer, in a `void` cell of the raster, or in a cell that s
 from __future__ import annotations
 
 import argparse
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from orientation_truth import context
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.plane.hough2d import Hough2d
@@ -32,7 +31,6 @@ from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import Rendering, SceneCameras, render
 from orthoflow.geometry.scenes import SurfaceRole, Viewers
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Truth, Walls
-from orthoflow.sdk import StepContext
 
 _GSD_M = 0.004
 # Drawn relief stands out by 0.3 m and goes in by 0.45 m at most; furniture stands farther out.
@@ -62,11 +60,6 @@ class TrueWall:
         """How far its relief stands out and goes in."""
         low, high = np.quantile(self.depth_m, [_RELIEF_LEAST, 1.0 - _RELIEF_LEAST])
         return float(high), float(-low)
-
-
-def context(seed: int) -> StepContext:
-    folder = Path(tempfile.mkdtemp())
-    return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=folder)
 
 
 def true_wall(truth: Truth, name: str) -> TrueWall:

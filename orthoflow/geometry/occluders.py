@@ -137,9 +137,9 @@ def occluders_in(
     larger = float(side) / (_VOXEL_CELLS * box.spacing_m)
     n_few = _FEW_POINTS * larger**2
     if stations_world is None or not len(stations_world):
-        is_spread = _spread(counts, n_few)
+        squares = counts.astype(np.uint32) ** 2
         _sum_neighbours(counts)
-        counts[is_spread] = 0
+        _forget_spread(counts, squares, n_few)
     else:
         _sum_neighbours(counts)
         stations = np.unique(stations_world, axis=0) - cloud.origin
@@ -206,20 +206,22 @@ def _part(points: Offsets, piece: slice) -> Offsets:
     return Offsets(points.x[piece], points.y[piece], points.z[piece])
 
 
-def _spread(counts: NDArray[np.uint16], n_few: float) -> tuple[NDArray[np.intp], ...]:
-    """Voxels about which few points are spread over all 27, as no surface spreads them.
+def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_few: float) -> None:
+    """Take no surface to be where few points are spread over all 27 voxels, as none spreads them.
 
     Of all pairs of points, one in 27 lies in one voxel where they stray, one in 9 on a surface and
     one in 3 along a line.
+
+    Args:
+        counts: of 27 voxels, changed in place.
+        squares: of the counts of single voxels, changed in place.
+        n_few: a surface has more.
     """
-    n, squares = counts.astype(np.uint32), counts.astype(np.uint32) ** 2
-    for each in (n, squares):
-        _sum_neighbours(each)
-    places = np.nonzero((n > 1) & (n < n_few))
-    around = n[places].astype(np.float64)
-    return tuple(
-        axis[squares[places] - around < _SPREAD_SHARE * around * (around - 1.0)] for axis in places
-    )
+    _sum_neighbours(squares)
+    places = np.nonzero((counts > 1) & (counts < n_few))
+    around = counts[places].astype(np.float64)
+    is_spread = squares[places] - around < _SPREAD_SHARE * around * (around - 1.0)
+    counts[tuple(axis[is_spread] for axis in places)] = 0
 
 
 def _forget_passed(
