@@ -70,6 +70,7 @@ def outcome(share: float, photos: Photos, walls: Walls, truth: Truth, *, structu
     first = orient(OrientColmapBundle, ties, photos, **ROUGHLY)
     _name_unplaced(first, "first", walls, truth)
     errors: tuple[PoseError, ...] = ()
+    cameras = first
     try:
         started = time.process_time()
         again = rematched("guided", photos, walls, first)
