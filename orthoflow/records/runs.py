@@ -25,6 +25,7 @@ from orthoflow.foreign_text import shown
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
+from orthoflow.sdk.lines import one_line
 
 REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"
@@ -34,6 +35,7 @@ GRAPH_FILE: Final = "graph.svg"
 # Of a run on several datasets, a page for each.
 PAGES_FOLDER: Final = "pages"
 _MOST_NAMED: Final = 12
+_LONGEST_REASON: Final = 400
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -108,7 +110,17 @@ class Run:
     def __repr__(self) -> str:
         counts = Counter(cell.status for cell in self.record.cells)
         statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
-        return shown(f"<Run {self.record.name} in {self.folder}: {statuses or 'no steps'}>")
+        said = self.with_failure(f"{self.record.name} in {self.folder}: {statuses or 'no steps'}")
+        return shown(f"<Run {said}>")
+
+    def with_failure(self, sentence: str) -> str:
+        """Add to what is said of a run which step failed first and why, if one did."""
+        failed = [cell for cell in self.record.cells if cell.status == "failed"]
+        if not failed:
+            return sentence
+        more = f" ({len(failed) - 1} more failed)" if len(failed) > 1 else ""
+        why = one_line(failed[0].error_message, _LONGEST_REASON)
+        return f"{sentence}; {failed[0].address} failed{more}: {why}"
 
     def metric_rows(self) -> tuple[MetricRow, ...]:
         """Every number of every cell, those that the engine measured included."""

@@ -86,8 +86,10 @@ def write_stac(run: Run, folder: Path) -> int:
     ]
     if not orthos:
         raise ArgumentError(
-            f"the run {run.record.run_id} has no orthoimages among its published files, so there "
-            "is nothing to describe"
+            run.with_failure(
+                f"the run {run.record.run_id} has no orthoimages among its published files, so "
+                "there is nothing to describe"
+            )
         )
     for ortho in orthos:
         beside = [path for path in copied if _is_beside(PurePosixPath(path), ortho)]

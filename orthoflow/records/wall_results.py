@@ -219,7 +219,9 @@ def _pictured(run: Run, cell: str | None) -> str:
     }
     if cell is None:
         if not found["orthoimages"] and not found["walls"]:
-            raise ArgumentError(f"the run {run.record.run_id} has no orthoimages and no walls")
+            raise ArgumentError(
+                run.with_failure(f"the run {run.record.run_id} has no orthoimages and no walls")
+            )
         return (found["orthoimages"] or found["walls"])[-1]
     run.cell(cell)
     everything = [*found["orthoimages"], *found["walls"]]

@@ -141,10 +141,10 @@ class OpenedRun(Run):
         baseline = [one.address for one in baseline_cells(part) if one.address in places]
         chosen = cell or next(iter([*baseline, *places]), "")
         if chosen not in places:
-            raise ArgumentError(
-                f"the run {self.record.run_id} has no orthoimages of {cell or 'any step'}; steps "
-                f"with some: {', '.join(places) or 'none'}"
-            )
+            lacks = f"the run {self.record.run_id} has no orthoimages"
+            if places:
+                raise ArgumentError(f"{lacks} of {cell}; steps with some: {', '.join(places)}")
+            raise ArgumentError(f"{self.with_failure(lacks)}{self._way_to_logs()}")
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
         found = [image for image in images if number is None or image.number == number]
         if not found:
@@ -184,6 +184,11 @@ class OpenedRun(Run):
         opened = other if isinstance(other, Run) else open_run(other)
         return compare_runs(self, opened, stores=stores)
 
+    def _way_to_logs(self) -> str:
+        """How to read what the steps said that failed; empty where none did."""
+        failed = [cell.address for cell in self.record.cells if cell.status == "failed"]
+        return f"; run.cell({failed[0]!r}).log has its log" if failed else ""
+
     def _repr_html_(self) -> str:
         record = self.record
         made = {cell.address for cell in baseline_cells(self)}
@@ -193,10 +198,10 @@ class OpenedRun(Run):
             for one in answers(self)
         )
         counts = Counter(cell.status for cell in record.cells)
-        told = _html(", ".join(f"{count} {status}" for status, count in counts.items()))
+        told = ", ".join(f"{count} {status}" for status, count in counts.items()) or "none"
+        steps = f"{self.with_failure(f'steps: {told}')}{self._way_to_logs()}"
         return (
-            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>"
-            f"steps: {told or 'none'}</p>"
+            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{_html(steps)}</p>"
             + (
                 f'<img alt="first orthoimage" src="{picture}" style="max-width:100%">'
                 if picture

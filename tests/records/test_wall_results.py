@@ -46,6 +46,9 @@ class ToyRun:
             raise ArgumentError(f"no cell {address}")
         return self.cells[address]
 
+    def with_failure(self, sentence: str) -> str:
+        return f"{sentence}; plane failed"
+
     def upstream(self, address: str) -> list[Any]:
         names = list(self.cells)
         return [self.cells[name] for name in names[: names.index(address) + 1]]
@@ -159,7 +162,7 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
     assert module._pictured(run, "a") == "a"
     assert module._pictured(ToyRun(a=cell(outputs=walls), d=cell(outputs=walls)), None) == "d"  # type: ignore[arg-type]
     nothing: Any = ToyRun(e=cell(outputs={"cloud": output("cloud")}))
-    with pytest.raises(ArgumentError, match="the run r1 has no orthoimages and no walls"):
+    with pytest.raises(ArgumentError, match=r"r1 has no orthoimages and no walls; plane failed$"):
         module._pictured(nothing, None)
     with pytest.raises(ArgumentError, match=r"e holds no orthoimages or walls; .*: none"):
         module._pictured(nothing, "e")

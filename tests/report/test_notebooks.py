@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -66,6 +67,31 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     assert "<img" not in html
     assert "&lt;Run" not in html
     assert "\x1b" not in html
+
+
+def test_a_run_that_failed_names_the_step_its_reason_and_where_the_log_is(tmp_path: Path) -> None:
+    # "no orthoimages of any step; steps with some: none" left its reader to search.
+    reason = "no plane holds <2> points: raise tolerance_m"
+    cells = [
+        cell("room"),
+        cell("plane@data=hall", status="failed", error_message=f"{reason}\n\x1b[2J"),
+        cell("plane@data=yard", status="failed", error_message="another"),
+        cell("mosaic", status="skipped", error_message="needs plane, which failed"),
+    ]
+    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells, name="hall"))
+    said = f"plane@data=hall failed (1 more failed): {reason} \\x1b[2J"
+    assert repr(run) == f"<Run hall in {tmp_path}: 1 ok, 2 failed, 1 skipped; {said}>"
+    way = "run.cell('plane@data=hall').log has its log"
+    for call in (lambda: run.orthoimage(0), lambda: run.orthoimage(0, cell="mosaic")):
+        with pytest.raises(ArgumentError) as error:
+            call()
+        assert str(error.value) == f"the run r1 has no orthoimages; {said}; {way}"
+    assert escape(f"steps: 1 ok, 2 failed, 1 skipped; {said}; {way}") in run._repr_html_()
+
+
+def test_the_reason_of_a_failure_is_cut_where_it_is_endless(tmp_path: Path) -> None:
+    failed = cell("plane", status="failed", error_message="long " * 10_000)
+    assert len(repr(OpenedRun(path=tmp_path / "run.h5", record=record([failed])))) < 700
 
 
 def swept_run(folder: Path) -> OpenedRun:

@@ -75,7 +75,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
             )
         return cell, found[cell]
     if not found:
-        raise ArgumentError(f"the run {run.record.run_id} {missing}")
+        raise ArgumentError(run.with_failure(f"the run {run.record.run_id} {missing}"))
     *others, last = found
     if others:
         few = first_few(others, most=_MOST_NAMED)
