@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.sdk import StepContext
 
@@ -45,6 +46,13 @@ _MEDIAN_SIGMA: Final = 1.2533
 _SURE_SIGMAS: Final = 3.0
 # Scans nearer to each other than this agree, however little they scatter.
 _AGREE_M: Final = 0.001
+# A piece within this angle of level or of upright is one; noise turns the smallest by 2 degrees.
+_SQUARE_DEG: Final = 5.0
+# Where what is said to be up is up, hardly any building shows no level piece at all.
+_LEVEL_NONE: Final = 0.03
+_LEVEL_PLAIN: Final = 0.15
+_SQUARE_PLAIN: Final = 0.8
+_SQUARER_BY: Final = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +68,7 @@ class CloudQuality:
         scans_apart_m: how far scans that show the same piece lie apart there, across it; None where
             fewer than 20 pieces are shown by two.
         sigma_apart_m: what their scatter alone would make of that, one standard deviation.
+        normals: (n_pieces, 3) unit vectors of the pieces, to either side.
     """
 
     side_m: float
@@ -69,6 +78,33 @@ class CloudQuality:
     scan_step_m: float
     scans_apart_m: float | None = None
     sigma_apart_m: float = 0.0
+    normals: NDArray[np.float64]
+
+    def square_shares(self, up: NDArray[np.float64]) -> tuple[float, float]:
+        """Share of the pieces that are level, and of those that are level or upright.
+
+        Args:
+            up: (3,) unit vector that points up, or is said to.
+        """
+        cosines = np.abs(self.normals @ up)
+        is_level = cosines > np.cos(np.radians(_SQUARE_DEG))
+        is_upright = cosines < np.sin(np.radians(_SQUARE_DEG))
+        return float(is_level.mean()), float((is_level | is_upright).mean())
+
+    def plainly_up(self, up: NDArray[np.float64]) -> int | None:
+        """Axis 0, 1, 2 that is up by the directions of surfaces; None where `up` may be right.
+
+        A room square to the axes looks alike along all of them, and nothing is said of it. Nor is
+        of slopes and single walls: surfaces must be level or upright by one axis, some of them
+        level, and by `up` none level and many askew.
+        """
+        level, square = self.square_shares(up)
+        for axis, direction in enumerate(np.eye(3)):
+            other_level, other_square = self.square_shares(direction)
+            is_plain = other_level >= _LEVEL_PLAIN and other_square >= _SQUARE_PLAIN
+            if level < _LEVEL_NONE and is_plain and other_square - square >= _SQUARER_BY:
+                return axis
+        return None
 
     @property
     def is_thick(self) -> bool:
@@ -93,6 +129,7 @@ class _Piece:
     scan_step_m: float
     apart_m: float
     sigma_apart_m: float
+    normal: NDArray[np.float64]
 
 
 def judge_quality(
@@ -116,6 +153,20 @@ def judge_quality(
         if len(pieces) >= _PIECES_LEAST:
             return _summed_up(pieces, side_m)
     return None
+
+
+def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
+    """Say so where surfaces are level and upright by another axis than the one that is up."""
+    axis = None if quality is None else quality.plainly_up(up_vector(up))
+    if quality is None or axis is None:
+        return
+    by_up, by_other = (quality.square_shares(one)[1] for one in (up_vector(up), np.eye(3)[axis]))
+    name = "xyz"[axis]
+    ctx.warn(
+        f"{name} looks like the axis that points up, not {up}: {by_other:.0%} of the surfaces are "
+        f"level or upright by it, {by_up:.0%} by {up}: set up of read.scan to {name}, or to "
+        f"-{name} where floors come out as ceilings"
+    )
 
 
 def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
@@ -249,6 +300,7 @@ def _measured(
         scan_step_m=step_m,
         apart_m=other_m,
         sigma_apart_m=other_sigma_m,
+        normal=frame[2],
     )
 
 
@@ -309,4 +361,5 @@ def _summed_up(pieces: Sequence[_Piece], side_m: float) -> CloudQuality:
         scan_step_m=median([piece.scan_step_m for piece in pieces]),
         scans_apart_m=median([piece.apart_m for piece in shared]) if is_shared else None,
         sigma_apart_m=median([piece.sigma_apart_m for piece in shared]) if is_shared else 0.0,
+        normals=np.array([piece.normal for piece in pieces]),
     )

@@ -20,7 +20,7 @@ from orthoflow.products import InputFiles, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, resolution_m
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
-from orthoflow_plugins.read.quality import judge_quality, report_quality
+from orthoflow_plugins.read.quality import judge_quality, report_quality, warn_of_up
 from orthoflow_plugins.read.scales import (
     LUMINANCE_CORRELATION,
     IntensityScale,
@@ -232,7 +232,9 @@ def _finish(
         },
     )
     _report_metrics(ctx, assembly, cloud)
-    report_quality(judge_quality(assembly.offsets, assembly.array("scan")), ctx)
+    quality = judge_quality(assembly.offsets, assembly.array("scan"))
+    report_quality(quality, ctx)
+    warn_of_up(quality, params.up, ctx)
     return cloud
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import quality as quality_module
-from orthoflow_plugins.read.quality import CloudQuality, judge_quality, report_quality
+from orthoflow_plugins.read.quality import CloudQuality, judge_quality, report_quality, warn_of_up
 
 from orthoflow.sdk import StepContext
 
+ASKEW = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
 Offsets = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -24,8 +25,7 @@ def wall(
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(-1.5, 1.5, step_m), np.arange(-1.0, 1.0, step_m))
     across = away_m + bow_m * np.cos(u) + rng.normal(0.0, noise_m, u.shape)
-    turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
-    return np.asarray(np.column_stack([u.ravel(), v.ravel(), across.ravel()]) @ turn.T)
+    return np.asarray(np.column_stack([u.ravel(), v.ravel(), across.ravel()]) @ ASKEW.T)
 
 
 def offsets(points: NDArray[np.float64]) -> Offsets:
@@ -123,6 +123,68 @@ def test_pieces_of_thirty_points_are_looked_at_and_three_hundred_at_most() -> No
         assert len(np.unique(np.floor(points[piece]), axis=0)) == 1
 
 
+def room(turned_deg: float, *, without_level: bool = False) -> NDArray[np.float64]:
+    """Points on the six sides of a room of 6 x 4 x 3 m, turned about z; noise of 2 mm."""
+    rng = np.random.default_rng(7)
+    sides = np.array([6.0, 4.0, 3.0])
+    points = []
+    for axis in range(2 if without_level else 3):
+        for end in (0.0, sides[axis]):
+            one = rng.uniform(0.0, 1.0, (20_000, 3)) * sides
+            one[:, axis] = end + rng.normal(0.0, 0.002, len(one))
+            points.append(one)
+    turn = np.radians(turned_deg)
+    about_z = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    return np.concatenate(points) @ about_z.T
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # as most mesh programs write
+UP = {"x": 0, "y": 1, "z": 2}
+
+
+@pytest.mark.parametrize("turned_deg", [8.0, 20.0, 45.0, 70.0])
+def test_a_room_on_its_side_shows_which_axis_is_up(turned_deg: float) -> None:
+    upright, fallen = room(turned_deg), room(turned_deg) @ Y_UP.T
+    for points, up in ((upright, "z"), (fallen, "y"), (fallen[:, [1, 0, 2]], "x")):
+        quality = judge_quality(offsets(points), None)
+        assert quality is not None
+        said = {axis: quality.plainly_up(np.eye(3)[index]) for axis, index in UP.items()}
+        assert said == {axis: None if axis == up else UP[up] for axis in UP}
+
+
+@pytest.mark.parametrize(
+    ("points", "why"),
+    [
+        (room(0.0) @ Y_UP.T, "square to all axes: nobody can tell"),
+        (room(20.0, without_level=True), "walls alone, and z is up"),
+        (wall(step_m=0.01, noise_m=0.002, bow_m=0.0), "one wall"),
+        (room(20.0) @ ASKEW.T, "no axis is up"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_may_be_right_is_not_doubted(points: NDArray[np.float64], why: str) -> None:
+    quality = judge_quality(offsets(points), None)
+    assert quality is not None, why
+    assert quality.plainly_up(np.array([0.0, 0.0, 1.0])) is None
+
+
+def test_another_axis_is_told_with_the_setting(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    fallen = judge_quality(offsets(room(20.0) @ Y_UP.T), None)
+    warn_of_up(fallen, "z", ctx)
+    (said,) = ctx.warnings
+    assert said == (
+        "y looks like the axis that points up, not z: 96% of the surfaces are level or upright by "
+        "it, 37% by z: set up of read.scan to y, or to -y where floors come out as ceilings"
+    )
+    for right in ("y", "-y"):
+        warn_of_up(fallen, right, ctx)
+    warn_of_up(None, "z", ctx)
+    assert ctx.warnings == [said]
+
+
 def square(across: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     """Points (1600, 3) of a square of 10 cm, so far before it in turn."""
     u, v = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(40) * 0.0025]))
@@ -210,6 +272,7 @@ def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
         scan_step_m=0.002,
         apart_m=apart_m,
         sigma_apart_m=sigma_apart_m,
+        normal=ASKEW[0],
     )
     found = quality_module._summed_up([piece] * 20, 0.1)
     assert (found.scans_apart_m, found.sigma_apart_m) == (apart_m, sigma_apart_m)
@@ -237,6 +300,7 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
         scan_step_m=0.002,
         scans_apart_m=0.0094,
         sigma_apart_m=0.0002,
+        normals=np.tile(ASKEW[0], (40, 1)),
     )
     report_quality(quality, ctx)
     assert {metric.name: round(metric.value, 6) for metric in ctx.metrics} == {
