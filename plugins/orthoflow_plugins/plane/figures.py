@@ -6,6 +6,7 @@ Margins are fixed: engines that find them out draw everything once more to measu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -69,6 +70,7 @@ _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
 _SCENE: Final = Margins(left=0.05, right=0.05, bottom=0.05, top=0.05, across=0.1)
 _PLANES_MOST: Final = 12
+_CLASSED_MOST: Final = 4
 _THICKNESS: Final = Margins(left=0.7, right=0.1, bottom=0.45, top=0.1, across=0.45, down=0.5)
 # The names of materials stand between panels.
 _WITH_NAMES: Final = replace(_THICKNESS, across=1.3)
@@ -172,10 +174,11 @@ def draw_thickness(
     known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
     if not known:
         return
+    first = known[:_CLASSED_MOST]
     classes = [
-        label for label in _classes(known[0][1]) if any(_classes(item)[label] for _, item in known)
+        label for label in _classes(known[0][1]) if any(_classes(item)[label] for _, item in first)
     ]
-    named = any(item.material for _, item in known)
+    named = any(item.material for _, item in first)
     n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + int(named)
     figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows))
     grid = figure.add_gridspec(n_rows, n_columns)
@@ -184,7 +187,7 @@ def draw_thickness(
     _draw_sigmas(figure.add_subplot(grid[0, 0]), planes, known)
     for place, label in enumerate(classes):
         axes = figure.add_subplot(grid[0, 1 + place])
-        for k, item in known[:4]:
+        for k, item in first:
             spreads = _classes(item)[label]
             middles = [0.5 * (spread.low + spread.high) for spread in spreads]
             sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
@@ -195,14 +198,15 @@ def draw_thickness(
         if place == 0:
             axes.legend(fontsize=7)
     if named:
-        _draw_materials(figure.add_subplot(grid[0, -1]), planes, known)
+        _draw_materials(figure.add_subplot(grid[0, -1]), planes, first)
     if row is not None:
         _draw_row(figure.add_subplot(grid[1, :]), planes, row, materials)
     ctx.figure(
         "thickness",
         figure,
         "Thickness of the cloud, one standard deviation in millimetres: on each plane beside the "
-        "scan step there, by class and by material. Below, one row of the scan on the first plane. "
+        f"scan step there{_drawn_by(classes, is_by_material=named)}."
+        f"{'' if row is None else ' Below, one row of the scan on the first plane.'} "
         "A cloud thicker than its scan step shows noise, or scans that do not fit each other.",
     )
 
@@ -245,6 +249,13 @@ def _draw_rectangles(
         label = None
 
 
+def _drawn_by(classes: Sequence[str], *, is_by_material: bool) -> str:
+    """Name what else the thickness is drawn along; empty where it is nothing."""
+    drawn = [label.partition(" [")[0] for label in classes] + ["material"] * is_by_material
+    *most, last = drawn or [""]
+    return f", and by {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
+
+
 def _classes(thickness: Thickness) -> dict[str, tuple[Spread, ...]]:
     """Spreads by the quantity that is drawn along, by its label."""
     return {
@@ -270,7 +281,7 @@ def _draw_materials(axes: Axes, planes: Planes, known: list[tuple[int, Thickness
     """Thickness of each material on the first planes."""
     bars = [
         (f"{spread.name}, {planes.names[k]}", 1000.0 * spread.sigma_m)
-        for k, item in known[:4]
+        for k, item in known
         for spread in item.material
     ]
     places = range(len(bars))

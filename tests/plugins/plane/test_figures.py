@@ -36,6 +36,7 @@ from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
 
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
+from orthoflow.sdk import StepContext
 from tests import samples
 from tests.plane_scenes import Rectangle, cloud_of, context, sampled
 
@@ -325,6 +326,40 @@ def test_thickness_without_classes_materials_or_row_is_one_panel(
     row = RowPoints(row=1, scan=0, along_m=np.ones(2), distance_m=np.ones(2), intensity=None)
     draw_thickness(context(tmp_path), planes_of(), (plain, None, None), row, {"a": (0.0, 1.0)})
     assert len(drawings["thickness"].axes[-1].lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("drawn", "has_row", "said"),
+    [
+        ({}, False, "beside the scan step there. A cloud"),
+        ({}, True, "there. Below, one row of the scan on the first plane. A cloud"),
+        ({"range_m": spreads(0.1)}, False, "there, and by range. A cloud"),
+        (
+            {"incidence_deg": spreads(0.1), "material": spreads(0.1, name="brick")},
+            False,
+            "there, and by angle of incidence and material. A cloud",
+        ),
+        (
+            {"incidence_deg": spreads(0.1), "range_m": spreads(0.1), "intensity": spreads(0.1)},
+            True,
+            "there, and by angle of incidence, range and intensity. Below, one row of the scan",
+        ),
+    ],
+    ids=["planes", "row", "range", "material", "classes and row"],
+)
+def test_the_caption_of_the_thickness_names_what_is_drawn(
+    drawn: dict[str, Any], has_row: bool, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    captions: list[str] = []
+    monkeypatch.setattr(StepContext, "figure", lambda *given: captions.append(given[-1]))
+    plain = Thickness(sigma_m=0.001, width_95_m=0.004, scan_step_m=0.005)
+    row = RowPoints(row=1, scan=0, along_m=np.ones(2), distance_m=np.ones(2), intensity=None)
+    # Of the fifth plane on only the bar is drawn.
+    fifth = replace(plain, material=spreads(0.1, name="wood"), intensity=spreads(0.1))
+    found = (replace(plain, **drawn), *[plain] * 3, fifth)
+    draw_thickness(context(tmp_path), planes_of(count=5), found, row if has_row else None, {})
+    (caption,) = captions
+    assert said in caption
 
 
 # --- how planes were looked for ---
