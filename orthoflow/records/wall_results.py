@@ -74,9 +74,17 @@ class WallResult:
     colours: str
 
 
-_UNMEASURED: Final = (
-    "how far drawings made from it are off was not measured; surveyed check points would tell"
-)
+@dataclass(frozen=True, kw_only=True)
+class UncountedPoints:
+    """Check points that a run was given, of which none counts.
+
+    Attributes:
+        cell: address of the inspection that failed over them; empty where none looked for them.
+        sentence: the rest of a sentence on what was not measured, with the reason.
+    """
+
+    cell: str
+    sentence: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +110,33 @@ class RoomResults:
     def openings_of(self, wall: WallResult) -> tuple[Opening, ...]:
         """Openings of one of the walls."""
         return tuple(opening for opening in self.openings if opening.wall == wall.number)
+
+
+def uncounted_points(run: Run) -> UncountedPoints | None:
+    """Say why none of the check points counts that a run was given.
+
+    Returns:
+        None where it was given none, and where an inspection has counted some.
+    """
+    looking = [
+        (cell, given.source)
+        for cell in run.cells.values()
+        for given in cell.inputs.values()
+        if given.type_name == CheckPoints.type_name
+    ]
+    # Those of a simulated room were not given by anyone.
+    read = [name for name, cell in run.cells.items() if cell.method.startswith("read.")]
+    sources = [source.rpartition(".")[0] for _, source in looking]
+    place = _upstream_product(run, tuple(sources or read), CheckPoints.type_name)
+    if place is None or any(cell.status == "ok" for cell, _ in looking):
+        return None
+    n_points = len(CheckPoints.from_payload(run.payload(*place)).names)
+    were = "check point was" if n_points == 1 else "check points were"
+    why = looking[0][0].error_message if looking else "no step has looked for them"
+    return UncountedPoints(
+        cell=looking[0][0].address if looking else "",
+        sentence=f"though {n_points} {were} given: {why}",
+    )
 
 
 def content_digest(run: Run) -> str:
@@ -155,13 +190,15 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
     }
     kept = Planes.from_payload(run.payload(*planes)) if planes else None
     colours = _colours(run, address)
-    oriented = _photo_accuracy(run, upstream)
+    oriented = tuple(_photo_accuracy(run, upstream))
     return RoomResults(
         address=address,
         walls=tuple(
-            replace(result, accuracy=(*result.accuracy, *oriented))
+            replace(result, accuracy=(*(measured or unmeasured), *result.accuracy, *oriented))
             for number in ([wall] if wall in files else sorted(files))
-            for result in [_wall_result(run, number, files[number], kept, inspections, colours)]
+            for measured in [tuple(_accuracy(inspections, number))]
+            for unmeasured in [(_unmeasured(run),) if "ortho" in files[number] else ()]
+            for result in [_wall_result(run, number, files[number], kept, colours)]
         ),
         planes=kept,
         checkpoints=CheckPoints.from_payload(run.payload(*points)) if points else None,
@@ -271,7 +308,6 @@ def _wall_result(
     number: int,
     rasters: dict[str, Path],
     planes: Planes | None,
-    inspections: dict[str, Inspection],
     colours: str,
 ) -> WallResult:
     for path in rasters.values():
@@ -284,7 +320,7 @@ def _wall_result(
     index = about.get("plane_index", number)
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
-    said = list(_accuracy(inspections, number)) or [_UNMEASURED] * ("ortho" in rasters)
+    said = []
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         said.append(
@@ -311,6 +347,12 @@ def _check_kind(kind: str, path: Path) -> None:
             f"{path} must have {wanted[0][0]} bands of {' or '.join(name for _, name in wanted)}, "
             f"got {found[0]} of {found[1]}"
         )
+
+
+def _unmeasured(run: Run) -> str:
+    uncounted = uncounted_points(run)
+    why = f", {uncounted.sentence}" if uncounted else "; surveyed check points would tell"
+    return f"how far drawings made from it are off was not measured{why}"
 
 
 def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:

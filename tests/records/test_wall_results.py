@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import ArgumentError, RecordError
-from orthoflow.products import Finding, Inspection
+from orthoflow.products import CheckPoints, Finding, Inspection
 from orthoflow.records import wall_results as module
 
 
@@ -26,6 +26,8 @@ def cell(address: str = "", **known: Any) -> Any:
         "metrics": (),
         "params": {},
         "method": "mosaic.seams",
+        "status": "ok",
+        "error_message": "",
     }
     return SimpleNamespace(**{**plain, **known})
 
@@ -40,6 +42,9 @@ class ToyRun:
         self.record = SimpleNamespace(
             run_id="r1", published=[SimpleNamespace(path=path) for path in published]
         )
+
+    def payload(self, address: str, port: str) -> Any:
+        return self.cells[address].outputs[port].product.to_payload()
 
     def cell(self, address: str) -> Any:
         if address not in self.cells:
@@ -130,6 +135,44 @@ def test_the_last_orientation_before_the_pictures_tells_its_worst_photo() -> Non
     assert said.startswith("before, worst photo: expected error")
     assert "ties" not in said
     assert list(module._photo_accuracy(run, ("mosaic",))) == []
+
+
+def checkpoints(count: int) -> Any:
+    product = CheckPoints(
+        names=tuple(f"P{k}" for k in range(count)),
+        points_world=np.zeros((count, 3)),
+        classes=("",) * count,
+        wall=np.full(count, -1, dtype=np.int32),
+        pixels_wall=np.full((count, 2), np.nan),
+    )
+    return SimpleNamespace(type_name="checkpoints", embedded=True, product=product)
+
+
+def looking(status: str, message: str = "") -> Any:
+    given = SimpleNamespace(type_name="checkpoints", source="survey.points", digest="c")
+    return cell("check", status=status, error_message=message, inputs={"points": given})
+
+
+@pytest.mark.parametrize(
+    ("count", "check", "said"),
+    [
+        (3, looking("failed", "none was found: P0 (57 m left of wall 0)"),
+         ", though 3 check points were given: none was found: P0 (57 m left of wall 0)"),
+        (1, cell(), ", though 1 check point was given: no step has looked for them"),
+        (3, looking("ok"), "; surveyed check points would tell"),
+    ],
+    ids=["none counted", "not looked for", "counted on another wall"],
+)  # fmt: skip
+def test_given_check_points_are_not_asked_for_again(count: int, check: Any, said: str) -> None:
+    # Those of the simulated room were given by nobody.
+    room = cell(method="simulate.room", outputs={"points": checkpoints(48)})
+    survey = cell(method="read.checkpoints", outputs={"points": checkpoints(count)})
+    run: Any = ToyRun(room=room, survey=survey, check=check)
+    assert module._unmeasured(run) == (
+        f"how far drawings made from it are off was not measured{said}"
+    )
+    alone: Any = ToyRun(room=room)
+    assert module._unmeasured(alone).endswith("measured; surveyed check points would tell")
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, 
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
-from orthoflow_plugins.orient.parameters import OrientOut, OrientParams
-from orthoflow_plugins.orient.reporting import hand_over
+from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientOut, OrientParams
+from orthoflow_plugins.orient.reporting import hand_over, measure_expected
 from orthoflow_plugins.orient.single_photo import Oriented, oriented_by_hand, tied_photo
 
 _SIDE: Final = 15
@@ -34,13 +34,9 @@ class OrientGiven(Method):
     """
 
     id: ClassVar[str] = "orient.given"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_photos",
-        "n_oriented",
-        "n_refused",
-    )
+    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(OrientParams):
@@ -84,6 +80,7 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
     ctx.metric("n_photos", len(cameras), "1")
     ctx.metric("n_oriented", n_oriented, "1")
     ctx.metric("n_refused", len(cameras) - n_oriented, "1")
+    measure_expected(ctx, cameras)
     for camera in cameras:
         if camera.status != "ok":
             ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")

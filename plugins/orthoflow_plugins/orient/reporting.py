@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
+from orthoflow.products import Camera, Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.orient.figures import (
     PhotoResiduals,
@@ -90,17 +90,24 @@ def _measure(ctx: StepContext, found: Sequence[Oriented]) -> None:
     ctx.metric("n_check", sum(item.n_check for item in numbers), "1")
     rejected = sum(int((item.role == TieRole.REJECTED).sum()) for item in found)
     ctx.metric("rejected_share", rejected / max(n_ties, 1), "1")
-    if not numbers:
-        return
-    sigmas = [item.camera.sigma_wall_m for item in found if item.camera.sigma_wall_m is not None]
     columns = {
         "control_rmse_px": ([item.control_rmse_px for item in numbers], "px"),
         "check_rmse_px": ([item.check_rmse_px for item in numbers], "px"),
         "check_rmse_mm": ([item.check_rmse_mm for item in numbers], "mm"),
-        "sigma_wall_mm": ([1000.0 * sigma for sigma in sigmas], "mm"),
     }
     for name, (values, unit) in columns.items():
-        known = [value for value in values if np.isfinite(value)]
-        if known:
-            ctx.metric(f"{name}_median", float(np.median(known)), unit)
-            ctx.metric(f"{name}_worst", max(known), unit)
+        _sum_up(ctx, name, values, unit)
+    measure_expected(ctx, [item.camera for item in found])
+
+
+def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
+    """Report the errors on the wall that orientations carry; nothing where none carries one."""
+    sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
+    _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
+
+
+def _sum_up(ctx: StepContext, name: str, values: Sequence[float], unit: str) -> None:
+    known = [value for value in values if np.isfinite(value)]
+    if known:
+        ctx.metric(f"{name}_median", float(np.median(known)), unit)
+        ctx.metric(f"{name}_worst", max(known), unit)

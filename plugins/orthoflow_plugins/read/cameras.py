@@ -34,12 +34,14 @@ class ReadCameras(Method):
     """
 
     id = "read.cameras"
-    result_version = 2
+    result_version = 3
     determinism = "exact"
     metrics = (
         "n_photos",
         "n_oriented",
         "n_refused",
+        "sigma_wall_mm_median",
+        "sigma_wall_mm_worst",
     )
     citations: ClassVar[tuple[str, ...]] = (
         (
@@ -90,6 +92,10 @@ class ReadCameras(Method):
         ctx.metric("n_photos", len(photos), "1")
         ctx.metric("n_oriented", n_oriented, "1")
         ctx.metric("n_refused", len(photos) - n_oriented, "1")
+        sigmas_mm = [1000.0 * one.sigma_wall_m for one in cameras if one.sigma_wall_m is not None]
+        if sigmas_mm:
+            ctx.metric("sigma_wall_mm_median", float(np.median(sigmas_mm)), "mm")
+            ctx.metric("sigma_wall_mm_worst", max(sigmas_mm), "mm")
         ctx.log(f"{n_oriented} poses are taken as given; nothing here has checked them")
         return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
 

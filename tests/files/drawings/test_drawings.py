@@ -175,6 +175,23 @@ def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> N
     )
 
 
+def test_every_wall_has_the_expected_error_of_the_photos(tmp_path: Path) -> None:
+    folder = write_drawing_run(tmp_path / "run")
+    name, another = f"wall_{WALL}_ortho", f"wall_{WALL + 1}_ortho"
+    run = photographed(open_run(folder))
+    images = [file for file in run.record.published if f"/{name}." in file.path]
+    for file in images:
+        copy = folder / file.path.replace(name, another)
+        copy.write_bytes((folder / file.path).read_bytes())
+    copies = [replace(file, path=file.path.replace(name, another)) for file in images]
+    record = replace(run.record, published=(*run.record.published, *copies))
+    walls = room_results(replace(run, record=record)).walls
+    assert [wall.number for wall in walls] == [WALL, WALL + 1]
+    assert {wall.accuracy[-1].partition(" mm")[0] for wall in walls} == {
+        "orient, worst photo: expected error of its orientation against the scan 4.0"
+    }
+
+
 def photographed(run: Run) -> Run:
     """The same run with an orientation of photos behind its orthoimages."""
     orient = cell(

@@ -177,3 +177,30 @@ def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() ->
 def test_without_walls_ties_are_as_they_are() -> None:
     ties: Any = object()
     assert given_poses._on_walls(ties, None) is ties
+
+
+@pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])
+def test_the_error_that_handed_on_cameras_carry_is_reported(folder: Path, n_by_hand: int) -> None:
+    names_mm = {"a.png": 1.25, "b.png": 3.5, "c.png": None, "d.png": 1.5}
+    handed_on = Cameras(
+        cameras=tuple(
+            replace(
+                ms.oriented(CAMERA, name=name),
+                sigma_wall_m=None if sigma_mm is None else sigma_mm / 1e3,
+            )
+            for name, sigma_mm in names_mm.items()
+        )
+    )
+    publish_cameras(handed_on, folder / "given", "sha256:0")
+    photos = ms.photos(*(replace(PIXEL, name=name) for name in names_mm))
+    files = InputFiles(name="cameras", paths=tuple(sorted((folder / "given").iterdir())))
+    first, second = context(folder), context(folder)
+    cameras = ReadCameras().run(
+        ReadCameras.In(files=files, photos=photos), ReadCameras.Params(), first
+    )
+    ties = first_of(clicked(4), n_by_hand) if n_by_hand else None
+    inputs = OrientGiven.In(cameras=cameras.cameras, photos=photos, walls=WALLS, ties=ties)
+    OrientGiven().run(inputs, OrientGiven.Params(), second)
+    for ctx in (first, second):
+        found = {one.name: one.value for one in ctx.metrics if one.name.startswith("sigma_wall")}
+        assert found == pytest.approx({"sigma_wall_mm_median": 1.5, "sigma_wall_mm_worst": 3.5})
