@@ -198,7 +198,7 @@ def show_unfinished(
         item.cell.address: CellResult(
             status="skipped",
             run_id=outcome.run_id,
-            error_message=NOT_YET,
+            error_message=item.cell.skip_reason or NOT_YET,
             **shared_fields(
                 plan.methods.get(item.cell.method) or MethodIdentity(method=item.cell.method),
                 MethodIdentity,

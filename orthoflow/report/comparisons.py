@@ -100,7 +100,9 @@ class Row:
     @property
     def groups(self) -> tuple[str, ...]:
         """Signs of the environments and data of its numbers, each once."""
-        return tuple(dict.fromkeys(value.group for value in self.judged if value.group))
+        return tuple(
+            dict.fromkeys(value.group for value in self.judged if value.text if value.group)
+        )
 
     @property
     def shortfall(self) -> str:
@@ -390,7 +392,7 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
 
 def _value(measured: Measured | None, one: Combination, origins: Origins, column: Column) -> Value:
     if measured is None:
-        return Value()
+        return _absent(one, origins, column)
     repeated = measured.n_repeats > 1
     text = (
         number_with_spread(measured.value, measured.spread) if repeated else number(measured.value)
@@ -411,6 +413,16 @@ def _value(measured: Measured | None, one: Combination, origins: Origins, column
         note=f"mean and standard deviation of {of_what}" if repeated else "",
         n_photos=one.n_photos(column.step, column.metric),
     )
+
+
+def _absent(one: Combination, origins: Origins, column: Column) -> Value:
+    """What stands where there is no number: nothing was found, or nobody asked."""
+    asked = [cell for cell in one.cells if cell.step == column.step and cell.status != "skipped"]
+    if one.failure is not None:
+        asked.append(one.failure)
+    if not asked:
+        return Value()
+    return Value(group=origins.letters(one, asked[0].environment), found_nothing=True)
 
 
 def _remark(one: Combination) -> str:

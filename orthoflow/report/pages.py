@@ -7,6 +7,7 @@ import hashlib
 import os
 import re
 import secrets
+import shlex
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -30,6 +31,7 @@ from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import figure_files
 from orthoflow.records.runs import FIGURES_FOLDER, Run
+from orthoflow.records.wall_results import UncountedPoints, uncounted_points
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.cursors import cursor_places
@@ -138,6 +140,7 @@ class _Section:
     photos: tuple[str, ...]
     plan: PhotoPlan | None
     diagram: Markup
+    record_file: str
     citations: Mapping[str, tuple[str, ...]]
     viewers: Mapping[str, str]
     files: Mapping[str, Mapping[str, str]]
@@ -145,6 +148,7 @@ class _Section:
     whole: str = ""
     doubt: str = ""
     is_measured: bool = True
+    uncounted: UncountedPoints | None = None
     datasets: DatasetTable | None = None
     over: tuple[MetricOverDatasets, ...] = ()
     leads: str = ""
@@ -308,6 +312,7 @@ def environment() -> jinja2.Environment:
     environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
+    environment.filters["shell"] = shlex.quote
     environment.filters["in_words"] = metric_words
     environment.filters["of_method"] = words_of
     environment.filters["drawing"] = Markup
@@ -406,14 +411,17 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         figures=figure_groups(run, share=share, with_files=place.has_figures),
     )
     main = baseline_addresses(run)
+    on_show = next((picture.name for picture in every.of(main).orthoimages), "")
+    is_measured = says_how_far_off(run)
     shown_ways = ways(run, prefix)
     comparison = comparison_table([run])
     return _Section(
         run=run,
         prefix=prefix,
         answers=tuple(_of_the_wall_shown(answers(run), every.of(main))),
-        is_measured=says_how_far_off(run),
-        limits=limits(run),
+        is_measured=is_measured,
+        uncounted=uncounted_points(run) if on_show and not is_measured else None,
+        limits=limits(run, on_show),
         results=results(run),
         comparison=comparison,
         curves=curves(run) if comparison else (),
@@ -426,6 +434,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         plan=photo_plan(run, walls),
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
+        record_file=(from_page / run.path.name).as_posix(),
         citations=citations(run),
         viewers={
             text: (from_page / page).as_posix()

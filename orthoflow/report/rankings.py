@@ -40,6 +40,8 @@ class Value:
         group: letters of its environment and data, empty when the table has one of each.
         note: more in words, e.g. how many repeats.
         n_photos: photos that it sums up, NaN where it sums up none.
+        found_nothing: there is no number though its step was asked for one, by a failure or because
+            nothing was found.
     """
 
     text: str = ""
@@ -49,6 +51,7 @@ class Value:
     group: str = ""
     note: str = ""
     n_photos: float = math.nan
+    found_nothing: bool = False
 
 
 def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]:
@@ -58,8 +61,10 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     quadrature), or where one of them has no repeats not above a hundredth of the best (repeats or
     not a tenth of a memory, three tenths of a time), is marked as near the best and never as worst;
     the best is then only among the best, too, as are several that are alike. The worst is marked
-    where every other value is as far from it. What sums up fewer photos than another of its group
-    is not ranked: who refuses the difficult ones has smaller errors of the rest.
+    where every other value is as far from it, and where nobody of its group found nothing, which is
+    worse; costs, which a method may just not have, are ranked all the same. What sums up fewer
+    photos than another of its group is not ranked: who refuses the difficult ones has smaller
+    errors of the rest.
 
     Args:
         values: a column.
@@ -95,7 +100,7 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         if len(near) == sum(scores[index] != scores[best] for index in members):
             continue
         worst = max(members, key=scores.__getitem__)
-        is_worst = all(
+        is_worst = not (_has_found_nothing(values, group) and _cost_share(metric) == 0.0) and all(
             scores[index] != scores[worst]
             and abs(values[index].sort - values[worst].sort)
             > _spread(values[worst], values[index], metric)
@@ -116,9 +121,19 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
 
 def _spread(one: Value, other: Value, metric: str) -> float:
     known = [value.spread for value in (one, other) if math.isfinite(value.spread)]
-    costs = [share for end, share in _ALIKE_COST_SHARES.items() if metric.endswith(end)]
-    share = max([*costs, 0.0 if len(known) == 2 else _ALIKE_SHARE])
+    share = max(_cost_share(metric), 0.0 if len(known) == 2 else _ALIKE_SHARE)
     return max(math.hypot(*known), share * abs(other.sort))
+
+
+def _cost_share(metric: str) -> float:
+    """By what share costs scatter; 0 for what is no cost."""
+    return max(
+        (share for end, share in _ALIKE_COST_SHARES.items() if metric.endswith(end)), default=0.0
+    )
+
+
+def _has_found_nothing(values: Sequence[Value], group: str) -> bool:
+    return any(value.found_nothing and value.group == group for value in values)
 
 
 class Sense(Enum):

@@ -16,6 +16,7 @@ from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.ways import improved_on
+from orthoflow.workflow.cells import NOT_ASKED_FOR
 
 # Without photos that show a place, completeness cannot be asked for there.
 _SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
@@ -184,12 +185,17 @@ def _is_of_others(run: Run, address: str) -> bool:
     return any(maker is not None and maker.method.startswith("read.") for maker in makers)
 
 
-def limits(run: Run) -> tuple[Limit, ...]:
+def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, those of one sense together.
 
     Of the warnings that no later step has settled what turns every picture over stands first; then
     those that help, of them those of what was measured on the results, then the frequent ones, then
-    the baseline's; last what speaks only of planes of which no orthoimage was made.
+    the baseline's. Behind them stands what speaks only of other planes than the one on show, last
+    what speaks only of planes of which no orthoimage was made.
+
+    Args:
+        run: the run.
+        on_show: name of the plane whose picture stands beside them; empty where there is none.
     """
     failures = alike(
         (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
@@ -200,6 +206,7 @@ def limits(run: Run) -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
+    shown = set(_PLANE.findall(on_show))
     # What a later orientation leaves open of the photos it says itself.
     oriented = [
         cell.address
@@ -213,6 +220,7 @@ def limits(run: Run) -> tuple[Limit, ...]:
         key=lambda item: (
             not item.is_foremost,
             _is_of_others_than(imaged, item.sentence),
+            _is_of_others_than(shown, item.sentence),
             not item.is_advice,
             measuring.isdisjoint(item.places),
         ),
@@ -223,17 +231,19 @@ def limits(run: Run) -> tuple[Limit, ...]:
     )
 
 
-def _is_of_others_than(imaged: Collection[str], text: str) -> bool:
-    """Whether a sentence names planes, but none of those of which there is an orthoimage."""
+def _is_of_others_than(numbers: Collection[str], text: str) -> bool:
+    """Whether a sentence names planes, but none of these, where there are any."""
     named = _PLANE.findall(text)
-    return bool(imaged and named) and not any(number in imaged for number in named)
+    return bool(numbers and named) and not any(number in numbers for number in named)
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:
-    """Which cells have a result, failed, or were not computed: status -> addresses."""
-    found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": ()}
+    """Which cells have a result, failed, were not reached or not asked for: which -> addresses."""
+    found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": (), "not asked for": ()}
     for cell in run.record.cells:
-        found[cell.status] = (*found[cell.status], cell.address)
+        is_unasked = cell.status == "skipped" and cell.error_message.startswith(NOT_ASKED_FOR)
+        which = "not asked for" if is_unasked else cell.status
+        found[which] = (*found[which], cell.address)
     return found
 
 

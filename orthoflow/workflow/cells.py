@@ -32,6 +32,8 @@ from orthoflow.workflow.wiring import StepGraph, step_graph, topological_steps
 
 # The kind whose methods say how good what others made is.
 _JUDGING: Final = "inspect"
+# How the reason of a cell begins that lacks optional data, unlike one behind a failure.
+NOT_ASKED_FOR: Final = "only "
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
 
@@ -475,7 +477,7 @@ def _all_before(address: str, cells: Mapping[str, Cell]) -> set[str]:
 
 def _reason(*causes: str) -> str:
     """Say why a cell is skipped: any of the causes would do."""
-    return f"only {' or '.join(causes)}"
+    return f"{NOT_ASKED_FOR}{' or '.join(causes)}"
 
 
 def _variant_name(step: WorkflowStep, cell: Cell) -> str:

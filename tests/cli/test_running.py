@@ -240,7 +240,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     }
     page = (tmp_path / "r" / "report.html").read_text()
     assert "<li>There: survey</li>" in page
-    assert "<li>Not computed: paint</li>" in page
+    assert "<li>Not reached: paint</li>" in page
     assert "<pre>orthoflow run studio.yaml --set survey.offset_m=2 -o r</pre>" in page
     assert "not finished" in page
     write_studio(tmp_path, "paint.plain")

@@ -267,10 +267,11 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert (fine.failure, coarse.failure) == ("", "")
     assert [value.text for value in fine.values[:4]] == ["1.10 ± 0.10", "10", "0.4", "0.9931"]
     assert [value.text for value in coarse.values[:4]] == ["4", "11", "60.4", "0.9931"]
+    # Nothing is worst beside one that found nothing.
     marks = [[value.mark for value in row.values[:4]] for row in (fine, coarse)]
     assert marks == [
         [Mark.BEST, Mark.NONE, Mark.BEST, Mark.NONE],
-        [Mark.WORST, Mark.NONE, Mark.WORST, Mark.NONE],
+        [Mark.NONE, Mark.NONE, Mark.NONE, Mark.NONE],
     ]
     assert fine.values[0].note == "mean and standard deviation of 3 repeats"
     assert coarse.values[0].note == ""

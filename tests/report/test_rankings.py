@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -111,6 +112,20 @@ def test_groups_are_ranked_apart_and_what_is_absent_is_not_ranked() -> None:
     values = [of(1.0, group="a"), of(9.0, group="b"), of(2.0, group="a"), of(8.0, group="b")]
     assert marks(*values) == ["BEST", "WORST", "WORST", "BEST"]
     assert marks(of(1.0), Value(), of(math.inf), of(2.0)) == ["BEST", "NONE", "NONE", "WORST"]
+
+
+def test_who_found_something_is_not_worst_where_another_found_nothing() -> None:
+    nothing = Value(found_nothing=True)
+    assert marks(of(1.0), nothing, of(2.0), of(5.0)) == ["BEST", "NONE", "NONE", "NONE"]
+    # Of other data, that says nothing of these; nor does what a method has no need of.
+    assert marks(of(1.0, group="a"), of(2.0, group="a"), replace(nothing, group="b")) == [
+        "BEST",
+        "WORST",
+        "NONE",
+    ]
+    for cost in ("first_plane_s", "peak_rss_mib"):
+        found = rank([of(1.0), nothing, of(2.0)], Sense.LESS, cost)
+        assert [value.mark.name for value in found] == ["BEST", "NONE", "WORST"]
 
 
 def test_a_mark_leaves_the_rest_of_a_value_as_it_was() -> None:

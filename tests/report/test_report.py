@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from markupsafe import Markup
-from orthoflow_provenance.model import Metric, PublishedFile
+from orthoflow_provenance.model import Metric, PublishedFile, RecordedCell
 
 from orthoflow.errors import StoreError
+from orthoflow.products import CheckPoints
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
@@ -26,7 +27,7 @@ from orthoflow.report.pages import _Ground, _of_the_wall_shown, _Part, cited
 from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
 from orthoflow.report.plane_tables import PlaneRow, PlaneTable
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
-from orthoflow.report.summaries import answers, citations, limits
+from orthoflow.report.summaries import answers, citations, limits, results
 from tests.report_runs import (
     FOCAL_PX,
     FRAME,
@@ -38,6 +39,7 @@ from tests.report_runs import (
     environment,
     given,
     metrics,
+    orthoimages_product,
     record,
 )
 
@@ -337,6 +339,98 @@ def test_what_is_said_of_planes_without_an_orthoimage_stands_last() -> None:
     assert [limit.cells for limit in limits(run(*told))] == [("a",), ("b",)]
 
 
+def test_what_is_said_of_other_planes_than_the_one_on_show_stands_behind() -> None:
+    told = run(
+        cell("a", warnings=("wall 3: cells are empty (raise gsd_m)",)),
+        cell("b", warnings=("the photos are few",)),
+        cell("c", warnings=("wall 0: cells are empty",)),
+        cell("d", warnings=("wall 3 and wall 0 are cut",)),
+    )
+    first = [limit.cells for limit in limits(told)]
+    assert first[0] == ("a",)
+    found = limits(told, "wall 0")
+    assert [limit.cells for limit in found] == [("b",), ("c",), ("d",), ("a",)]
+    assert limits(told, "wall 3")[0].cells == ("a",)
+    # A picture without a number, as one of another program, says nothing of planes.
+    assert [limit.cells for limit in limits(told, "facade")] == first
+
+
+def test_given_check_points_of_which_none_counts_are_not_asked_for_again(tmp_path: Path) -> None:
+    survey = CheckPoints(
+        names=("P<1>", "P2"),
+        points_world=np.zeros((2, 3)),
+        classes=("", ""),
+        wall=np.full(2, -1, dtype=np.int32),
+        pixels_wall=np.full((2, 2), np.nan),
+    )
+    images = orthoimages_product(0)
+    cells = (
+        cell("mosaic", outputs={"orthoimages": given("", "1", "orthoimages")}),
+        cell(
+            "survey", method="read.checkpoints", outputs={"points": given("", "2", "checkpoints")}
+        ),
+        cell(
+            "points",
+            method="inspect.checkpoints",
+            status="failed",
+            error_message="none of the 2 was found: P<1> (9 m left of wall 0)",
+            inputs={"checkpoints": given("survey.points", "2", "checkpoints")},
+        ),
+    )
+    products = {("mosaic", "orthoimages"): images, ("survey", "points"): survey}
+    asked = HeldRun(path=tmp_path / "run.h5", record=record(cells), products=products)
+    write_report([asked], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert (
+        "was not measured, though 2 check points were given: none of the 2 was found: "
+        "P&lt;1&gt; (9 m left of wall 0).</p>"
+    ) in page
+    assert "surveyed check points would tell" not in page
+    # Told once.
+    assert "<li>Failed: none of the check points counts, as said above" in page
+    without = replace(asked, record=record(cells[:1]))
+    write_report([without], tmp_path / "report.html")
+    assert "surveyed check points would tell" in (tmp_path / "report.html").read_text()
+
+
+def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
+    told = run(
+        cell("wall"),
+        cell("paint", status="failed", error_message="no disk"),
+        cell("check", status="skipped", error_message="needs paint, which failed"),
+        cell("theirs", status="skipped", error_message="only with the input other"),
+        cell("match", status="skipped", error_message="only without the input cameras"),
+    )
+    assert results(told) == {
+        "ok": ("wall",),
+        "failed": ("paint",),
+        "skipped": ("check",),
+        "not asked for": ("theirs", "match"),
+    }
+    write_report([told], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "<li>Not reached: check</li>" in page
+    assert "<li>Not asked for: theirs, match</li>" in page
+
+
+def test_a_page_names_the_records_of_its_runs_as_they_lie_from_it(
+    compared: HeldRun, tmp_path: Path
+) -> None:
+    first = replace(compared, path=tmp_path / "one" / "run.h5")
+    second = replace(compared, path=tmp_path / "two" / "my run.h5")
+    for folder in (first.folder, second.folder):
+        folder.mkdir()
+    write_report([first, second], tmp_path / "both.html")
+    page = (tmp_path / "both.html").read_text()
+    assert "beside this page" not in page
+    assert "<code>one/run.h5</code> seen from this page" in page
+    assert "<code>two/my run.h5</code> seen from this page" in page
+    assert "orthoflow verify &#39;my run.h5&#39; " in page
+    write_report([second], second.folder / "report.html")
+    page = (second.folder / "report.html").read_text()
+    assert "The record <code>my run.h5</code> beside this page holds" in page
+
+
 def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
     plane = cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6))
     for value, first in ((0.0, ("main wall of the scene", "not found")), (1.0, None)):
@@ -463,12 +557,33 @@ def test_a_value_says_what_it_is_the_mean_of(
     column = Column(step="plane", metric="plane_offset_mm", label="", sense=Sense.LESS)
     value = comparisons._value(measured, one, comparisons.Origins.of([told]), column)
     assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
-    assert comparisons._value(None, one, comparisons.Origins.of([told]), column) == Value()
+    nothing = comparisons._value(None, one, comparisons.Origins.of([told]), column)
+    assert nothing == Value(found_nothing=True)
     sizes = comparisons._value(
         replace(measured, is_of_sizes=True), one, comparisons.Origins.of([told]), column
     )
     signed = f" the sizes of errors of both signs in {n_repeats} repeats"
     assert sizes.note == (f"mean and standard deviation of{signed}" if n_repeats > 1 else "")
+
+
+@pytest.mark.parametrize(
+    ("cells", "found_nothing"),
+    [
+        ((cell("plane"), cell("check")), True),
+        ((cell("plane", status="failed"), cell("check", status="skipped")), True),
+        ((cell("plane"), cell("check", status="skipped", error_message="not given")), False),
+        ((cell("plane"),), False),
+    ],
+    ids=["nothing found", "failed before", "not asked for", "no such step"],
+)
+def test_who_was_asked_for_a_number_and_has_none_found_nothing(
+    cells: tuple[RecordedCell, ...], found_nothing: bool
+) -> None:
+    told = run(*cells)
+    (one,) = combinations_of(told)
+    column = Column(step="check", metric="plane_offset_mm", label="", sense=Sense.LESS)
+    value = comparisons._value(None, one, comparisons.Origins.of([told]), column)
+    assert value.found_nothing == found_nothing
 
 
 def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
@@ -490,7 +605,8 @@ def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
     assert fine.is_baseline
     assert fine.values[0].text == "1.10 ± 0.10"
     assert fine.values[0].mark is Mark.BEST
-    assert coarse.values[0].mark is Mark.WORST
+    # The broken one found nothing, which is worse.
+    assert coarse.values[0].mark is Mark.NONE
     assert fine.values[1].mark is Mark.NONE  # an angle has no good side
     assert broken.failure == "plane@plane=broken: no plane & no <wall>"
     assert broken.values[0].text == ""
@@ -736,8 +852,14 @@ def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:
         "plane: points to the first plane, RMS / mm",
         "check: error along u (right), RMS / mm",
     )
-    assert second.n_worst >= 2
+    assert second.n_worst == 0
     assert (last.name, last.shortfall, last.n_best) == ("plane=broken", "failed", 0)
+    whole = [one for one in compared.record.cells if one.assignment.get("plane") != "broken"]
+    without = comparison_table(
+        [replace(compared, record=replace(compared.record, cells=tuple(whole)))]
+    )
+    assert without is not None
+    assert without.glance[1].n_worst >= 2
     row = table.rows[0]
     # At most three are named.
     for n_best, named in ((3, 3), (4, 4)):
