@@ -22,7 +22,7 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of, wanted_metrics
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
-from orthoflow.report.rankings import Sense
+from orthoflow.report.rankings import Sense, cost_share
 from orthoflow.workflow.format import DATA
 
 _MOST_CURVES: Final = 12
@@ -179,8 +179,10 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
     for column in sorted(chosen, key=lambda one: not one.is_key):
-        for (step, _), alike in swept.items():
-            if column.step not in behind[step]:
+        for (step, parameter), alike in swept.items():
+            # A parameter over itself says nothing.
+            is_itself = (column.step, column.metric) == (step, parameter)
+            if is_itself or column.step not in behind[step]:
                 continue
             lines: dict[str, list[_Point]] = {}
             for sweep in alike:
@@ -287,8 +289,9 @@ def _curve(
     else:
         said = "one value each: without repeats nobody knows how far they scatter"
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
-    good += ", of signed errors their sizes" if column.sense is Sense.LESS else ""
-    if any(point.is_baseline for points in lines.values() for point in points):
+    if column.sense is Sense.LESS and not cost_share(column.metric):
+        good += ", of signed errors their sizes"
+    if any(map(_has_baseline, lines.values())):
         good += "; the filled point is the baseline"
     shape = (
         "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
@@ -393,7 +396,9 @@ class _Axes:
                 taken = x + 0.5 * _LETTER * len(text) + 6.0
         # Bars at one place would hide each other.
         apart = _APART if sum(_has_bars(points) for points in lines.values()) > 1 else 0.0
-        for index, points in enumerate(lines.values()):
+        # The baseline's last: its filled point is looked for.
+        drawn = sorted(enumerate(lines.values()), key=lambda one: _has_baseline(one[1]))
+        for index, points in drawn:
             aside = apart * (index - 0.5 * (len(lines) - 1))
             line = self._line(index, points)
             parts.append(f'<g transform="translate({aside:g} 0)">{line}</g>' if aside else line)
@@ -432,6 +437,10 @@ class _Axes:
         )
         bar = f'<path class="bar line-{index}" d="{bars}"/>' if bars else ""
         return f'<path class="line line-{index}" d="M{way}"/>{bar}{dots}'
+
+
+def _has_baseline(points: Sequence[_Point]) -> bool:
+    return any(point.is_baseline for point in points)
 
 
 def _has_bars(points: Sequence[_Point]) -> bool:

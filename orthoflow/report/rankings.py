@@ -100,7 +100,7 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         if len(near) == sum(scores[index] != scores[best] for index in members):
             continue
         worst = max(members, key=scores.__getitem__)
-        is_worst = not (_has_found_nothing(values, group) and _cost_share(metric) == 0.0) and all(
+        is_worst = not (_has_found_nothing(values, group) and cost_share(metric) == 0.0) and all(
             scores[index] != scores[worst]
             and abs(values[index].sort - values[worst].sort)
             > _spread(values[worst], values[index], metric)
@@ -121,11 +121,11 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
 
 def _spread(one: Value, other: Value, metric: str) -> float:
     known = [value.spread for value in (one, other) if math.isfinite(value.spread)]
-    share = max(_cost_share(metric), 0.0 if len(known) == 2 else _ALIKE_SHARE)
+    share = max(cost_share(metric), 0.0 if len(known) == 2 else _ALIKE_SHARE)
     return max(math.hypot(*known), share * abs(other.sort))
 
 
-def _cost_share(metric: str) -> float:
+def cost_share(metric: str) -> float:
     """By what share costs scatter; 0 for what is no cost."""
     return max(
         (share for end, share in _ALIKE_COST_SHARES.items() if metric.endswith(end)), default=0.0

@@ -131,6 +131,37 @@ def test_repeats_have_bars_and_what_failed_has_no_point(tmp_path: Path) -> None:
     assert "means of the repeats" in curve.caption
 
 
+def test_nothing_lies_over_the_point_of_the_baseline(tmp_path: Path) -> None:
+    cells = [
+        cell(f"plane@plane={name}", params={"tolerance_m": value, "mode": mode},
+             metrics=metrics(angle_s=1.0))
+        for name, value, mode in (("a", 1, "x"), ("b", 2, "x"), ("c", 1, "y"), ("d", 2, "y"))
+    ]  # fmt: skip
+    told = record(
+        cells,
+        workflow_resolved=json.dumps(
+            {"compare": {"baseline": {"plane": "a"}, "metrics": ["plane.angle_s"]}}
+        ),
+    )
+    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    dots = re.findall(r'class="dot (line-\d)( base)?"', curve.svg)
+    assert dots == [("line-1", ""), ("line-1", ""), ("line-0", " base"), ("line-0", "")]
+    # Times have no sign.
+    assert "of signed errors their sizes" not in curve.caption
+
+
+def test_no_parameter_is_drawn_over_itself(tmp_path: Path) -> None:
+    cells = [
+        cell(f"plane@plane=v{value}", params={"thinning": value},
+             metrics=metrics(thinning=float(value), n_planes=1.0 / value))
+        for value in (1, 4, 20)
+    ]  # fmt: skip
+    told = record(cells, workflow_resolved=compared_resolved("plane.*"))
+    names = [one.name for one in curves(HeldRun(path=tmp_path / "run.h5", record=told))]
+    assert names[0] == "plane.n_planes_over_plane.thinning"
+    assert "plane.thinning_over_plane.thinning" not in names
+
+
 def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
     told = record(
         swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.report import write_report
 from tests.browser import PROGRAM, BrowserError, Page, browser
-from tests.report_runs import HeldRun, compared_run
+from tests.report_runs import HeldRun, cell, compared_run, metrics, record
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
 ROWS = "[...document.querySelectorAll('[data-chooser] tbody tr')]"
@@ -70,6 +70,35 @@ def test_headings_sort_the_table_by_mouse_and_keyboard(page: Page) -> None:
 def test_a_failed_combination_stands_in_its_row_with_the_reason(page: Page) -> None:
     text = page.evaluate(f"{ROWS}.find(row => row.matches('.failed-row')).innerText")
     assert "no plane & no <wall>" in text
+
+
+def test_no_word_of_a_curve_lies_under_the_button_that_enlarges_it(
+    page: Page, tmp_path: Path
+) -> None:
+    name = "a name that reaches as far as the drawing does, and says more than there is room for"
+    cells = [
+        cell(f"plane@plane=v{k}", params={"tolerance_m": k, name: 1}, metrics=metrics(rms_mm=k))
+        for k in (1.0, 2.0, 3.0)
+    ] + [
+        cell(f"plane@plane=w{k}", params={"tolerance_m": k, name: 2}, metrics=metrics(rms_mm=k))
+        for k in (1.0, 2.0, 3.0)
+    ]
+    swept = HeldRun(path=tmp_path / "run.h5", record=record(cells))
+    write_report([swept], tmp_path / "report.html")
+    before = page.evaluate("decodeURI(location.pathname)")
+    page.open(tmp_path / "report.html")
+    try:
+        for width in (1440, 390):
+            page.show_as(width)
+            bottom, top = page.evaluate(
+                "(figure => [figure.querySelector('.enlarge').getBoundingClientRect().bottom, "
+                "Math.min(...[...figure.querySelectorAll('text')].map(one => "
+                "one.getBoundingClientRect().top))])(document.querySelector('.curve')"
+                ".closest('figure'))"
+            )
+            assert bottom <= top
+    finally:
+        page.open(Path(before))
 
 
 def test_pictures_of_few_cells_are_shown_large_and_in_their_form(page: Page) -> None:
