@@ -54,8 +54,9 @@ def run(
 ) -> OpenedRun:
     """Run a workflow, as `orthoflow run` does, and open what came out.
 
-    Progress goes to standard error as the command's does. A step that fails leaves a run whose
-    `record.status` is `failed`; results that are stored are not computed again.
+    Progress goes to standard error as the command's does; in a notebook it is one output.
+    A step that fails leaves a run whose `record.status` is `failed`; results that are stored are
+    not computed again.
 
     Args:
         workflow: a file, or the name of a shipped one.

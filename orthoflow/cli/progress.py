@@ -1,4 +1,7 @@
-"""How a running workflow shows itself: a live table on a terminal, plain lines elsewhere."""
+"""How a running workflow shows itself: a live table on a terminal, plain lines elsewhere.
+
+In a notebook, which keeps what it shows, one output is written anew.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from orthoflow.alike import sense
 from orthoflow.cli.failures import say_error
@@ -34,6 +38,9 @@ if TYPE_CHECKING:
 _REFRESH_PER_S: Final = 4
 # A log file gets a line at least so often.
 _EVERY_S: Final = 10.0
+_NOTEBOOK_EVERY_S: Final = 1.0
+# Of more lines a notebook shows the last.
+_NOTEBOOK_LINES: Final = 40
 # Before a step has said for long what it compiles, nobody misses that time.
 _TOLD_COMPILE_S: Final = 2.0
 _STARTING: Final = "starting"
@@ -103,6 +110,21 @@ class RunState:
         with self._lock:
             return dict(self._cells)
 
+    def running_lines(self) -> list[str]:
+        """Say of each cell that runs how far it is."""
+        now_s = time.monotonic()
+        lines = []
+        for address, cell in self.cells().items():
+            if cell.state == "running":
+                parts = [
+                    f"{100 * cell.done(now_s):.0f} %",
+                    cell.text,
+                    f"{duration(now_s - cell.started)} so far",
+                    left_of_cell(cell, now_s),
+                ]
+                lines.append(f"{address}: {', '.join(part for part in parts if part)}")
+        return lines
+
     def left(self) -> str:
         """Say how long the run still takes; empty when nobody knows."""
         return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
@@ -155,16 +177,78 @@ class PlainProgress:
         say_error(line)
 
     def _remind(self) -> None:
-        now_s = time.monotonic()
-        for address, cell in self._state.cells().items():
-            if cell.state == "running":
-                parts = [
-                    f"{100 * cell.done(now_s):.0f} %",
-                    cell.text,
-                    f"{duration(now_s - cell.started)} so far",
-                    left_of_cell(cell, now_s),
-                ]
-                say_error(f"{address}: {', '.join(part for part in parts if part)}")
+        for line in self._state.running_lines():
+            say_error(line)
+
+
+class NotebookProgress:
+    """A line per ended step and per sense of warnings, below them what runs: one output.
+
+    It is written anew every second, so that a notebook keeps its last state only.
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[PlannedCell],
+        *,
+        jobs: int = 1,
+        every_s: float = _NOTEBOOK_EVERY_S,
+    ) -> None:
+        self._state = RunState(cells, jobs)
+        self._lines: list[str] = []
+        self._place = _NotebookPlace()
+        self._clock = _Clock(self._draw, every_s)
+
+    def __enter__(self) -> Self:
+        self._clock.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._clock.stop()
+        self._draw()
+
+    def tell(self, event: RunEvent) -> None:
+        """Take an event; the clock shows it."""
+        self._state.take(event)
+        match event:
+            case RunStarted():
+                self._lines.append(start_text(event))
+            case CellWarned() if self._state.is_new(event):
+                self._lines.append(self._state.told(event))
+            case CellFinished():
+                self._lines.append(end_text(event))
+            case _:
+                return
+
+    def _draw(self) -> None:
+        lines, running = list(self._lines), self._state.running_lines()
+        if (n_more := len(lines) - _NOTEBOOK_LINES) > 0:
+            lines = [lines[0], f"... {counted(n_more, 'line')} more", *lines[n_more + 1 :]]
+        left = self._state.left() if running else ""
+        self._place.show("\n".join([*lines, *running, *([left] if left else [])]))
+
+
+class _NotebookPlace:
+    """One output of a notebook's cell."""
+
+    def __init__(self) -> None:
+        # Any: IPython need not be there, and its types are none.
+        self._handle: Any = None
+
+    def show(self, text: str) -> None:
+        """Put a text into the place of the one before."""
+        said = {"text/plain": shown(text, keep="\n")}
+        if self._handle is None:
+            display = import_module("IPython.display").display
+            self._handle = display(said, raw=True, display_id=True)
+        else:
+            self._handle.update(said, raw=True)
+
+
+def in_notebook() -> bool:
+    """Whether a notebook's kernel shows what this process says; a terminal's IPython is none."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")
 
 
 def start_text(event: RunStarted) -> str:
@@ -275,6 +359,8 @@ def visible_cells(cells: Mapping[str, CellState], height: int) -> dict[str, Cell
 
 def make_progress(cells: Sequence[PlannedCell], *, jobs: int = 1) -> Progress:
     """Give the live table when standard error is a terminal, plain lines otherwise."""
+    if in_notebook():
+        return NotebookProgress(cells, jobs=jobs)
     if sys.stderr.isatty():
         return LiveProgress(cells, jobs=jobs)
     return PlainProgress(cells, jobs=jobs)
@@ -301,7 +387,8 @@ def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
         ):
             yield
         return
-    clock = _Clock(lambda: say_error(line()), every_s)
+    place = _NotebookPlace() if in_notebook() else None
+    clock = _Clock(lambda: place.show(line()) if place else say_error(line()), every_s)
     clock.start()
     try:
         yield

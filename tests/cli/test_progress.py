@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
+import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -13,7 +15,9 @@ from rich.console import Console
 from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.progress import (
     LiveProgress,
+    NotebookProgress,
     PlainProgress,
+    _Clock,
     make_progress,
     visible_cells,
     working_on,
@@ -182,6 +186,77 @@ def test_a_step_that_says_nothing_still_moves_in_plain_lines(
         assert re.fullmatch(
             r"plane: 25 %, compiling peel, 0\.\d\d s so far, about 1 min 00 s left", line
         )
+
+
+@pytest.fixture
+def places(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """A notebook: of each output all that stood in it, the last of it what is kept."""
+    found: list[list[str]] = []
+
+    def display(data: dict[str, str], **_: object) -> SimpleNamespace:
+        found.append([data["text/plain"]])
+        return SimpleNamespace(update=lambda data, **_: found[-1].append(data["text/plain"]))
+
+    shell = SimpleNamespace(kernel=object())
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+    return found
+
+
+def test_a_notebook_keeps_one_output_with_a_line_per_step(
+    places: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Plain lines came every ten seconds, and a notebook kept all of them.
+    progress = make_progress(planned("cloud", "plane", took_s=60.0))
+    assert type(progress) is NotebookProgress
+    progress._clock = _Clock(progress._draw, 0.05)
+    with progress:
+        for event in EVENTS[:4]:
+            progress.tell(event)
+        time.sleep(0.3)
+        for event in EVENTS[4:]:
+            progress.tell(event)
+    (written,) = places
+    assert any("\nplane: 50 %, peeling, 0." in text for text in written[:-1])
+    assert written[-1].splitlines() == [
+        "run r1: 5 steps",
+        "cloud: cached",
+        "plane: warning: the side is a [guess]",
+        "plane: warning: wall 2: no point lies within its buffer",
+        "plane: failed in 1 min 15 s: no plane",
+        "wall: skipped: needs plane, which failed",
+        "other: ok in 1.2 s",
+        "last: ok in 1.2 s, besides 45.0 s of loading and compiling",
+    ]
+    assert capsys.readouterr().err == ""
+
+
+def test_of_many_steps_a_notebook_keeps_the_last_lines(places: list[list[str]]) -> None:
+    with NotebookProgress(()) as progress:
+        progress.tell(EVENTS[0])
+        for index in range(1000):
+            progress.tell(CellFinished(address=f"c{index}", result=OK, cached=True))
+    head, more, *last = places[0][-1].splitlines()
+    assert (head, more) == ("run r1: 5 steps", "... 961 lines more")
+    assert last == [f"c{index}: cached" for index in range(961, 1000)]
+
+
+def test_a_terminal_s_ipython_is_no_notebook(
+    places: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=SimpleNamespace))
+    assert type(make_progress(())) is not NotebookProgress
+    assert places == []
+
+
+def test_what_a_notebook_waits_for_is_one_line_too(places: list[list[str]]) -> None:
+    with working_on("writing the record", every_s=0.1):
+        time.sleep(0.35)
+    with working_on("reading", every_s=5.0):
+        pass
+    (written,) = places
+    assert len(written) >= 2
+    assert all(text.startswith("writing the record, 0.") for text in written)
 
 
 def test_what_no_cell_does_is_said_while_it_takes_long(capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,6 +36,13 @@ def test_the_notebook_runs_and_shows_what_it_promises(
         notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     )
     client.execute()
+    # Progress is one output, with a line per step that has ended.
+    first = next(cell for cell in notebook.cells if "orthoflow.run(" in cell.source)
+    progress, *others = [one for one in first.outputs if one.output_type != "execute_result"]
+    head, *lines = progress["data"]["text/plain"].splitlines()
+    assert head.startswith("run ")
+    assert all(": started" not in line and " so far" not in line for line in lines)
+    assert others == []
     shown = [
         output.data
         for cell in notebook.cells
