@@ -462,8 +462,10 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     example.
 
     What stops every run is told once, and other rules are skipped. Ends with 1 when a rule
-    is broken, with 4 when the method cannot be loaded.
+    is broken, with 4 when the method cannot be loaded. What still stands as `plugins new` wrote it
+    is named, and breaks no rule.
     """
+    from orthoflow.scaffold import unwritten
     from orthoflow.testing import conformance_cases
 
     results: list[dict[str, str]] = []
@@ -481,14 +483,17 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
             if not as_json:
                 echo(f"{state:{8 if quick else 7}} {name}: {said or rule}")
     counts = Counter(result["state"] for result in results)
+    left = unwritten(method_id, discover_catalog())
     if as_json:
-        echo_json({"method": method_id, "checks": results})
+        echo_json({"method": method_id, "checks": results, "unwritten": list(left)})
     else:
         summed = [f"{method_id} keeps {counted(counts['kept'], 'rule')}"]
         summed += [f"breaks {counts['broken']}"] if counts["broken"] else []
         summed += [f"{counts['skipped']} skipped"] if counts["skipped"] else []
         summed += [f"{counts['left out']} left out (--quick)"] if counts["left out"] else []
         echo("", ", ".join(summed))
+        if left:
+            echo(f"warning: as `plugins new` wrote it, write your own: {', '.join(left)}")
     return EXIT_CELL_FAILED if counts["broken"] else EXIT_GOOD
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import keyword
 import re
 from collections.abc import Iterator
@@ -24,6 +25,11 @@ from orthoflow.version import __version__
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 # What a written module may import by name.
 _IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
+# What stands where the author shall write; `unwritten` finds it again.
+_UNWRITTEN: Final = {
+    "summary": "one line for `orthoflow plugins list`",
+    "description": "Say here what the method does, for `orthoflow plugins show`.",
+}
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 
@@ -108,6 +114,28 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
     return tuple(written)
 
 
+def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
+    """Say what the plugin of a method still shows in the words that `write_project` put there.
+
+    Raises:
+        PluginError: the method cannot be loaded.
+    """
+    entry = catalog.method(method_id)
+    announced = {
+        f"method {method_id}": entry,
+        **{f"kind {name}": kind for name, kind in catalog.kinds.items()},
+        **{f"product {name}": product for name, product in catalog.products.items()},
+    }
+    summaries = tuple(
+        f"the summary of {name}"
+        for name, one in announced.items()
+        if one.distribution == entry.distribution and one.spec.summary == _UNWRITTEN["summary"]
+    )
+    method = entry.load()
+    is_described = inspect.getdoc(method) != _UNWRITTEN["description"]
+    return summaries if is_described else (*summaries, f"the docstring of {method.__name__}")
+
+
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
     if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
         raise ArgumentError(
@@ -179,6 +207,7 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         "ports": ports,
         "version": __version__,
         "has_comparison": bool(comparison),
+        "unwritten": _UNWRITTEN,
     }
     sources = {
         "pyproject.toml": "pyproject.toml.jinja",

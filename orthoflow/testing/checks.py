@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
@@ -22,7 +23,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.store import digest_of, publish_into
 from orthoflow.errors import CancelledStepError, OrthoflowError, ProductError
-from orthoflow.products import Cameras, PointCloud, Product
+from orthoflow.products import Cameras, Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room, few_points
@@ -123,6 +124,23 @@ def outputs_are_valid(subject: Subject) -> None:
             subject.method.may_report(metric.name),
             f"metric {metric.name} is none of those that the method declares (`metrics`)",
         )
+
+
+def no_covariance_is_zero(subject: Subject) -> None:
+    """No plane and no pose is said to be known without error, by a covariance of zeros."""
+    for product in subject.witness.first.run.outputs.values():
+        stated: list[tuple[str, NDArray[np.float64] | None]] = []
+        if isinstance(product, Planes):
+            stated += zip(product.names, product.covariance, strict=True)
+        if isinstance(product, Cameras):
+            stated += [(camera.photo, camera.covariance) for camera in product.cameras]
+        for name, covariance in stated:
+            require(
+                covariance is None or bool(np.any(covariance)),
+                f"the covariance of {name} is zero, which says that it is known without error: put "
+                "in what your fit states; `orthoflow plugins new` writes that of least squares for "
+                "a plane, and of a camera it may be left out",
+            )
 
 
 def publishers_write_into_their_folder(subject: Subject) -> None:
@@ -350,6 +368,10 @@ def _makes_its_own(method: type[Method]) -> bool:
     return any(port.type_name not in _OURS for port in port_specs(method.Out).values())
 
 
+def _states_errors(method: type[Method]) -> bool:
+    return finds_planes(method) or orients_photos(method)
+
+
 def _takes_a_cloud(method: type[Method]) -> bool:
     return any(True for _ in _cloud_ports(method))
 
@@ -374,6 +396,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(parameters_are_documented, _always),
     _check(parameters_round_trip, _always),
     _check(outputs_are_valid, _always),
+    _check(no_covariance_is_zero, _states_errors),
     _check(publishers_write_into_their_folder, _makes_its_own),
     _check(inputs_stay_untouched, _always),
     _check(global_state_stays_untouched, _always),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-from orthoflow import testing
+from orthoflow import scaffold, testing
 from orthoflow.cli import plugins as module
 from orthoflow.cli.program import program
 
@@ -20,6 +21,7 @@ def case(name: str, problem: str = "", *, is_quick: bool = True) -> Any:
     return SimpleNamespace(check=check, problem=lambda: problem)
 
 
+LEFT: list[str] = []
 CASES = [
     case("fine"),
     case("stopped", "the method raised"),
@@ -33,6 +35,7 @@ CASES = [
 def checked(monkeypatch: pytest.MonkeyPatch, cases: list[Any], *options: str) -> Result:
     monkeypatch.setattr(testing, "conformance_cases", lambda _id, **_known: cases)
     monkeypatch.setattr(module, "_sharing_kernels", lambda _id: nullcontext())
+    monkeypatch.setattr(scaffold, "unwritten", lambda *_: LEFT)
     return CliRunner().invoke(program, ["plugins", "check", "plane.toy", *options])
 
 
@@ -61,6 +64,19 @@ def test_a_quick_check_leaves_out_what_is_slow(monkeypatch: pytest.MonkeyPatch) 
         "",
         "plane.toy keeps 1 rule, 2 left out (--quick)",
     ]
+
+
+def test_words_of_the_scaffold_are_named_and_break_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = ["the summary of kind mark", "the docstring of A"]
+    monkeypatch.setattr(sys.modules[__name__], "LEFT", left)
+    done = checked(monkeypatch, CASES[:1])
+    assert done.exit_code == 0
+    assert done.output.splitlines()[-2:] == [
+        "plane.toy keeps 1 rule",
+        f"warning: as `plugins new` wrote it, write your own: {', '.join(left)}",
+    ]
+    told = json.loads(checked(monkeypatch, CASES[:1], "--json").output)
+    assert told["unwritten"] == left
 
 
 def test_json_has_the_state_and_problem_of_each(monkeypatch: pytest.MonkeyPatch) -> None:

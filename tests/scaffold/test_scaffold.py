@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.errors import ArgumentError
-from orthoflow.scaffold import Project, write_project
+from orthoflow.scaffold import Project, unwritten, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
 from orthoflow.workflow.cells import expand_cells
@@ -81,6 +81,33 @@ def test_a_new_plugin_passes_the_suite_as_it_is(
     problems = [case.problem() for case in conformance_cases(project.method_id, golden=golden)]
     assert [problem for problem in problems if problem] == []
     assert project.method_id in golden.read_text()
+
+
+def test_what_the_author_has_not_written_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for project in (
+        Project(name="left-kind", kind="left", product="lefts", takes=("cloud",)),
+        Project(name="left-finder", kind="plane"),
+    ):
+        write_project(project, tmp_path, discover_catalog())
+        install(tmp_path / project.name, monkeypatch)
+    assert unwritten("left.left-kind", discover_catalog()) == (
+        "the summary of method left.left-kind",
+        "the summary of kind left",
+        "the summary of product lefts",
+        "the docstring of LeftKind",
+    )
+    assert unwritten("plane.left-finder", discover_catalog()) == (
+        "the summary of method plane.left-finder",
+        "the docstring of LeftFinder",
+    )
+    hooks = tmp_path / "left-finder" / "left_finder" / "hooks.py"
+    text = hooks.read_text(encoding="utf-8")
+    hooks.write_text(text.replace("one line for `orthoflow plugins list`", "walls by chance"))
+    monkeypatch.delitem(sys.modules, "left_finder.hooks")
+    assert unwritten("plane.left-finder", discover_catalog()) == ("the docstring of LeftFinder",)
+    assert unwritten("plane.hough2d", discover_catalog()) == ()
 
 
 @pytest.mark.parametrize("takes", [("cloud",), ("planes", "cloud")], ids="-".join)

@@ -62,7 +62,7 @@ class Floor(Method):
         square = np.array([[x, y + 1, z], [x, y, z], [x + 1, y, z], [x + 1, y + 1, z]])
         planes = Planes(
             normal=np.array([[0.0, 0.0, 1.0]]), offset=np.array([z]) + cloud.origin[2],
-            corners=(square + cloud.origin)[np.newaxis], covariance=np.zeros((1, 4, 4)),
+            corners=(square + cloud.origin)[np.newaxis], covariance=self.covariance(),
             n_points=np.array([len(cloud)], dtype=np.int64), rms_m=np.zeros(1),
             names=("plane 0",), up=np.array([0.0, 0.0, 1.0]),
         )
@@ -72,6 +72,9 @@ class Floor(Method):
 
     def listen(self, ctx):
         ctx.progress(0.0, "looking")
+
+    def covariance(self):
+        return 1e-6 * np.eye(4)[np.newaxis]
 
     def look_at(self, cloud):
         cloud.require_points(3)
@@ -114,6 +117,14 @@ CHEATS: dict[str, tuple[str, str, str]] = {
         def lift_m(self, cloud, ctx):
             ctx.metric("height", 1.0, "")
             return 0.0
+        """,
+    ),
+    "faultless": (
+        "no-covariance-is-zero",
+        "the covariance of plane 0 is zero, which says that it is known without error: put in what",
+        """
+        def covariance(self):
+            return np.zeros((1, 4, 4))
         """,
     ),
     "meddling": (
@@ -417,7 +428,7 @@ def test_a_quick_check_ends_as_what_it_looked_at(cheat: str, code: int, state: s
 def test_what_a_quick_check_leaves_out_is_told() -> None:
     said = CliRunner().invoke(program, ["plugins", "check", "plane.floor", "--quick"]).stdout
     assert "left out results-repeat: Same seed, same digest" in said
-    assert said.endswith("plane.floor keeps 11 rules, 4 left out (--quick)\n")
+    assert said.endswith("plane.floor keeps 12 rules, 4 left out (--quick)\n")
 
 
 @pytest.mark.usefixtures("cheats")

@@ -20,7 +20,7 @@ class PyRansac3d(Method):
     """
 
     id = "plane.pyransac3d"
-    result_version = 1
+    result_version = 2
     determinism = "seeded"
     citations = ("pyRANSAC-3D, doi:10.5281/zenodo.7212567",)
 
@@ -115,7 +115,7 @@ def products(points, cloud, found, params, ctx):
     n_points = np.array([np.count_nonzero(nearest == index) for index in range(len(found))])
     order = np.argsort(-n_points, kind="stable")
     viewer = points.mean(axis=0) if cloud.stations is None else cloud.stations[0] - cloud.origin
-    normals, offsets, corners, rms_m = [], [], [], []
+    normals, offsets, corners, covariances, rms_m = [], [], [], [], []
     labels = np.full(len(points), -1, dtype=np.int16)
     for place, index in enumerate(order):
         normal, centre = found[index]
@@ -125,6 +125,7 @@ def products(points, cloud, found, params, ctx):
         normals.append(normal)
         offsets.append(normal @ (centre + cloud.origin))
         corners.append(rectangle(points[own], normal, centre, cloud.up) + cloud.origin)
+        covariances.append(covariance(points[own], normal, centre + cloud.origin))
         rms_m.append(float(np.sqrt(np.mean(signed_m[index][own] ** 2))))
     ctx.metric("n_planes", len(found), "1")
     ctx.metric("rms_mm", 1000 * rms_m[0], "mm")
@@ -132,7 +133,7 @@ def products(points, cloud, found, params, ctx):
         normal=np.array(normals),
         offset=np.array(offsets),
         corners=np.array(corners),
-        covariance=np.zeros((len(order), 4, 4)),
+        covariance=np.array(covariances),
         n_points=n_points[order].astype(np.int64),
         rms_m=np.array(rms_m),
         up=cloud.up,
@@ -140,6 +141,22 @@ def products(points, cloud, found, params, ctx):
         viewpoint="guess" if cloud.stations is None else "stations",
     )
     return {"planes": planes, "labels": PointLabels(plane_index=labels)}
+
+
+def covariance(points, normal, centre_world):
+    """How exact the plane is: covariance (4, 4) of its normal and its offset, in metres.
+
+    That of least squares, as if every point were measured by itself; neighbours in a scan are not.
+    """
+    from_middle = points - points.mean(axis=0)
+    sigma2 = np.mean((from_middle @ normal) ** 2)
+    spread, axes = np.linalg.eigh(from_middle.T @ from_middle)  # ascending: the first is across
+    tilts = [
+        np.append(axis, axis @ centre_world) * np.sqrt(sigma2 / max(total, 1e-12))
+        for total, axis in zip(spread[1:], axes.T[1:])
+    ]
+    shift = np.array([0.0, 0.0, 0.0, np.sqrt(sigma2 / len(points))])
+    return sum(np.outer(part, part) for part in (*tilts, shift))
 
 
 def rectangle(points, normal, centre, up):
