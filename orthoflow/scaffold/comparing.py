@@ -9,7 +9,10 @@ from typing import Any, Final
 from ruamel.yaml import YAML
 
 from orthoflow.catalog.catalog import Catalog
+from orthoflow.errors import PluginError
+from orthoflow.scaffold.kinds import loadable_method
 from orthoflow.sdk import port_specs
+from orthoflow.sdk.hooks import FILES
 from orthoflow.workflow.recipes import shipped_workflow
 
 # The first recipe that has a step of the kind is taken; coarse cells of one wall let it run in
@@ -36,7 +39,8 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         catalog: says which kinds are sources, which take no variants.
 
     Returns:
-        YAML; empty when no shipped recipe has a step of the kind.
+        YAML; empty for a source, and when neither a shipped recipe has a step of the kind nor an
+        installed method of the kind can stand behind one.
     """
     kind = method_id.partition(".")[0]
     if catalog.kinds[kind].spec.is_source:
@@ -51,7 +55,21 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         document["name"] = f"compare-{name}"
         document["compare"] = {"design": "product", **_judged(kind, steps, catalog)}
         return _dumped(document)
-    return ""
+    sibling = loadable_method(catalog, kind)
+    if sibling is None:
+        return ""
+    ports = [port for port in port_specs(sibling.load().In).values() if port.required]
+    variants = {
+        sibling.spec.id.partition(".")[2]: {"use": sibling.spec.id},
+        name: {"use": method_id},
+    }
+    takes = {port.name: port.type_name for port in ports}
+    document = _behind_a_recipe(kind, takes, variants, catalog)
+    if not document:
+        return ""
+    document["name"] = f"compare-{name}"
+    document["compare"] = {"design": "product"}
+    return _dumped(document)
 
 
 def _judged(
@@ -78,27 +96,41 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
         catalog: says what the recipes' methods give.
 
     Returns:
-        YAML; empty when no shipped recipe has all of them.
+        YAML; empty when no shipped recipe leads to all of them.
     """
     kind = method_id.partition(".")[0]
+    variants = {
+        "plain": {"use": method_id},
+        "double": {"use": method_id, "params": {"factor": 2.0}},
+    }
+    document = _behind_a_recipe(kind, dict(zip(takes, takes, strict=True)), variants, catalog)
+    if not document:
+        return ""
+    document["name"] = f"compare-{kind}"
+    document["compare"] = {"design": "product", "metrics": [f"{kind}.n_items"]}
+    return _dumped(document)
+
+
+def _behind_a_recipe(
+    step: str, takes: Mapping[str, str], variants: Mapping[str, object], catalog: Catalog
+) -> dict[str, Any]:
+    """What a step needs of a shipped recipe, and the step; empty where no recipe leads to it.
+
+    Args:
+        step: its name.
+        takes: port -> product type; what the recipe does not give installed methods make of it.
+        variants: of the step.
+        catalog: says what methods take and give.
+    """
     for recipe in _RECIPES:
         document = _coarse_document(recipe)
         steps: dict[str, dict[str, Any]] = document["steps"]
-        given: dict[str, list[str]] = {}
-        for name, node in steps.items():
-            for port in port_specs(catalog.method(node["use"]).load().Out).values():
-                given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
-        if kind in steps or not given.keys() >= set(takes):
+        if step in steps or not all(_reach(kind, steps, catalog) for kind in takes.values()):
             continue
-        # Of what is read or simulated, what is there; of what several steps make, the last.
-        wires = {name: given[name] if name == "cloud" else given[name][-1] for name in takes}
-        variants = {
-            "plain": {"use": method_id},
-            "double": {"use": method_id, "params": {"factor": 2.0}},
-        }
+        wires = _wires(takes, steps, catalog)
         needed = _needed(steps, wires.values())
         document["steps"] = {name: node for name, node in steps.items() if name in needed}
-        document["steps"][kind] = {"in": wires, "variants": variants}
+        document["steps"][step] = {"in": wires, "variants": dict(variants)}
         document["inputs"] = {
             name: spec
             for name, spec in document.get("inputs", {}).items()
@@ -106,10 +138,54 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
         }
         if not document["inputs"]:
             del document["inputs"]
-        document["name"] = f"compare-{kind}"
-        document["compare"] = {"design": "product", "metrics": [f"{kind}.n_items"]}
-        return _dumped(document)
-    return ""
+        return document
+    return {}
+
+
+def _reach(
+    type_name: str,
+    steps: dict[str, dict[str, Any]],
+    catalog: Catalog,
+    asked: frozenset[str] = frozenset(),
+) -> bool:
+    """Add steps of installed methods until one gives a product type; whether one does."""
+    if type_name in _given(steps, catalog):
+        return True
+    if type_name in asked:
+        return False
+    for entry in catalog.methods.values():
+        kind = entry.spec.kind
+        try:
+            method = entry.load()
+        except PluginError:
+            continue
+        gives = {port.type_name for port in port_specs(method.Out).values()}
+        takes = {p.name: p.type_name for p in port_specs(method.In).values() if p.required}
+        if type_name not in gives or FILES in takes.values() or kind in steps:
+            continue
+        if all(_reach(one, steps, catalog, asked | {type_name}) for one in takes.values()):
+            steps[kind] = {"use": entry.spec.id, "in": _wires(takes, steps, catalog)}
+            return True
+    return False
+
+
+def _given(steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> dict[str, list[str]]:
+    """References to the outputs of steps, by product type."""
+    given: dict[str, list[str]] = {}
+    for name, node in steps.items():
+        for port in port_specs(catalog.method(node["use"]).load().Out).values():
+            given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
+    return given
+
+
+def _wires(
+    takes: Mapping[str, str], steps: Mapping[str, Mapping[str, Any]], catalog: Catalog
+) -> dict[str, str | list[str]]:
+    """Of what is read or simulated, what is there; of what several steps make, the last."""
+    given = _given(steps, catalog)
+    return {
+        port: given[kind] if kind == "cloud" else given[kind][-1] for port, kind in takes.items()
+    }
 
 
 def _coarse_document(recipe: str) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
     entry = catalog.kinds[kind]
     if entry.state != "fine":
         raise PluginError(entry.problem)
-    start = _loadable(catalog, kind)
+    start = loadable_method(catalog, kind)
     taken, given = _declared(start) if start else ({}, {})
     if not entry.spec.is_source:
         required = {name: name not in taken or taken[name].required for name in entry.spec.inputs}
@@ -105,6 +105,18 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
     )
 
 
+def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
+    """The first installed method of a kind whose class loads; None without one."""
+    for entry in catalog.methods.values():
+        if entry.spec.kind == kind:
+            try:
+                entry.load()
+            except PluginError:
+                continue
+            return entry
+    return None
+
+
 def taken_ports(catalog: Catalog, takes: Sequence[str]) -> KindPorts:
     """Give a port of its name for each product type, all of them required."""
     imports: dict[str, set[str]] = {}
@@ -131,17 +143,6 @@ def _needs(
         if one.name != DISTRIBUTION
     }
     return tuple(f"{name}>={version}" for name, version in sorted(versions.items()))
-
-
-def _loadable(catalog: Catalog, kind: str) -> MethodEntry | None:
-    for entry in catalog.methods.values():
-        if entry.spec.kind == kind:
-            try:
-                entry.load()
-            except PluginError:
-                continue
-            return entry
-    return None
 
 
 def _declared(start: MethodEntry) -> tuple[dict[str, PortSpec], dict[str, PortSpec]]:

@@ -14,7 +14,7 @@ from typing import Final
 import jinja2
 
 from orthoflow import products, sdk
-from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.catalog import Catalog, KindEntry, MethodEntry, ProductEntry
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError
@@ -121,7 +121,7 @@ def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
         PluginError: the method cannot be loaded.
     """
     entry = catalog.method(method_id)
-    announced = {
+    announced: dict[str, MethodEntry | KindEntry | ProductEntry] = {
         f"method {method_id}": entry,
         **{f"kind {name}": kind for name, kind in catalog.kinds.items()},
         **{f"product {name}": product for name, product in catalog.products.items()},

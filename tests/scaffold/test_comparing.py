@@ -87,6 +87,23 @@ def test_a_new_kind_is_compared_with_itself_behind_what_it_takes(catalog: Catalo
         assert f"inputs.{name}" in str(found["steps"])
 
 
+def test_what_a_recipe_does_not_give_installed_methods_make_of_it(catalog: Catalog) -> None:
+    found = read(comparison_text("colour.mine", "mine", catalog))
+    steps = found["steps"]
+    assert steps["colour"]["variants"] == {
+        "photos": {"use": "colour.photos"},
+        "mine": {"use": "colour.mine"},
+    }
+    # The first recipe has no photos on walls: the first methods that match and orient lead there.
+    made = {name: node["in"] for name, node in steps.items() if name in ("match", "orient")}
+    assert made == {
+        "match": {"photos": "room.photos", "walls": "wall.walls"},
+        "orient": {"ties": "match.ties", "photos": "room.photos"},
+    }
+    assert steps["colour"]["in"]["cameras"] == "orient.cameras"
+    assert found["compare"] == {"design": "product"}
+
+
 def test_what_no_recipe_gives_is_compared_in_none(catalog: Catalog) -> None:
     assert own_comparison_text("part.mine", ["no_such_product"], catalog) == ""
     # Nor where a recipe has a step of that name already.

@@ -55,11 +55,16 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
     # A template that reports a metric declares it.
     text = (folder / project.package / "method.py").read_text(encoding="utf-8")
     assert set(method.metrics) == set(re.findall(r"^ +ctx\.metric\(\"(\w+)", text, re.MULTILINE))
-    comparison = folder / "compare.yaml"
+    comparison, told = folder / "compare.yaml", (folder / "README.md").read_text(encoding="utf-8")
+    # Sources take no variants; their step stands in the text instead.
+    assert comparison.exists() == (not catalog.kinds[kind].spec.is_source)
+    assert ("there is no `compare.yaml`" in told) != comparison.exists()
     if comparison.exists():
-        steps = load_workflow(comparison, catalog).steps.values()
-        uses = {variant.method for step in steps for variant in step.variants}
-        assert project.method_id in uses
+        workflow = load_workflow(comparison, catalog)
+        cells = [one for one in expand_cells(workflow, catalog) if one.method == project.method_id]
+        assert [one.skip_reason for one in cells] == [""]
+    else:
+        assert f"`{kind}: {{use: {project.method_id}}}`" in told
 
 
 def test_a_new_detector_is_compared_by_the_planes_that_it_finds(tmp_path: Path) -> None:
@@ -142,6 +147,19 @@ def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
     for project in projects:
         write_project(project, tmp_path, discover_catalog())
         install(tmp_path / project.name, monkeypatch)
+        # A workflow leads from a shipped recipe through what the other plugin makes of it.
+        comparison = tmp_path / project.name / "compare.yaml"
+        catalog = discover_catalog()
+        workflow = load_workflow(comparison, catalog)
+        cells = [one for one in expand_cells(workflow, catalog) if one.step == project.kind]
+        assert project.method_id in {one.method for one in cells}
+        assert [one.skip_reason for one in cells] == ["", ""]
+        assert doubts_about(workflow) == ()
+    then_steps = YAML(typ="safe").load((tmp_path / "then-own" / "compare.yaml").read_text())[
+        "steps"
+    ]
+    assert then_steps["first"]["use"] == "first.firsts"
+    assert then_steps["then"]["in"]["firsts"] == "first.firsts"
     for project in projects:
         text = (tmp_path / project.name / "pyproject.toml").read_text(encoding="utf-8")
         needed = tomllib.loads(text)["project"]["dependencies"]
