@@ -379,11 +379,16 @@ class _Axes:
                 f"{escape(shown(below))}{' (logarithmic)' if self.is_logarithmic else ''}</text>"
             ),
         ]
-        for value in _ticks(*self.y):
+        ticks = _ticks(*self.y)
+        # Numbers that differ in their last digits only: how far they lie above the first.
+        base = ticks[0] if len(set(map(number, ticks))) < len(ticks) else 0.0
+        beside += f", above {base:.10g}" if base else ""
+        for value in ticks:
             y = self.down(value)
             parts.append(
                 f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>'
-                f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{number(value)}</text>'
+                f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">'
+                f"{number(value - base)}</text>"
             )
         taken = -math.inf
         for value in sorted({point.x for points in lines.values() for point in points}):
@@ -458,4 +463,4 @@ def _ticks(low: float, high: float) -> list[float]:
     step = next(power * round_ for round_ in (1, 2, 5, 10) if power * round_ >= 0.8 * rough)
     first = math.ceil(low / step - 1e-9)
     last = math.floor(high / step + 1e-9)
-    return [float(f"{index * step:.6g}") for index in range(first, last + 1)]
+    return [float(f"{index * step:.12g}") for index in range(first, last + 1)]

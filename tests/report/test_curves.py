@@ -150,6 +150,28 @@ def test_nothing_lies_over_the_point_of_the_baseline(tmp_path: Path) -> None:
     assert "of signed errors their sizes" not in curve.caption
 
 
+@pytest.mark.parametrize(
+    ("offsets", "told", "above"),
+    [
+        ((0.0, 0.5, 1.0), ["282", "282.2", "282.4", "282.6", "282.8", "283"], ""),
+        ((0.0, 0.0005, 0.001), ["0", "0.0002", "0.0004", "0.0006", "0.0008", "0.001"], "282"),
+        ((0.0, 5e-7, 1e-6), ["0", "2e-07", "4e-07", "6e-07", "8e-07", "1e-06"], "282"),
+    ],
+)
+def test_ticks_that_differ_in_their_last_digits_are_told_apart(
+    tmp_path: Path, offsets: tuple[float, ...], told: list[str], above: str
+) -> None:
+    cells = [
+        cell(f"plane@plane=v{k}", params={"cell_m": k}, metrics=metrics(omega_deg=282.0 + offset))
+        for k, offset in enumerate(offsets)
+    ]
+    kept = record(cells, workflow_resolved=compared_resolved("plane.omega_deg"))
+    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=kept))
+    assert re.findall(r'text-anchor="end">([^<]+)<', curve.svg) == told
+    (beside,) = re.findall(r'class="beside"[^>]*>([^<]+)<', curve.svg)
+    assert beside.partition(" / deg")[2] == (f", above {above}" if above else "")
+
+
 def test_no_parameter_is_drawn_over_itself(tmp_path: Path) -> None:
     cells = [
         cell(f"plane@plane=v{value}", params={"thinning": value},
