@@ -259,7 +259,7 @@ def _facts_text(facts: Mapping[str, object]) -> str:
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "n_values", "swept", "shared", "variants"):
+    for name in ("labels", "n_values", "swept", "shared", "set_as", "beside", "variants"):
         del values[name]
     return values | {"differs": dict(differs)}
 

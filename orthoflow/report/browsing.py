@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
@@ -54,11 +54,14 @@ class RunSummary:
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
-        facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
-            baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
-            version), and inputs by `input <name>`.
-        swept: of facts whose variants of the same method take several values, all of them.
+        facts: what may differ between runs, as JSON: parameters of the baseline by
+            `step.parameter`, its methods by `step.use`, and parameters of other variants by
+            `step.variant.parameter`; `seed`, `orthoflow` (its version), and inputs by
+            `input <name>`.
+        swept: of facts that a sweep gives several values, all of them.
         shared: of facts of one of several datasets, their name without it.
+        set_as: of parameters of a variant, the baseline's too, `step.variant.parameter`.
+        beside: of parameters of another variant, the fact of the baseline.
         variants: all values of parameters as `--set` names them for one variant,
             `step.variant.parameter`; of one with a sweep those of all that it became.
     """
@@ -76,6 +79,8 @@ class RunSummary:
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
     swept: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
     shared: Mapping[str, str] = field(default_factory=dict)
+    set_as: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
     variants: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
     @property
@@ -128,7 +133,8 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     """What of its facts tells each run from others of the same workflow, by its folder.
 
     A fact that some of them lack differs only where two others disagree on it. Of a sweep all
-    values are told, and without the dataset what is the same on all datasets of each such run.
+    values are told, without the dataset what is the same on all datasets of each such run, and
+    without the variant what is the same in all variants.
     """
     told = {run.folder: run.told for run in runs}
     apart: set[tuple[str, str]] = set()
@@ -150,14 +156,49 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     for run in runs:
         for name, value in named[run.folder].items():
             values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
+    names = _names_as_set(runs, named, called)
     return {
         run.folder: {
             name: value
-            for name, value in named[run.folder].items()
-            if len(values[run.workflow, name]) > 1
+            for fact, value in named[run.folder].items()
+            if len(values[run.workflow, fact]) > 1
+            and (name := names.get((run.workflow, fact), fact))
         }
         for run in runs
     }
+
+
+def _names_as_set(
+    runs: Sequence[RunSummary],
+    named: Mapping[Path, Mapping[str, JsonValue]],
+    called: Callable[[RunSummary, str], str],
+) -> dict[tuple[str, str], str]:
+    """Other names of parameters that several variants take, by workflow and name.
+
+    Where another variant has the baseline's value in every run, its own name is empty: what is
+    said of the baseline holds for it. Where not, the baseline's is named with its variant, too,
+    as long as that is the same one in all runs.
+    """
+    follows: dict[tuple[str, str], bool] = {}
+    for run in runs:
+        values = named[run.folder]
+        for fact, first in run.beside.items():
+            name = run.workflow, called(run, fact)
+            is_same = values[called(run, fact)] == values[called(run, first)]
+            follows[name] = is_same and follows.get(name, True)
+    names = {name: "" for name, does in follows.items() if does}
+    of_baseline: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        for fact in run.facts.keys() - run.beside.keys():
+            name = run.workflow, called(run, fact)
+            of_baseline.setdefault(name, set()).add(run.set_as.get(fact, ""))
+    for run in runs:
+        for fact, first in run.beside.items():
+            name = run.workflow, called(run, first)
+            if not follows[run.workflow, called(run, fact)] and len(of_baseline[name]) == 1:
+                (written,) = of_baseline[name]
+                names[name] = written or name[1]
+    return names
 
 
 def _sorted_json(value: JsonValue) -> str:
@@ -231,27 +272,10 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         facts["datasets"] = len(parts)
     for given in record.inputs:
         facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
-    # Those whose numbers are shown are named by their step, whatever their variant is called.
-    names = {
-        cell.address: f"{cell.step}@data={cell.assignment[DATA]}"
-        if DATA in cell.assignment
-        else cell.step
-        for part in parts.values() or (run,)
-        for cell in baseline_cells(part)
-    }
-    shared: dict[str, str] = {}
-    for cell in record.cells:
-        if cell.repeat == 0 and cell.status != "skipped":
-            name = names.get(cell.address, cell.address)
-            own = {f"{name}.{parameter}": value for parameter, value in cell.params.items()}
-            if cell.address in names:
-                own[f"{name}.use"] = cell.method
-                shared |= {
-                    fact: f"{cell.step}{fact.removeprefix(name)}"
-                    for fact in own
-                    if DATA in cell.assignment
-                }
-            facts |= own
+    baseline = {cell.address for part in parts.values() or (run,) for cell in baseline_cells(part)}
+    groups = tuple(_alike(record.cells, baseline))
+    named = [(one, f".{parameter}") for one in groups for parameter in one.values]
+    facts |= {f"{one.name}.{name}": value for one in groups for name, value in one.values.items()}
     values = _values(run)
     return RunSummary(
         folder=folder,
@@ -265,8 +289,16 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         n_values={name: len(found) for name, found in values.items()} if parts else {},
         labels=_labels(run),
         facts=facts,
-        swept=_swept(record.cells, names),
-        shared=shared,
+        swept={
+            f"{one.name}.{name}": several for one in groups for name, several in one.swept.items()
+        },
+        shared={one.name + name: one.shared + name for one, name in named if one.data},
+        set_as={one.name + name: one.written + name for one, name in named if one.variant},
+        beside={
+            one.name + name: first
+            for one, name in named
+            if one.variant and not one.chosen and (first := one.of_baseline + name) in facts
+        },
         variants=_variants(record.cells),
     )
 
@@ -277,40 +309,85 @@ def _variants(cells: Sequence[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]
         variant = cell.assignment.get(cell.step, "")
         if not variant or cell.repeat or cell.status == "skipped":
             continue
-        # A sweep puts its parameters and their values behind the name that `--set` takes.
-        swept = [variant.find(f"-{parameter}-") for parameter in cell.params]
-        names = {variant, variant[: min((at for at in swept if at > 0), default=None)]}
-        for name in names:
+        for name in {variant, _called_by_set(cell)} - {""}:
             for parameter, value in cell.params.items():
                 found.setdefault(f"{cell.step}.{name}.{parameter}", []).append(value)
     return {name: tuple(values) for name, values in found.items()}
 
 
-def _swept(
-    cells: Sequence[RecordedCell], names: Mapping[str, str]
-) -> dict[str, tuple[JsonValue, ...]]:
-    """All values of what the variants of one method take several of.
+def _called_by_set(cell: RecordedCell) -> str:
+    """The variant that `--set` names: a sweep puts parameters and values behind its name."""
+    variant = cell.assignment.get(cell.step, "")
+    swept = [f"-{variant}".find(f"-{parameter}-") for parameter in cell.params]
+    return variant[: min((max(at - 1, 0) for at in swept if at >= 0), default=None)]
 
-    Args:
-        cells: of the run.
-        names: address -> how the cell of the baseline is named.
+
+@dataclass(frozen=True, kw_only=True)
+class _Alike:
+    """Cells of a step whose parameters `--set` changes together, whatever varies before them.
+
+    Attributes:
+        step: theirs.
+        data: their dataset, empty for none.
+        variant: of their step as `--set` names it, empty for none.
+        cells: one, or of a sweep one for each of its values.
+        chosen: the cell of the baseline, if it is among them.
     """
-    alike: dict[tuple[str, str, str], list[RecordedCell]] = {}
+
+    step: str
+    data: str
+    variant: str
+    cells: tuple[RecordedCell, ...]
+    chosen: RecordedCell | None
+
+    @property
+    def values(self) -> dict[str, JsonValue]:
+        """Parameters, those of the baseline where it is among them, and then its method."""
+        values = dict((self.chosen or self.cells[0]).params)
+        return values | {"use": self.chosen.method} if self.chosen else values
+
+    @property
+    def swept(self) -> dict[str, tuple[JsonValue, ...]]:
+        """All values of the parameters that have several."""
+        found: dict[str, dict[str, JsonValue]] = {}
+        for cell in self.cells:
+            for name, value in cell.params.items():
+                found.setdefault(name, {})[_sorted_json(value)] = value
+        return {name: tuple(values.values()) for name, values in found.items() if len(values) > 1}
+
+    @property
+    def written(self) -> str:
+        """What `--set` takes."""
+        return f"{self.step}.{self.variant}" if self.variant else self.step
+
+    @property
+    def shared(self) -> str:
+        """The name without the dataset: the baseline's is its step, whatever its variant."""
+        return self.step if self.chosen else self.written
+
+    @property
+    def of_baseline(self) -> str:
+        """The name of the baseline's cell of the step, on the same dataset."""
+        return f"{self.step}@{DATA}={self.data}" if self.data else self.step
+
+    @property
+    def name(self) -> str:
+        """The name that no others have."""
+        if self.chosen or not self.variant:
+            return self.of_baseline
+        return f"{self.of_baseline},{self.step}={self.variant}" if self.data else self.written
+
+
+def _alike(cells: Iterable[RecordedCell], baseline: Collection[str]) -> Iterator[_Alike]:
+    """Put together what `--set` does; `baseline` has the addresses of the baseline's cells."""
+    found: dict[tuple[str, str, str], list[RecordedCell]] = {}
     for cell in cells:
         if cell.repeat == 0 and cell.status != "skipped":
-            key = cell.step, cell.method, cell.assignment.get(DATA, "")
-            alike.setdefault(key, []).append(cell)
-    found = {}
-    for variants in alike.values():
-        for cell in variants:
-            for parameter in cell.params if cell.address in names and len(variants) > 1 else ():
-                values = {
-                    _sorted_json(one.params.get(parameter)): one.params.get(parameter)
-                    for one in variants
-                }
-                if len(values) > 1:
-                    found[f"{names[cell.address]}.{parameter}"] = tuple(values.values())
-    return found
+            key = cell.step, cell.assignment.get(DATA, ""), _called_by_set(cell)
+            found.setdefault(key, []).append(cell)
+    for (step, data, variant), several in found.items():
+        chosen = next((cell for cell in several if cell.address in baseline), None)
+        yield _Alike(step=step, data=data, variant=variant, cells=tuple(several), chosen=chosen)
 
 
 def _values(run: Run) -> dict[str, list[float]]:

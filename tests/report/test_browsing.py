@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from orthoflow_provenance.model import RecordedFile, RecordedInput
@@ -176,7 +177,7 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
     def told(name: str, *tries: tuple[int, ...]) -> RunSummary:
         rooms = ("hall", "stairs", "court")[: len(tries)]
         cells = [
-            cell(f"check@check=v{value},data={room}", params={"tries": value})
+            cell(f"check@check=tries-{value},data={room}", params={"tries": value})
             for room, values in zip(rooms, tries, strict=True)
             for value in values
         ]
@@ -214,6 +215,67 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
     assert three.values("check.tries") == (1, 2, 1, 2, 1, 2)
     assert (apart.values("check.tries"), apart.values("seed")) == ((4, 5), (1,))
     assert "check.tries" in apart.names
+
+
+def compared(
+    folder: Path,
+    swept: tuple[float, ...] = (0.05,),
+    *,
+    ransac_m: float = 0.05,
+    gsd_m: float = 0.01,
+) -> RunSummary:
+    """A run with two variants on two datasets, and a step behind them."""
+    names = [f"hough-tol_m-{k}" if len(swept) > 1 else "hough" for k in range(len(swept))]
+    tolerances = {**dict(zip(names, swept, strict=True)), "ransac": ransac_m}
+    cells = [
+        one
+        for room in ("hall", "stairs")
+        for variant, tol_m in tolerances.items()
+        for one in (
+            cell(f"plane@data={room},plane={variant}", params={"tol_m": tol_m}),
+            cell(f"wall@data={room},plane={variant}", params={"gsd_m": gsd_m}),
+        )
+    ]
+    resolved = {
+        "datasets": {room: {"inputs": {}, "set": {}} for room in ("hall", "stairs")},
+        "compare": {"baseline": {"plane": names[0]}},
+    }
+    made = record(cells, workflow_resolved=json.dumps(resolved))
+    return module._of_run(folder, HeldRun(path=folder / "run.h5", record=made))
+
+
+@pytest.mark.parametrize(
+    ("changed", "of_first", "of_second"),
+    [
+        # Of a step behind variants, whatever it comes from.
+        ({"gsd_m": 0.02}, {"wall.gsd_m": 0.01}, {"wall.gsd_m": 0.02}),
+        # `--set plane.tol_m` changes each variant, `plane.hough.tol_m` one of them.
+        (
+            {"swept": (0.1,), "ransac_m": 0.1},
+            {"plane.tol_m": 0.05},
+            {"plane.tol_m": 0.1},
+        ),
+        ({"swept": (0.1,)}, {"plane.hough.tol_m": 0.05}, {"plane.hough.tol_m": 0.1}),
+        ({"ransac_m": 0.1}, {"plane.ransac.tol_m": 0.05}, {"plane.ransac.tol_m": 0.1}),
+        # And a sweep has the name that it was written with.
+        (
+            {"swept": (0.02, 0.05, 0.1)},
+            {"plane.hough.tol_m": 0.05},
+            {"plane.hough.tol_m": "0.02|0.05|0.1"},
+        ),
+    ],
+    ids=["behind variants", "each variant", "the baseline's", "another's", "a sweep"],
+)
+def test_what_was_changed_once_is_named_once_and_as_it_is_set(
+    tmp_path: Path,
+    changed: dict[str, Any],
+    of_first: dict[str, object],
+    of_second: dict[str, object],
+) -> None:
+    first, second = compared(tmp_path / "a"), compared(tmp_path / "b", **changed)
+    assert list(differing_facts([first, second]).values()) == [of_first, of_second]
+    # Each of these names is one that `--where` takes.
+    assert all(second.values(name) for name in of_second)
 
 
 def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:
