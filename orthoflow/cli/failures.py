@@ -6,13 +6,16 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from orthoflow.cli.commands import Session
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import OrthoflowError
+
+if TYPE_CHECKING:
+    from orthoflow.workflow.format import Workflow
 
 EXIT_GOOD: Final = 0
 EXIT_CELL_FAILED: Final = 1
@@ -80,6 +83,14 @@ def say_error(*lines: str) -> None:
     """Write lines to standard error; a closed one is no reason to fail."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
+
+
+def say_doubts(workflow: Workflow) -> None:
+    """Write to standard error what is allowed in a workflow and can hardly be meant."""
+    from orthoflow.workflow.doubts import doubts_about
+
+    for doubt in doubts_about(workflow):
+        say_error(f"workflow: warning: {doubt}")
 
 
 def code_for(doubts: Iterable[str], consequence: str) -> int:

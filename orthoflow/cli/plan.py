@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD, say_error
+from orthoflow.cli.failures import EXIT_GOOD, say_doubts
 from orthoflow.cli.options import (
     Changes,
     json_option,
@@ -46,7 +46,6 @@ def plan(
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
     from orthoflow.workflow.cells import expand_cells
-    from orthoflow.workflow.doubts import doubts_about
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)
@@ -59,8 +58,7 @@ def plan(
         ("step", "method", "status", "reason"),
         [(item.cell.address, item.cell.method, item.status, item.reason) for item in planned],
     )
-    for doubt in doubts_about(loaded):
-        say_error(f"workflow: warning: {doubt}")
+    say_doubts(loaded)
     echo("", _summary(planned))
     return EXIT_GOOD
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
 from collections.abc import Iterator, Sequence
@@ -67,8 +68,8 @@ def replay(
     it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
     differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
     whose products are identical: by more than a millionth, or a count at all; and where it cannot
-    be replayed because an input is missing or altered, the record was edited, or a method is of
-    another version; with 4 where methods are missing and nothing else is wrong.
+    be replayed because an input or the record was changed, or a method is of another version; else
+    with 2 where an input is not to be found, with 4 where methods are missing.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions
@@ -115,6 +116,7 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
         yield given
         return
     fresh = folder.with_name(f"{folder.name}.store")
+    made = [place for place in fresh.parents if not place.exists()]
     fresh.mkdir(parents=True, exist_ok=True)
     is_interrupted = False
     try:
@@ -126,6 +128,10 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     finally:
         if not is_interrupted:
             shutil.rmtree(fresh, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                # `runs`, where nothing was run after all.
+                for place in made:
+                    place.rmdir()
 
 
 def _earlier_stores() -> tuple[Store, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from orthoflow.cli.commands import Command, command_again, current_session
-from orthoflow.cli.failures import say_error, silence_stdout
+from orthoflow.cli.failures import say_doubts, say_error, silence_stdout
 from orthoflow.cli.options import (
     Changes,
     execution_options,
@@ -95,12 +95,16 @@ def prepared(
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog.discovery import discover_catalog
         from orthoflow.engine.plan import RunOptions, plan_run
+        from orthoflow.engine.run_folder import require_run_folder
         from orthoflow.engine.store import Store
         from orthoflow.workflow.cells import expand_cells
 
         options = RunOptions(**choices)
         catalog = discover_catalog()
         loaded = changes.load(workflow, catalog)
+        if output is not None:
+            # Gigabytes of inputs are looked at next.
+            require_run_folder(output.absolute(), loaded.name)
         opened = Store(store)
         cells = expand_cells(loaded, catalog)
         planned = plan_run(cells, loaded, catalog, opened, options)
@@ -176,11 +180,9 @@ class Call:
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine.scheduling import execute
-        from orthoflow.workflow.doubts import doubts_about
 
         # Before minutes pass, and once more in the summary.
-        for doubt in doubts_about(self.workflow):
-            say_error(f"workflow: warning: {doubt}")
+        say_doubts(self.workflow)
         with make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress:
             return execute(
                 self.plan,

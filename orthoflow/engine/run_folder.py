@@ -6,8 +6,8 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -127,9 +127,9 @@ class Journal:
             run_id: id of a new run, made up when empty; a resumed run keeps its own.
 
         Raises:
-            ArgumentError: the folder holds a finished run in which nothing lacked room on the
-                disk, another workflow's run, or other files.
-            StoreError: it is in use by another run, or the disk refuses.
+            ArgumentError: the folder is in use by another run, or holds a finished run in which
+                nothing lacked room on the disk, another workflow's run, or other files.
+            StoreError: the disk refuses.
         """
         self._folder = folder
         self._path = folder / JOURNAL
@@ -171,10 +171,7 @@ class Journal:
 
     def _begin(self, name: str, run_id: str) -> None:
         if not self._lock.take(is_shared=False, waits=False):
-            raise StoreError(
-                f"the run folder {self._folder} is in use by another run; wait for its end, or "
-                f"{_ANOTHER}"
-            )
+            raise _is_in_use(self._folder)
         lines = self._read_lines()
         if (self._folder / RECORD_FILE).exists():
             self._reopen(lines)
@@ -183,11 +180,7 @@ class Journal:
         if lines and first is None:
             raise self._damage()
         first = first or RunBegan(time=now(), run_id=run_id or new_run_id(), workflow=name)
-        if first.workflow != name:
-            raise ArgumentError(
-                f"{self._folder} holds an unfinished run of {first.workflow}, not of "
-                f"{name}; {_ANOTHER}"
-            )
+        _check_workflow(self._folder, first, name)
         self.run_id = first.run_id
         self.damaged = {line.address: line.what for line in lines if isinstance(line, CellDamaged)}
         self.started = first.time
@@ -236,6 +229,60 @@ def _parsed(lines: bytes) -> list[JournalLine]:
     return [_codec().validate_json(line, strict=True) for line in lines.splitlines()]
 
 
+def require_run_folder(folder: Path, name: str) -> None:
+    """Refuse what a journal would refuse, before anything is read for the run.
+
+    Args:
+        folder: the run folder, which need not be there.
+        name: name of the workflow.
+
+    Raises:
+        ArgumentError: no run of the workflow can begin or go on there.
+    """
+    _check_folder(folder)
+    if is_running(folder):
+        raise _is_in_use(folder)
+    for line in _readable_lines(folder):
+        if isinstance(line, RunBegan):
+            _check_workflow(folder, line, name)
+
+
+@contextmanager
+def kept_from_others(folder: Path) -> Iterator[None]:
+    """Keep other runs out of a run folder while what came out of its run is written there.
+
+    Raises:
+        ArgumentError: another run goes on there already.
+    """
+    path = folder / JOURNAL
+    if not path.exists():
+        yield
+        return
+    with path.open("r+b") as journal, closing(file_lock(path, journal.fileno())) as lock:
+        if not lock.take(is_shared=False, waits=False):
+            raise _is_in_use(folder)
+        yield
+
+
+def _is_in_use(folder: Path) -> ArgumentError:
+    return ArgumentError(
+        f"the run folder {folder} is in use by another run; wait for its end, or {_ANOTHER}"
+    )
+
+
+def _check_workflow(folder: Path, first: RunBegan, name: str) -> None:
+    if first.workflow != name:
+        raise ArgumentError(
+            f"{folder} holds an unfinished run of {first.workflow}, not of {name}; {_ANOTHER}"
+        )
+
+
+def _readable_lines(folder: Path) -> list[JournalLine]:
+    with suppress(OSError, ValueError):
+        return _parsed((folder / JOURNAL).read_bytes())
+    return []
+
+
 def _is_finished(folder: Path) -> ArgumentError:
     return ArgumentError(
         f"{folder} holds a finished run ({RECORD_FILE}); {_ANOTHER}, or look at this one "
@@ -250,18 +297,16 @@ def _lacked_room(lines: Sequence[JournalLine]) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
+    if files := [place for place in (folder, *folder.parents) if place.is_file()]:
+        raise ArgumentError(f"{folder} can be no folder, for {files[0]} is a file; {_ANOTHER}")
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             what = "a link" if path.is_symlink() else "a pipe or a device"
             raise ArgumentError(
                 f"{folder} holds {what}, {path.name}, as no run makes them; {_ANOTHER}"
             )
-    if (folder / RECORD_FILE).exists():
-        lines: list[JournalLine] = []
-        with suppress(OSError, ValueError):
-            lines = _parsed((folder / JOURNAL).read_bytes())
-        if not _lacked_room(lines):
-            raise _is_finished(folder)
+    if (folder / RECORD_FILE).exists() and not _lacked_room(_readable_lines(folder)):
+        raise _is_finished(folder)
     if not folder.is_dir():
         return
     if not (folder / JOURNAL).exists() and any(folder.iterdir()):

@@ -515,6 +515,9 @@ class Store:
         Raises:
             StoreError: it cannot be moved.
         """
+        if not os.path.lexists(path):
+            # Who only asks a store leaves no lock there, and makes no folder for it.
+            return False
         try:
             with writing_to(self.folder), taking_turns(self.folder / "damaged.lock"):
                 # Another run may have been quicker, and may have put a sound one there.

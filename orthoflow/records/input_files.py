@@ -21,7 +21,7 @@ from orthoflow_provenance.model import RecordedFile, RecordedInput
 from orthoflow.alike import first_few
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.errors import InputError
+from orthoflow.errors import InputError, RecordError
 from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.workflow.format import Workflow, WorkflowInputSpec
@@ -40,6 +40,14 @@ _MOST_LISTED: Final = 10_000
 _FOLDERS_ABOVE: Final = 3
 
 
+class ChangedInputsError(RecordError):
+    """Input files are not what a record says; `problems` names them, and those that are missing."""
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
 @dataclass(frozen=True, kw_only=True)
 class InputSearch:
     """What a search found.
@@ -47,10 +55,12 @@ class InputSearch:
     Attributes:
         paths: input -> its files in the order of the record; inputs that were not given have none.
         problems: one sentence per file that is missing or was changed.
+        is_changed: one of them lies there with other content.
     """
 
     paths: Mapping[str, tuple[Path, ...]]
     problems: tuple[str, ...]
+    is_changed: bool
 
 
 def find_inputs(
@@ -84,7 +94,7 @@ def find_inputs(
     """
     places = _places(workflow, run_folder, given, extracted or {})
     paths: dict[str, tuple[Path, ...]] = {}
-    problems: list[str] = []
+    lost: list[_Lost] = []
     for entry in recorded:
         found = []
         for file in entry.files:
@@ -92,9 +102,13 @@ def find_inputs(
             if isinstance(where, Path):
                 found.append(where)
             else:
-                problems.append(where)
+                lost.append(where)
         paths[entry.name] = tuple(found)
-    return InputSearch(paths=paths, problems=tuple(problems))
+    return InputSearch(
+        paths=paths,
+        problems=tuple(one.problem for one in lost),
+        is_changed=any(one.is_changed for one in lost),
+    )
 
 
 class LaidOutInputs:
@@ -169,10 +183,18 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
         yield laid_out
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Lost:
+    """A file that was not found: the sentence that says so, and whether another has its place."""
+
+    problem: str
+    is_changed: bool = False
+
+
 def _find(
     name: str, file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
-) -> Path | str:
-    """The file, or a sentence that says why there is none."""
+) -> Path | _Lost:
+    """The file, or why there is none."""
     same_name: list[Path] = []
     seen: set[Path] = set()
     expected = f"{file.size_bytes} bytes with the SHA-256 {file.sha256[:12]}..."
@@ -195,19 +217,20 @@ def _find(
         if path.name == file.name:
             same_name.append(path)
     if same_name:
-        return (
-            f"input {name}: {same_name[0]} is not the {file.name} of the record: it was changed "
-            f"(expected {expected})"
+        return _Lost(
+            problem=f"input {name}: {same_name[0]} is not the {file.name} of the record: it was "
+            f"changed (expected {expected})",
+            is_changed=True,
         )
     if places.files:
         given = first_few([str(path) for path in places.files])
-        return (
-            f"input {name}: {file.name} of the record is not among what was given, {given} "
+        return _Lost(
+            problem=f"input {name}: {file.name} of the record is not among what was given, {given} "
             f"(expected {expected}, under any name)"
         )
-    return (
-        f"input {name}: {file.name} ({file.size_bytes} bytes, SHA-256 {file.sha256[:12]}...) is "
-        f"not to be found; give it with --input {name}=PATH"
+    return _Lost(
+        problem=f"input {name}: {file.name} ({file.size_bytes} bytes, SHA-256 "
+        f"{file.sha256[:12]}...) is not to be found; give it with --input {name}=PATH"
     )
 
 

@@ -22,6 +22,7 @@ from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.format import StepVariant, Workflow
+from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import workflow_from_resolved
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
@@ -84,7 +85,8 @@ def plan_replay(
 
     Raises:
         UnreplayableRunError: the record was changed, a method has another result version or takes
-            other parameters, or an input file is missing or was changed.
+            other parameters, or an input file was changed.
+        MissingInputsError: nothing of that, but input files are not to be found.
         MissingMethodsError: nothing is wrong but that methods or product types are not installed.
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
@@ -112,8 +114,10 @@ def plan_replay(
         extracted=laid_out.extracted if laid_out else None,
         noted=[one.file_digests() for one in earlier],
     )
-    if check.others or search.problems:
+    if check.others or search.is_changed:
         raise UnreplayableRunError((*check.others, *check.missing, *search.problems))
+    if search.problems:
+        raise MissingInputsError((*check.missing, *search.problems))
     if check.missing:
         raise MissingMethodsError(tuple(check.missing))
     if store.folder.is_dir():

@@ -32,9 +32,9 @@ from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import CellResult
-from orthoflow.engine.run_folder import RECORD_FILE
-from orthoflow.errors import DamageError, InputError, OrthoflowError, StoreError
-from orthoflow.records.input_files import embedded_inputs, find_inputs
+from orthoflow.engine.run_folder import RECORD_FILE, kept_from_others
+from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
+from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
@@ -101,12 +101,14 @@ def write_run(
             aside, and the same run, gone on with, computes it again.
         StoreError: the disk refuses, or refused a step what it wanted to read or write.
         InputError: an input file to embed was changed during the run.
+        ArgumentError: another run goes on in the folder meanwhile.
     """
     _check_failures(outcome, run_folder)
     try:
-        return _write_run(
-            outcome, plan, workflow, run_folder, store, embed=embed, before_finish=before_finish
-        )
+        with kept_from_others(run_folder):
+            return _write_run(
+                outcome, plan, workflow, run_folder, store, embed=embed, before_finish=before_finish
+            )
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
         damaged = store.damaged_objects(needed)
@@ -314,8 +316,10 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         The run, with the new record.
 
     Raises:
-        InputError: an input file is missing or was changed.
-        StoreError: a product is in neither record nor store, or the disk refuses.
+        InputError: an input file is missing.
+        ChangedInputsError: an input file was changed.
+        ArgumentError: a product is in neither record nor store.
+        StoreError: the disk refuses.
         InvalidArgumentsError: `inputs` names no input of the workflow.
     """
     _check_products(run, store)
@@ -431,7 +435,7 @@ def _check_products(run: Run, store: Store) -> None:
         if not output.embedded and store.product_file(output.digest) is None
     ]
     if missing:
-        raise StoreError(
+        raise ArgumentError(
             f"neither the record {run.path} nor the store {store.folder} has "
             f"{first_few(missing)}: name the store of the run with --store, or replay the run"
         )
@@ -448,6 +452,8 @@ def _input_files(
     search = find_inputs(
         workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
     )
+    if search.is_changed:
+        raise ChangedInputsError(search.problems)
     if search.problems:
         raise MissingInputsError(search.problems)
     return {

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import pytest
 from orthoflow_provenance.verify import verify_record
 
-from orthoflow.errors import RecordError
+from orthoflow.engine.store import Store
+from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.records.runs import open_run
+from orthoflow.records.writing import write_embedded
 from tests.studios import Studio, open_copy, open_finished_studio
 
 
@@ -115,10 +118,58 @@ def test_every_figure_is_written_on_demand(studio: Studio) -> None:
     assert (refused.exit_code, "has no step 'nowhere'" in refused.stderr) == (2, True)
 
 
+def test_a_folder_that_is_taken_is_refused_before_inputs_are_looked_at(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def look(*_: object, **__: object) -> None:
+        raise AssertionError("too late")
+
+    monkeypatch.setattr("orthoflow.engine.plan.plan_run", look)
+    refused = studio("run", "studio.yaml", "-o", "first", "--input", "number=n.txt")
+    assert refused.exit_code == 2
+    assert refused.stderr == (
+        f"error: {studio.folder / 'first'} holds a finished run (run.h5); choose another folder "
+        "with -o (in Python: output=), or look at this one (orthoflow show, orthoflow.open_run)\n"
+    )
+
+
+def test_a_refused_export_of_a_record_alone_leaves_nothing(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = studio.folder / "alone"
+    alone.mkdir()
+    shutil.copyfile(studio.folder / "first" / "run.h5", alone / "run.h5")
+    monkeypatch.chdir(alone)
+    (studio.folder / "n.txt").unlink()
+    for command in (("export", "run.h5", "--embed"), ("replay", "run.h5")):
+        refused = studio(*command)
+        assert refused.exit_code == 2
+        assert "is not to be found; give it with --input number=PATH" in refused.stderr
+    assert [path.name for path in alone.iterdir()] == ["run.h5"]
+
+
+def test_products_that_nobody_has_are_named_and_no_store_is_made(studio: Studio) -> None:
+    run = open_run(studio.folder / "first")
+    survey, paint = run.record.cells
+    (port,) = paint.outputs
+    by_digest = replace(paint.outputs[port], embedded=False)
+    cells = (survey, replace(paint, outputs={port: by_digest}))
+    named = replace(run, record=replace(run.record, cells=cells))
+    store = Store(studio.folder / "none")
+    with pytest.raises(ArgumentError) as caught:
+        write_embedded(named, studio.folder / "whole.h5", store)
+    assert str(caught.value) == (
+        f"neither the record {run.path} nor the store {store.folder} has paint.{port}: name the "
+        "store of the run with --store, or replay the run"
+    )
+    assert not store.folder.exists()
+    assert not (studio.folder / "whole.h5").exists()
+
+
 def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     (studio.folder / "n.txt").write_text("1.6")
     refused = studio("export", "first", "--embed", "-o", "whole")
-    assert refused.exit_code == 2
+    assert refused.exit_code == 3
     assert "input number: n.txt is not the n.txt of the record: it was changed" in refused.stderr
     for words, sentence in (
         (("--to", "csv", "--embed"), "writes no record"),

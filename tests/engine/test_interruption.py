@@ -156,7 +156,7 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
     process = start_coordinator(world, STEPS.replace("steps: 6", "steps: 2000"), "run")
     try:
         wait_for(world, "run", "started", "second")
-        with pytest.raises(StoreError, match="is in use by another run; wait for its end"):
+        with pytest.raises(ArgumentError, match="is in use by another run; wait for its end"):
             world.run(STEPS)
         assert is_running(world.folder / "run")
         with pytest.raises(ArgumentError, match=r"holds no run\.h5 yet: its run is under"):

@@ -17,8 +17,10 @@ from orthoflow.engine.run_folder import (
     RunWent,
     cell_file_name,
     is_running,
+    kept_from_others,
     new_run_folder,
     new_run_id,
+    require_run_folder,
 )
 from orthoflow.errors import ArgumentError, RecordError, StoreError
 
@@ -85,9 +87,43 @@ def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
     assert is_running(tmp_path) is False
     with Journal(tmp_path / "run", "hall"):
         assert is_running(tmp_path / "run")
-        with pytest.raises(StoreError, match="is in use by another run; wait for its end, or"):
-            Journal(tmp_path / "run", "hall")
+        for refused in (Journal, require_run_folder):
+            with pytest.raises(ArgumentError, match="is in use by another run; wait for its end, "):
+                refused(tmp_path / "run", "hall")
     assert not is_running(tmp_path / "run")
+    require_run_folder(tmp_path / "run", "hall")
+    with pytest.raises(ArgumentError, match="holds an unfinished run of hall, not of court; choo"):
+        require_run_folder(tmp_path / "run", "court")
+
+
+def test_nobody_goes_on_with_a_run_while_what_came_out_is_written(tmp_path: Path) -> None:
+    with Journal(tmp_path / "run", "hall"):
+        pass
+    with kept_from_others(tmp_path / "run"):
+        assert is_running(tmp_path / "run")
+        with pytest.raises(ArgumentError, match="is in use by another run; wait for its end, or"):
+            Journal(tmp_path / "run", "hall")
+    with Journal(tmp_path / "run", "hall") as journal:
+        assert journal.is_resumed
+        with (
+            pytest.raises(ArgumentError, match="is in use by another run; wait for its end, or"),
+            kept_from_others(tmp_path / "run"),
+        ):
+            pass
+    # Of a folder without a journal there is nobody to keep out.
+    with kept_from_others(tmp_path / "new"):
+        assert not (tmp_path / "new").exists()
+
+
+def test_below_a_file_there_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    for place in (tmp_path / "notes.txt", tmp_path / "notes.txt" / "run"):
+        with pytest.raises(ArgumentError) as caught:
+            Journal(place, "hall")
+        assert str(caught.value) == (
+            f"{place} can be no folder, for {tmp_path / 'notes.txt'} is a file; choose another "
+            "folder with -o (in Python: output=)"
+        )
 
 
 def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: Path) -> None:

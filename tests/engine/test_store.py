@@ -282,6 +282,10 @@ def test_only_what_is_there_and_damaged_is_set_aside(store: Store) -> None:
     assert store._set_aside(folder, lambda: False) is False
     assert store._set_aside(folder.with_name("0" * 64), lambda: True) is False
     assert not store.damaged.exists()
+    # Who asks a store that is not there makes none.
+    nowhere = Store(store.folder.with_name("nowhere"))
+    assert nowhere._set_aside(object_folder(nowhere, ref), lambda: True) is False
+    assert not nowhere.folder.exists()
     assert store._set_aside(folder, lambda: True) is True
     assert not folder.exists()
     (aside,) = store.damaged.iterdir()

@@ -18,6 +18,7 @@ import pytest
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
+from orthoflow.engine.run_folder import is_running
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
@@ -118,6 +119,8 @@ def test_the_record_has_no_name_while_the_report_is_written(executed: Executed) 
         image = run.product("paint", "orthoimages")
         seen.append(((run.folder / "run.h5").exists(), len(image.images)))  # type: ignore[attr-defined]
         assert run.orthoimages[0].is_file()
+        # Nor does anybody else go on with the run meanwhile.
+        assert is_running(run.folder)
 
     executed.write(before_finish=look)
     assert seen == [(False, 1)]
