@@ -24,6 +24,7 @@ _COARSE: Final = {
         "raster.grid": {"gsd_m": 0.06, "n_walls_max": 1},
     }
 }
+_METRICS_MOST: Final = 4
 # What a detector says of its own planes (RMS) is good where it found but the easy ones.
 _JUDGED: Final = {
     "plane": ("true_planes_found", "label_iou_mean", "plane_angle_deg", "plane_offset_mm")
@@ -68,7 +69,10 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
     if not document:
         return ""
     document["name"] = f"compare-{name}"
-    document["compare"] = {"design": "product"}
+    # A pattern may have none that fits; a name is reported.
+    metrics = [one for one in sibling.load().metrics if one.isidentifier()][:_METRICS_MOST]
+    asked = {"metrics": [f"{kind}.{one}" for one in metrics]} if metrics else {}
+    document["compare"] = {"design": "product", **asked}
     return _dumped(document)
 
 

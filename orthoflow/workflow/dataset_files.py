@@ -11,7 +11,16 @@ from typing import Final, Generic
 
 from orthoflow.errors import WorkflowError
 from orthoflow.files.regular_files import open_file
-from orthoflow.files.yaml_positions import Entry, Position, Table, Text, Value, read_yaml
+from orthoflow.files.yaml_positions import (
+    Entry,
+    Position,
+    Table,
+    Text,
+    Value,
+    describe,
+    plain,
+    read_yaml,
+)
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import TEXT, Found, Schema, Shape
 
@@ -31,6 +40,7 @@ class TableOr(Generic[Found]):
     """A CSV file, or what it stands for."""
 
     other: Shape[Found]
+    example: str
 
     @property
     def words(self) -> str:
@@ -43,8 +53,16 @@ class TableOr(Generic[Found]):
 
     def read(self, value: Value, path: str, log: ProblemLog) -> str | Found | None:
         """Take the name of the file, which nobody has looked for yet, or the rest."""
-        shape: Shape[str | Found] = TEXT if isinstance(value, Text) else self.other
-        return shape.read(value, path, log)
+        if isinstance(value, Table):
+            return self.other.read(value, path, log)
+        if isinstance(value, Text) and isinstance(plain(value), str):
+            return TEXT.read(value, path, log)
+        log.add(
+            value.position,
+            path,
+            f"expected {self.words}, as in {self.example}, got {describe(value)}",
+        )
+        return None
 
 
 def read_text(path: Path) -> str:

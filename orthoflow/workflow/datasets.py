@@ -17,6 +17,7 @@ from orthoflow.files.yaml_positions import (
     Table,
     Text,
     Value,
+    describe,
     join,
     plain,
 )
@@ -144,6 +145,14 @@ class _OneFile:
     def dataset(self, entry: Entry) -> Dataset:
         """Read one dataset."""
         here = join(self.path, entry.key)
+        if not isinstance(entry.value, Table):
+            form = f"{{{next(iter(self.reader.inputs), 'scan')}: FILE}}"
+            self.log.add(
+                entry.value.position,
+                here,
+                f"expected what the dataset gives, as in {form}, got {describe(entry.value)}",
+            )
+            return Dataset(name=entry.key)
         table = DATASET.read(entry.value, here, self.log)
         if table is None:
             return Dataset(name=entry.key)

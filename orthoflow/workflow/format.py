@@ -427,7 +427,7 @@ NAMED_DATASETS: Final = Named(
 )
 DATASETS: Final[Key[str | tuple[Entry, ...]]] = Key(
     name="datasets",
-    shape=TableOr(NAMED_DATASETS),
+    shape=TableOr(other=NAMED_DATASETS, example="{hall: {scan: hall.e57}}"),
     meaning="What the workflow runs on, one after the other; the runs are one comparison.",
     example="{hall: {scan: data/hall.e57}, stairs: {scan: data/stairs.e57}}",
     default="the workflow runs once, on its inputs",

@@ -101,7 +101,10 @@ def test_what_a_recipe_does_not_give_installed_methods_make_of_it(catalog: Catal
         "orient": {"ties": "match.ties", "photos": "room.photos"},
     }
     assert steps["colour"]["in"]["cameras"] == "orient.cameras"
-    assert found["compare"] == {"design": "product"}
+    # What its sibling says of itself, and no pattern of names.
+    assert found["compare"]["design"] == "product"
+    metrics = catalog.method("colour.photos").load().metrics
+    assert found["compare"]["metrics"] == [f"colour.{one}" for one in metrics[:4]]
 
 
 def test_what_no_recipe_gives_is_compared_in_none(catalog: Catalog) -> None:

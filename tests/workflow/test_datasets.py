@@ -268,7 +268,24 @@ MAPPINGS = {
     ),
     "a list": (
         "datasets: [hall]",
-        "rooms.yaml:18:11: datasets: expected a mapping, got a list",
+        (
+            "rooms.yaml:18:11: datasets: expected a CSV file, or a mapping from names to datasets, "
+            "as in {hall: {scan: hall.e57}}, got a list"
+        ),
+    ),
+    "a number": (
+        "datasets: 5",
+        (
+            "rooms.yaml:18:11: datasets: expected a CSV file, or a mapping from names to datasets, "
+            "as in {hall: {scan: hall.e57}}, got 5"
+        ),
+    ),
+    "a file alone": (
+        "datasets: {hall: hall.e57}",
+        (
+            "rooms.yaml:18:18: datasets.hall: expected what the dataset gives, as in {scan: FILE}, "
+            'got the text "hall.e57"'
+        ),
     ),
     "there twice": (
         "datasets: {a: {}, a: {}}",
