@@ -156,7 +156,7 @@ class StepContext:
         except (TypeError, ValueError, OverflowError) as error:
             raise ProductError(f"metric {name} must be a number: {one_line(error)}") from error
         if not math.isfinite(number):
-            raise ProductError(f"metric {name} must be finite, got {number}")
+            raise ProductError(f"metric {name} must be finite, got {number}: leave it out instead")
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
     @_names_the_line

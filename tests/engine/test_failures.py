@@ -99,7 +99,7 @@ RAISED = {
         f"method work.wrong_out {TOYS} must return its Out, got Numbers",
         1,
     ),
-    "bad_param": ("ProductError", "metric nan must be finite, got nan", 1),
+    "bad_param": ("ProductError", "metric nan must be finite, got nan: leave it out instead", 1),
     "leave": (
         "MethodError",
         f"method work.leave {TOYS} tried to end the program (bye)",

@@ -289,7 +289,7 @@ STOPPED: dict[str, tuple[str, str, str]] = {
     ),
     "wrong_metric": (
         "outputs-are-valid",
-        r"what the method makes is not valid: metric height must be finite, got nan \(floors.*\)",
+        r"what the method makes is not valid: metric height must be finite, got nan.* \(floors.*\)",
         """
         def listen(self, ctx):
             ctx.metric("height", float("nan"), "m")
