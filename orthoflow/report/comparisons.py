@@ -12,13 +12,19 @@ from typing import Final, TypeAlias
 from orthoflow.records import COSTS
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
+from orthoflow.report.combinations import (
+    Combination,
+    Measured,
+    combinations_of,
+    is_missing,
+    wanted_metrics,
+)
 from orthoflow.report.environments import alike_environments
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
-from orthoflow.workflow.cells import variants_text
+from orthoflow.workflow.cells import NOT_ASKED_FOR, variants_text
 from orthoflow.workflow.format import DATA
 
 _NOTHING: Final = "-"
@@ -417,12 +423,22 @@ def _value(measured: Measured | None, one: Combination, origins: Origins, column
 
 def _absent(one: Combination, origins: Origins, column: Column) -> Value:
     """What stands where there is no number: nothing was found, or nobody asked."""
-    asked = [cell for cell in one.cells if cell.step == column.step and cell.status != "skipped"]
-    if one.failure is not None:
-        asked.append(one.failure)
+    own = [cell for cell in one.cells if cell.step == column.step]
+    asked = [
+        cell
+        for cell in own
+        if not is_missing(cell) and not cell.error_message.startswith(NOT_ASKED_FOR)
+    ]
+    if one.failure is not None and (asked or not own):
+        # Of another run the step may be, and not of this one.
+        asked = [one.failure] if _has_step(one.run, column.step) else []
     if not asked:
         return Value()
     return Value(group=origins.letters(one, asked[0].environment), found_nothing=True)
+
+
+def _has_step(run: Run, step: str) -> bool:
+    return any(cell.step == step for cell in run.record.cells)
 
 
 def _remark(one: Combination) -> str:

@@ -571,10 +571,25 @@ def test_a_value_says_what_it_is_the_mean_of(
     [
         ((cell("plane"), cell("check")), True),
         ((cell("plane", status="failed"), cell("check", status="skipped")), True),
-        ((cell("plane"), cell("check", status="skipped", error_message="not given")), False),
+        (
+            (
+                cell("plane"),
+                cell("check", status="skipped", error_message="only with the input other"),
+            ),
+            False,
+        ),
+        ((cell("plane"), cell("check", status="skipped", error_message=NOT_YET)), False),
         ((cell("plane"),), False),
+        ((cell("plane", status="failed"),), False),
     ],
-    ids=["nothing found", "failed before", "not asked for", "no such step"],
+    ids=[
+        "nothing found",
+        "failed before",
+        "not asked for",
+        "broken off",
+        "no such step",
+        "no such step, and failed",
+    ],
 )
 def test_who_was_asked_for_a_number_and_has_none_found_nothing(
     cells: tuple[RecordedCell, ...], found_nothing: bool
