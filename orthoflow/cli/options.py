@@ -35,7 +35,7 @@ class Changes:
         """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
         from orthoflow.workflow.document import load_workflow
 
-        return load_workflow(workflow, catalog, **vars(self))
+        return load_workflow(workflow, catalog, also_files=True, **vars(self))
 
 
 def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:

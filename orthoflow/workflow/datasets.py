@@ -213,10 +213,13 @@ class _OneFile:
             for variant in step.variants:
                 name = CallName(step=step.name, variant=variant.call.name)
                 call = reader.calls.get((name.step, name.variant))
-                if name not in assigned or call is None:
+                if name not in assigned:
                     continue
                 overrides = (*assigned[name], *reader.overrides.get(name, ()))
-                params = resolve_params(variant, overrides, self.log, blame)
+                # Of a call with mistakes of its own, those are told at their places, and once.
+                params = resolve_params(variant, overrides, self.log, blame if call else None)
+                if call is None:
+                    continue
                 calls[name.step, name.variant] = replace(
                     call, params=params.resolved, params_set=params.as_set
                 )

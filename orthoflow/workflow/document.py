@@ -29,6 +29,7 @@ from orthoflow.workflow.format import (
     WorkflowStep,
 )
 from orthoflow.workflow.inputs import (
+    add_missing_inputs,
     check_shared_inputs,
     override_inputs,
     read_input_options,
@@ -51,7 +52,7 @@ from orthoflow.workflow.wiring import check_wiring
 MOST_BYTES: Final = 400_000
 
 
-def load_workflow(
+def load_workflow(  # noqa: PLR0913 - an argument for each option of the command line
     name_or_path: str | Path,
     catalog: Catalog,
     *,
@@ -60,6 +61,7 @@ def load_workflow(
     datasets: str | Mapping[str, JsonValue] = "",
     only_data: Sequence[str] = (),
     set_files: Sequence[str | Path] = (),
+    also_files: bool = False,
 ) -> Workflow:
     """Read and check a workflow.
 
@@ -73,6 +75,7 @@ def load_workflow(
         only_data: names of datasets, each as behind `--only-data`.
         set_files: YAML files of `step.parameter: value`, as behind `--set-file`; what stands
             behind `--set` goes before them.
+        also_files: of a file with problems, input files that are missing are told with them.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
@@ -100,6 +103,9 @@ def load_workflow(
     )
     reader = _Reader(path=path, source=source, catalog=catalog, log=log, options=options)
     workflow = reader.read(table)
+    if also_files and log.has_any:
+        # Else they are looked for by who needs them.
+        add_missing_inputs(workflow, log)
     log.raise_any()
     return workflow
 

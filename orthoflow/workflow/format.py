@@ -17,6 +17,7 @@ from typing import Final, Literal
 from orthoflow.files.yaml_positions import Entry
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.dataset_files import TableOr
+from orthoflow.workflow.problems import Problem
 from orthoflow.workflow.shapes import (
     ASSIGNMENT,
     FLAG,
@@ -95,7 +96,7 @@ class WorkflowInputSpec:
     folder: Path = Path()
     is_given: bool = False
     said_in: str = ""
-    place: str = field(default="", compare=False)
+    place: Problem | None = field(default=None, compare=False)
 
 
 # Steps --------------------------------------------------------------------------------------------

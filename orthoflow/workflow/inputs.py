@@ -54,7 +54,7 @@ def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, Workfl
             files=(FILES.read(table, path, log) or ()) if table else (),
             optional=bool(table and OPTIONAL.read(table, path, log)),
             folder=folder,
-            place=log.place(named.value.position, join(path, FILES.name)) if named else "",
+            place=log.place(named.value.position, join(path, FILES.name)) if named else None,
         )
     return specs
 
@@ -156,6 +156,16 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
     return found
 
 
+def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
+    """Add to the problems of a workflow the inputs whose files are missing."""
+    for spec in workflow.input_specs.values():
+        try:
+            _resolve(spec)
+        except InputError as error:
+            place = _place(spec)
+            log.add_input(spec.place if place else None, str(error).removeprefix(place))
+
+
 def present_inputs(workflow: Workflow) -> frozenset[str]:
     """Names of the inputs that are there; those that are not optional always count as there."""
     return frozenset(
@@ -210,9 +220,12 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     else:
         files, missing = [], f"there is no file {pattern}{where}{_meant(path)}"
     if not files:
-        place = "" if spec.is_given else spec.place
-        raise InputError(f"{place}input {spec.name}: {missing}")
+        raise InputError(f"{_place(spec)}input {spec.name}: {missing}")
     return [item.absolute() for item in files]
+
+
+def _place(spec: WorkflowInputSpec) -> str:
+    return spec.place.place if spec.place and not spec.is_given else ""
 
 
 def _meant(path: Path) -> str:

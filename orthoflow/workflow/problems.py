@@ -92,6 +92,7 @@ class ProblemLog:
     lines: tuple[str, ...] = ()
     _in_file: list[Problem] = field(default_factory=list)
     _in_plugins: list[Problem] = field(default_factory=list)
+    _in_inputs: list[Problem] = field(default_factory=list)
     _in_options: list[Problem] = field(default_factory=list)
 
     def add(self, position: Position, path: str, message: str) -> None:
@@ -118,13 +119,21 @@ class ProblemLog:
         """Whether there is a problem."""
         return bool(self._in_file or self._in_plugins or self._in_options)
 
-    def place(self, position: Position, path: str) -> str:
-        """Say where something stands, as problems begin; empty of what comes from no file."""
-        return self._at(position, path, "").place if position.line else ""
+    def place(self, position: Position, path: str) -> Problem | None:
+        """Give a problem of something without its message; None of what comes from no file."""
+        return self._at(position, path, "") if position.line else None
 
     def add_plugin(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of a plugin that the file needs here."""
-        self._in_plugins.append(self._at(position, path, message))
+        problem = self._at(position, path, message)
+        if problem not in self._in_plugins:
+            self._in_plugins.append(problem)
+
+    def add_input(self, place: Problem | None, message: str) -> None:
+        """Keep a problem of input files, named at a place; what is wrong besides says its kind."""
+        nowhere = Problem(file=self.file, line=0, column=0, path="", message="")
+        if len(self._in_inputs) < MOST_PROBLEMS:
+            self._in_inputs.append(replace(place or nowhere, message=message))
 
     def add_option(self, option: str, message: str) -> None:
         """Keep a problem of a command-line option, e.g. `--set wall.gsd_m=0`."""
@@ -145,7 +154,7 @@ class ProblemLog:
 
     def _raise(self) -> NoReturn:
         in_order = sorted(
-            self._in_file + self._in_plugins,
+            self._in_file + self._in_plugins + self._in_inputs,
             key=lambda problem: (problem.file, problem.line, problem.column),
         )
         everything = tuple(in_order + self._in_options)

@@ -14,6 +14,7 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.doubts import doubts_about
 from orthoflow.workflow.format import Workflow
 from orthoflow.workflow.inputs import resolve_input_files
+from orthoflow.workflow.problems import InvalidWorkflowError
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 ROOMS = """\
@@ -35,6 +36,17 @@ steps:
   wall: {use: raster.grid, in: {cloud: [cloud.cloud, room.cloud], planes: plane.planes}}
   ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
 """
+MISTAKEN = """\
+orthoflow: 1
+inputs:
+  scan: {files: hall.e57}
+steps:
+  cloud: {use: read.scan, in: {files: inputs.scan}, params: {unit: parsec}}
+  plane: {use: plane.hough2d, in: {cloud: cloud.cloud}, params: {tolerance_m: -1}}
+datasets:
+  hall: {set: {plane.cell_m: -3}}
+  lost: {scan: lost.e57, set: {plane.tolerance_m: x}}
+"""
 TWO = "datasets: {hall: {scan: hall.e57}, stairs: {scan: stairs.e57}}\n"
 
 
@@ -45,6 +57,24 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("shared.jpg", "hall.e57", "stairs.e57", "attic.e57"):
         (tmp_path / name).write_text(name)
     return tmp_path
+
+
+def test_mistakes_of_steps_and_of_datasets_and_missing_files_are_told_in_one_pass(
+    folder: Path, catalog: Catalog
+) -> None:
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load(MISTAKEN, catalog, also_files=True)
+    assert [(problem.line, problem.path) for problem in caught.value.problems] == [
+        (5, "steps.cloud.params.unit"),
+        (6, "steps.plane.params.tolerance_m"),
+        (8, "datasets.hall.set.plane.cell_m"),
+        (9, "datasets.lost.scan"),
+        (9, "datasets.lost.set.plane.tolerance_m"),
+    ]
+    assert caught.value.problems[3].message == (
+        f"input scan@lost: there is no file lost.e57 beside the workflow ({folder / 'lost.e57'}) "
+        "(did you mean stairs.e57?)"
+    )
 
 
 def load(text: str, catalog: Catalog, **options: object) -> Workflow:
