@@ -1,4 +1,4 @@
-"""What is told of rastered walls: numbers, a picture, and what limits them."""
+"""What is told of rastered walls: numbers, and what limits them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import encode_webp
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import SurfaceMask, Wall
@@ -18,7 +17,6 @@ from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
-_LONGEST_PX: Final = 1400
 # Causes of empty cells are told in words where so many of a wall are.
 _EMPTY_WORTH_WORDS: Final = 0.1
 # Where a cell that has points has so many, no cell is empty for want of larger ones.
@@ -80,7 +78,7 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
 
 
 def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
-    """Tell in numbers what the walls hold, and draw the first."""
+    """Tell in numbers what the walls hold."""
     walls = [raster.wall for raster in rasters]
     n_cells = sum(wall.mask.size for wall in walls)
     counts = [_sampled(wall.count) for wall in walls]
@@ -100,12 +98,6 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
     for state in SurfaceMask:
         share = sum(count_cells(wall.mask, state) for wall in walls) / n_cells
         ctx.metric(f"{state.name.lower()}_share", share, "1")
-    ctx.figure(
-        "depth",
-        _depth_preview(walls[0]),
-        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void. Relief has "
-        "sharp edges; stripes or steps on an even wall come from scans that do not fit each other.",
-    )
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
@@ -158,19 +150,3 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
     """Rows of a raster, all of them unless it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]
-
-
-def _depth_preview(wall: Wall) -> bytes:
-    """Picture of a wall's depth: its inner 98 % spread over a colour scale, void in grey."""
-    import cv2
-
-    step = max(1, -(-max(wall.mask.shape) // _LONGEST_PX))
-    depth, mask = wall.depth_m[::step, ::step], wall.mask[::step, ::step]
-    is_void = mask == SurfaceMask.VOID
-    known = depth[~is_void]
-    low, high = np.percentile(known, [1.0, 99.0]) if known.size else (0.0, 1.0)
-    scaled = (np.nan_to_num(depth) - low) / max(high - low, 1e-6)
-    levels = np.clip(255.0 * scaled, 0.0, 255.0).astype(np.uint8)
-    picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
-    picture[is_void] = 128
-    return encode_webp(np.asarray(picture, dtype=np.uint8)[:, :, ::-1])

@@ -1,4 +1,4 @@
-"""What is told of rastered walls: metrics by hand, warnings in full, and the picture of a depth."""
+"""What is told of rastered walls: metrics by hand, and warnings in full."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from orthoflow_plugins.raster import reporting
 from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
-from orthoflow.files.images import decode_image
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext, StepEvent
 from tests import samples
@@ -80,8 +79,6 @@ def test_walls_are_told_in_numbers(listener: Listener) -> None:
         "measured_share": 0.6,
         "recovered_share": 0.1,
     }
-    [figure] = listener.context.figures
-    assert figure.name == "depth"
 
 
 def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
@@ -213,24 +210,6 @@ def test_rounded_shares_of_empty_cells_add_up(listener: Listener) -> None:
     [said] = listener.warnings
     shares = [int(text) for text in re.findall(r"(\d+)%", said)]
     assert shares[0] == sum(shares[1:]) == 35
-
-
-def test_a_picture_of_a_depth_is_grey_where_it_is_void_and_spreads_the_rest() -> None:
-    of = wall([[1] * 200] * 100)
-    of.depth_m[:] = np.linspace(-0.1, 0.1, 200, dtype=np.float32)
-    of.mask[:50, 100:] = SurfaceMask.VOID
-    picture = decode_image(reporting._depth_preview(of)).astype(float)
-    assert picture.shape == (100, 200, 3)
-    np.testing.assert_allclose(picture[4:46, 110:190], 128.0, atol=6.0)
-    # Viridis goes from dark violet to yellow.
-    np.testing.assert_allclose(picture[80, 2], [68, 1, 84], atol=25.0)
-    np.testing.assert_allclose(picture[80, 197], [253, 231, 37], atol=25.0)
-
-
-@pytest.mark.parametrize(("side", "shown"), [(1400, 1400), (1401, 701), (4300, 1075)])
-def test_pictures_of_large_walls_have_some_of_their_rows_and_columns(side: int, shown: int) -> None:
-    of = wall([[1] * side] * 3)
-    assert decode_image(reporting._depth_preview(of)).shape[1] == shown
 
 
 def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
