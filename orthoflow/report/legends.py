@@ -66,7 +66,9 @@ def depth_gradient(colours: Sequence[Sequence[float]]) -> str:
 
 
 def depth_bar(limit_m: float) -> str:
-    """Draw which colour stands for which depth as an `<svg>` element as wide as the picture.
+    """Draw which colour stands for which depth as an `<svg>` element.
+
+    It is as wide as the picture, or as its own words.
 
     Args:
         limit_m: depth of the last colour, metres; the first stands for as much behind the plane.
@@ -82,7 +84,7 @@ def depth_bar(limit_m: float) -> str:
         )
     )
     return (
-        f'<svg class="legend" width="100%" height="32" role="img" aria-label="{label}">'
+        f'<svg class="legend depths" width="100%" height="32" role="img" aria-label="{label}">'
         f'<rect x="0" y="2" width="100%" height="11" fill="url(#{_GRADIENT})" class="frame"/>'
         f"{ticks}</svg>"
     )

@@ -19,6 +19,12 @@ from tests.browser import PROGRAM, BrowserError, Page, browser
 from tests.report_runs import HeldRun, cell, compared_run, metrics, record
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
+# Few combinations stand beside each other where their row would be cut.
+AS_ROWS = (
+    "if (document.querySelector('[data-chooser] .turned'))"
+    " document.querySelector('.chooser button').click()"
+)
+VIEWER = "document.getElementById('viewer')"
 ROWS = "[...document.querySelectorAll('[data-chooser] tbody tr')]"
 
 
@@ -56,6 +62,7 @@ def test_every_picture_shows_and_says_what_it_is(page: Page) -> None:
 def test_headings_sort_the_table_by_mouse_and_keyboard(page: Page) -> None:
     names = f"{ROWS}.map(row => row.cells[0].innerText.split(' ')[0])"
     heading = "document.querySelectorAll('[data-chooser] th[data-sort]')[1]"
+    page.evaluate(AS_ROWS)
     assert page.evaluate(names) == ["fine", "coarse", "broken"]
     page.evaluate(f"{heading}.querySelector('button').click()")
     assert page.evaluate(f"{heading}.getAttribute('aria-sort')") == "ascending"
@@ -68,6 +75,7 @@ def test_headings_sort_the_table_by_mouse_and_keyboard(page: Page) -> None:
 
 
 def test_a_failed_combination_stands_in_its_row_with_the_reason(page: Page) -> None:
+    page.evaluate(AS_ROWS)
     text = page.evaluate(f"{ROWS}.find(row => row.matches('.failed-row')).innerText")
     assert "no plane & no <wall>" in text
 
@@ -113,6 +121,38 @@ def test_pictures_of_few_cells_are_shown_large_and_in_their_form(page: Page) -> 
             assert max(columns, rows) < 640
             assert wide > columns
             assert wide / high == pytest.approx(columns / rows, rel=0.02)
+
+
+def test_the_bar_of_the_scale_is_as_long_as_it_says_below_narrow_pictures_too(page: Page) -> None:
+    measured = page.evaluate(
+        "[...document.querySelectorAll('figure[data-width-m]')].flatMap(figure => [1, 0.1]"
+        ".map(part => { const image = figure.querySelector('img'), was = image.style.cssText;"
+        " const bar = figure.querySelector('.legend .ink');"
+        " image.style.width = part * image.clientWidth + 'px';"
+        " const [shown, long] = [image, bar].map(one => one.getBoundingClientRect().width);"
+        " image.style.cssText = was;"
+        " return [long / shown * figure.dataset.widthM, bar.closest('svg').ariaLabel]; }))"
+    )
+    assert len(measured) > 8
+    for length_m, label in measured:
+        number, unit = label.removeprefix("scale: the bar is ").split()
+        said_m = float(number) * {"m": 1.0, "cm": 0.01}[unit]
+        assert length_m == pytest.approx(said_m, rel=0.01), label
+
+
+def test_colours_of_depth_are_told_in_the_enlarged_view_too(page: Page) -> None:
+    page.show_as(1440)
+    told = f"{VIEWER}.querySelectorAll('[data-part=colours] .depths').length"
+    is_depth = {}
+    for kind in ("orthoimage", "depth"):
+        figure = (
+            "[...document.querySelectorAll('figure.raster')].find(figure =>"
+            f" !!figure.querySelector('.depths') === {str(kind == 'depth').lower()})"
+        )
+        page.evaluate(f"{figure}.querySelector('.enlarge').click()")
+        is_depth[kind] = page.evaluate(told)
+        page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
+    assert is_depth == {"orthoimage": 0, "depth": 1}
 
 
 def test_a_failure_is_told_once_before_the_tables_and_the_baseline_is_named(page: Page) -> None:
@@ -304,9 +344,6 @@ def test_the_first_screen_of_a_phone_shows_picture_and_accuracy(page: Page) -> N
     assert max(bottoms) <= 844
 
 
-VIEWER = "document.getElementById('viewer')"
-
-
 def test_pictures_open_large_and_the_arrow_keys_lead_on(page: Page) -> None:
     page.show_as(1440)
     page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
@@ -394,6 +431,7 @@ def test_the_slider_remembers_what_was_compared(page: Page) -> None:
 
 def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> None:
     bar = "document.querySelector('.chooser')"
+    page.evaluate(AS_ROWS)
     page.evaluate(
         f"(() => {{ const filter = {bar}.querySelector('input[type=search]');"
         " filter.value = 'coarse'; filter.dispatchEvent(new Event('input')); })()"
@@ -414,10 +452,57 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
     assert not any("points to the first plane" in name for name in names)
 
 
+def test_few_combinations_stand_beside_each_other_where_their_row_would_be_cut(page: Page) -> None:
+    region = "document.querySelector('[data-chooser]')"
+    is_turned, is_cut = (
+        f"!!{region}.querySelector('.turned')",
+        f"{region}.scrollWidth > {region}.clientWidth",
+    )
+    seen = {}
+    for width in (1440, 700, 390):
+        page.show_as(width)
+        page.open(Path(page.evaluate("location.pathname")))
+        seen[width] = (page.evaluate(is_turned), page.evaluate(is_cut))
+    page.show_as(1440)
+    page.open(Path(page.evaluate("location.pathname")))
+    assert seen[700] == (True, False)
+    assert seen[390][0]
+    assert not seen[1440][1]
+
+
+def test_of_many_columns_as_many_stand_as_fit_and_all_are_a_click_away(
+    page: Page, tmp_path: Path
+) -> None:
+    was = page.evaluate("location.pathname")
+    text = Path(was).read_text(encoding="utf-8")
+    # Rows of their own for eight combinations, and each metric's column four times.
+    told = re.search(r'data-chooser="either">.*?</table>', text, re.DOTALL)
+    assert told is not None
+    table = re.sub(r"(<th[^>]* data-name=.*?</th>)", r"\1" * 4, told[0], flags=re.DOTALL)
+    table = re.sub(r'(<td class="n.*?</td>)', r"\1" * 4, table, flags=re.DOTALL)
+    head, body = table.split("<tbody>")
+    rows, end = body.split("</tbody>")
+    wide = tmp_path / "wide.html"
+    wide.write_text(text.replace(told[0], f"{head}<tbody>{rows * 3}</tbody>{end}"))
+    page.show_as(1440)
+    page.open(wide)
+    region = "document.querySelector('[data-chooser]')"
+    shown = f"[...{region}.querySelectorAll('th[data-name]')].filter(one => !one.hidden).length"
+    is_cut = f"{region}.scrollWidth > {region}.clientWidth"
+    n_all = page.evaluate(f"{region}.querySelectorAll('th[data-name]').length")
+    assert n_all > 30
+    assert 3 <= page.evaluate(shown) < n_all
+    assert not page.evaluate(is_cut)
+    page.evaluate("document.querySelectorAll('.chooser button')[1].click()")
+    assert page.evaluate(shown) == n_all
+    page.open(Path(was))
+
+
 def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
     page.open(Path(page.evaluate("location.pathname")))
     way = "document.querySelector('.way')"
     assert not page.evaluate(f"{way}.open")
+    assert page.evaluate("!!document.querySelector('[data-chooser] .turned a')")
     page.evaluate(f"document.querySelector('a[href=\"#' + {way}.id + '\"]').click()")
     page.evaluate("new Promise(done => setTimeout(done, 50))")
     assert page.evaluate(f"{way}.open")
@@ -462,6 +547,8 @@ def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
     )
     assert wide
     assert max(wide) <= 6
+    least = "getComputedStyle(document.querySelector('.on-paper .remark')).minWidth"
+    assert float(page.evaluate(least).removesuffix("px")) <= 100  # five of them fit a sheet
     page.evaluate("window.dispatchEvent(new Event('afterprint'))")
     assert page.evaluate("document.querySelectorAll('.warnings details[open]').length") == 0
     assert page.evaluate("document.querySelectorAll('.on-paper').length") == 0

@@ -57,13 +57,12 @@
   }
 
   // Wide tables: columns are chosen, rows filtered, and metrics stand as rows where there are few combinations.
-  const MANY = 9, FEW_ROWS = 6;
+  const MANY = 9, LEAST = 3, FEW_ROWS = 6;
   const isShown = (element) => !element.hidden;
   // A table of the same places with columns as rows, so many combinations beside each other.
   const turned = (table, most) => {
     const bodyRows = [...table.tBodies[0].rows].filter(isShown);
     const headings = [...table.tHead.rows[0].cells].filter(isShown);
-    const named = bodyRows.map((row) => [...row.cells].slice(0, table.dataset.names).map((place) => place.textContent.trim()));
     const blocks = [];
     for (let start = 0; start < bodyRows.length; start += most) {
       const block = document.createElement("table");
@@ -73,13 +72,15 @@
       corner.scope = "col";
       corner.textContent = "what";
       top.append(corner);
-      bodyRows.slice(start, start + most).forEach((_, index) => {
+      for (const from of bodyRows.slice(start, start + most)) {
         const heading = document.createElement("th");
         heading.scope = "col";
         heading.className = "n";
-        heading.textContent = named[start + index].filter((name) => name !== "-").join(", ");
+        const names = [...from.cells].slice(0, table.dataset.names).filter((place) => place.textContent.trim() !== "-");
+        // With the links that lead from a name to what stands behind it.
+        names.forEach((place, index) => heading.append(index ? ", " : "", ...place.cloneNode(true).childNodes));
         top.append(heading);
-      });
+      }
       const body = block.createTBody();
       for (const heading of headings.slice(Number(table.dataset.names))) {
         const row = body.insertRow();
@@ -126,15 +127,21 @@
     const judging = optional.map((heading) => "key" in heading.dataset);
     // Where few of them judge quality, those that the workflow names first.
     const keys = judging.filter(Boolean).length < 4 ? optional.map((_, index) => index < MANY) : judging;
-    let isTurned = region.dataset.chooser === "either" && optional.length > MANY && table.tBodies[0].rows.length <= FEW_ROWS;
-    // Of many columns those that judge quality come first; all are one click away.
-    if (!isTurned && optional.length > MANY && keys.some(Boolean)) {
-      boxes.forEach((box, index) => { box.checked = keys[index]; });
+    const isMuch = optional.length > MANY || region.scrollWidth > region.clientWidth;
+    let isTurned = region.dataset.chooser === "either" && isMuch && table.tBodies[0].rows.length <= FEW_ROWS;
+    // Of more than fits those that judge quality come first; all are one click away.
+    const hide = (index) => {
+      for (const row of table.rows) row.cells[optional[index].cellIndex].hidden = !boxes[index].checked;
+    };
+    if (!isTurned && isMuch && keys.some(Boolean)) {
+      boxes.forEach((box, index) => { box.checked = keys[index]; hide(index); });
+      for (let last; region.scrollWidth > region.clientWidth && keys.filter(Boolean).length > LEAST; hide(last)) {
+        last = keys.lastIndexOf(true);
+        boxes[last].checked = keys[last] = false;
+      }
     }
     const draw = () => {
-      optional.forEach((heading, index) => {
-        for (const row of table.rows) row.cells[heading.cellIndex].hidden = !boxes[index].checked;
-      });
+      optional.forEach((_, index) => hide(index));
       for (const row of table.tBodies[0].rows) {
         row.hidden = !row.textContent.toLowerCase().includes(filter.value.trim().toLowerCase());
       }
@@ -464,6 +471,7 @@
     view.readout.textContent = isPointed ? "move for coordinates, click to collect a point" : "";
     view.readout.parentElement.hidden = !isPointed;
     view.stage.style.cursor = isPointed ? "crosshair" : "";
+    view.colours.replaceChildren(...[...picture.querySelectorAll(":scope > .depths")].map((bar) => bar.cloneNode(true)));
     const file = figure.querySelector("a.file");
     view.file.replaceChildren(...(file ? [Object.assign(file.cloneNode(), { textContent: "open the file" })] : []));
     if (!viewer.open) viewer.showModal();
