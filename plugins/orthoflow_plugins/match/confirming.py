@@ -79,13 +79,14 @@ def confirmed(
 
     Args:
         photos: all photos.
-        places: by index of a photo that key points did not recognise, where it may be.
-        recognised: by index, the pairs of the other photos.
+        places: by index of a photo that key points did not recognise clearly, where it may be.
+        recognised: by index, the pairs of photos that they did recognise; of some in `places`, too,
+            as key points may agree by chance.
         walls: all walls.
         cores: photos are compared by so many threads.
 
     Returns:
-        By index of a photo, the place.
+        By index of a photo, the place by structure; not of photos whose key points are confirmed.
     """
     if not any(places.values()):
         return {}
@@ -253,9 +254,11 @@ def _chosen(laid: Sequence[_Laid], agreeing: Sequence[tuple[int, int]]) -> dict[
         if not _is_enough(laid, members):
             continue
         by_photo: dict[int, Placed] = {}
+        recognised = {laid[member].photo for member in members if laid[member].placed is None}
         for member in members:
             placed = laid[member].placed
-            if placed is None:
+            # Key points that others confirm need no structure.
+            if placed is None or laid[member].photo in recognised:
                 continue
             rival = by_photo.get(laid[member].photo)
             if rival is None or placed.share > rival.share:

@@ -29,10 +29,11 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 }
 """By name, weights of red, green and blue, in the order in which they are tried."""
 
-# Measured in rooms of inverted contrast: up to 15 matches agreed on a wrong place. A mixture that
-# recognises a wall needs more, as there are several of them; from so many on, no other is tried.
+# Measured in rooms of inverted contrast: up to 15 matches agreed on a wrong place, and once 19. A
+# mixture that recognises a wall needs more than 15, as there are several of them.
 LEAST: Final = 16
-_CLEARLY: Final = 24
+# From so many on, neither another mixture is tried nor structure.
+CLEARLY: Final = 24
 # A mixture is there to find the place, not to measure it.
 _LONGEST_SIDE_PX: Final = 2000
 # A photo without colours has but one mixture.
@@ -53,7 +54,7 @@ def pair_in_colours(
         What most key points agree in, grey where no mixture has more.
     """
     best = pair_photo(photo_grey(photo), walls, rule)
-    if best.n_recognised >= _CLEARLY:
+    if best.n_recognised >= CLEARLY:
         return best
     smaller = replace(rule, longest_side_px=min(rule.longest_side_px, _LONGEST_SIDE_PX))
     rgb = photo_rgb(photo)
@@ -64,7 +65,7 @@ def pair_in_colours(
         tried = pair_photo(picture, walls, smaller)
         if not tried.is_mirrored and tried.n_recognised >= max(LEAST, best.n_recognised + 1):
             best = replace(tried, picture=name)
-        if best.n_recognised >= _CLEARLY:
+        if best.n_recognised >= CLEARLY:
             break
     return best
 

@@ -18,7 +18,7 @@ from orthoflow_plugins.match.hand_ties import (
     ties_by_hand_alone,
     with_ties_by_hand,
 )
-from orthoflow_plugins.match.mixtures import LEAST, pair_in_colours
+from orthoflow_plugins.match.mixtures import CLEARLY, LEAST, pair_in_colours
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import (
@@ -60,7 +60,7 @@ class MatchSift(Method):
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 8
+    result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -261,7 +261,7 @@ def _placed(
     unclear = [
         index
         for index, pairs in enumerate(paired)
-        if not pairs.is_mirrored and pairs.n_recognised < LEAST
+        if not pairs.is_mirrored and pairs.n_recognised < CLEARLY
     ]
     # A photo alone has nobody to confirm it.
     if params.structure == "never" or not unclear:
@@ -277,10 +277,10 @@ def _placed(
     for index, found in zip(unclear, one_by_one(look, unclear, ctx.cores), strict=True):
         ctx.progress(1.0 - 1.0 / (len(paired) + 1), f"{photos.photos[index].name}, by structure")
         places[index] = found
-    clear = {k: pairs for k, pairs in enumerate(paired) if pairs.n_recognised >= LEAST}
-    placed = confirmed(photos, places, clear, on_walls, ctx.cores)
+    recognised = {k: pairs for k, pairs in enumerate(paired) if pairs.n_recognised >= LEAST}
+    placed = confirmed(photos, places, recognised, on_walls, ctx.cores)
     for index, found in places.items():
-        if index in placed or not found or not found[0].is_clear:
+        if index in placed or index in recognised or not found or not found[0].is_clear:
             continue
         name = photos.photos[index].name
         if params.structure == "alone":

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import confirming
 from orthoflow_plugins.match.confirming import confirmed
-from orthoflow_plugins.match.pairing import USUAL_RULE, pair_photo, wall_features
+from orthoflow_plugins.match.pairing import USUAL_RULE, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.placing import Placed, PlacedWalls
 from orthoflow_plugins.match.sift import MatchSift
@@ -111,6 +111,28 @@ def test_photos_that_are_wrong_together_lose_to_one_that_key_points_recognise() 
     assert chosen(both, recognised=[2]) == {0: near}
 
 
+def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() -> None:
+    near = pytest.approx(0.0, abs=1e-9)
+    features = [wall_features(WALLS.walls[0], USUAL_RULE)]
+    right = pair_photo(photo_grey(photos().photos[2]), features, USUAL_RULE)
+    (pair,) = right.pairs
+    assert pair.homography is not None
+    shift = np.array([[1.0, 0.0, 120.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    wrong = replace(right, pairs=(replace(pair, homography=shift @ pair.homography),))
+    places = {k: [place(k)] for k in range(3)}
+
+    def taken(pairs: PhotoPairs) -> dict[int, float]:
+        found = confirmed(photos(), places, {2: pairs}, PlacedWalls(walls=WALLS.walls))
+        return {
+            k: float((one.camera.centre_world - CAMERAS[k].centre_world)[0])
+            for k, one in found.items()
+        }
+
+    assert taken(wrong) == dict.fromkeys(range(3), near)
+    # Where the others confirm its key points, these stay.
+    assert taken(right) == {0: near, 1: near}
+
+
 def sifted(
     folder: Path, places: dict[int, list[Placed]], structure: Literal["never", "confirmed", "alone"]
 ) -> tuple[Ties, list[str]]:
@@ -132,7 +154,8 @@ def test_a_photo_that_nobody_confirms_is_placed_only_for_who_asks_and_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As if no key points had shown a wall clearly.
-    monkeypatch.setattr("orthoflow_plugins.match.sift.LEAST", 10**6)
+    for least in ("LEAST", "CLEARLY"):
+        monkeypatch.setattr(f"orthoflow_plugins.match.sift.{least}", 10**6)
     asked: list[int] = []
     places = {0: [place(0, is_clear=True)], 1: [place(1, aside_m=0.3)]}
 

@@ -230,9 +230,11 @@ def test_a_photo_is_noted_with_the_walls_that_it_shows(
     ("structure", "n_recognised", "looked_at"),
     [
         ("never", (3, 3), []),
-        ("confirmed", (3, 15), [0, 1]),
-        ("confirmed", (3, 16), [0]),
-        ("confirmed", (16, 40), []),
+        # Some that agree by chance must not keep a photo from its place.
+        ("confirmed", (3, 23), [0, 1]),
+        ("confirmed", (3, 24), [0]),
+        ("confirmed", (16, 40), [0]),
+        ("confirmed", (24, 40), []),
         # One photo alone has nobody to confirm it, but may be placed all the same.
         ("confirmed", (3,), []),
         ("alone", (3,), [0]),
@@ -263,13 +265,28 @@ def test_photos_that_key_points_hardly_recognise_are_looked_for_by_structure(
     params = MatchSift.Params(structure=structure)  # type: ignore[arg-type]
     assert sift._placed(photos, WALLS, paired, params, context(tmp_path)) == {}
     assert asked == looked_at
-    # The others, which key points recognise, confirm.
+    # Those that key points recognise confirm.
     expected = [k for k, n in enumerate(n_recognised) if n >= 16]
     assert clear == ([expected] if looked_at else [])
     mirrored = [pairs(n_recognised=0, is_mirrored=True)] * 2
     asked.clear()
     sift._placed(photos, WALLS, mirrored, params, context(tmp_path))
     assert asked == []
+
+
+@pytest.mark.parametrize(("n_recognised", "is_placed"), [(15, True), (16, False)])
+def test_a_place_that_nobody_confirms_does_not_stand_against_key_points(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, n_recognised: int, is_placed: bool
+) -> None:
+    place: Any = SimpleNamespace(is_clear=True)
+    monkeypatch.setattr("orthoflow_plugins.match.placing.places_of", lambda *_: [place])
+    monkeypatch.setattr("orthoflow_plugins.match.confirming.confirmed", lambda *_: {})
+    photos: Any = SimpleNamespace(photos=[SimpleNamespace(name="a")])
+    ctx = context(tmp_path)
+    paired = [pairs(n_recognised=n_recognised)]
+    placed = sift._placed(photos, WALLS, paired, MatchSift.Params(structure="alone"), ctx)
+    assert placed == ({0: place} if is_placed else {})
+    assert len(ctx.warnings) == is_placed
 
 
 def test_what_stands_free_is_told_from_the_cloud_between_all_photos_and_walls(
