@@ -137,7 +137,9 @@ def _undeclared(method: type[Method]) -> list[str]:
     return [
         f"{label}{did_you_mean(label, declared)}"
         for label in map(str, labels)
-        if not any(fnmatchcase(name, label) or fnmatchcase(label, name) for name in declared)
+        # The same pattern with `[xy]` in it does not match itself.
+        if label not in declared
+        and not any(fnmatchcase(name, label) or fnmatchcase(label, name) for name in declared)
     ]
 
 

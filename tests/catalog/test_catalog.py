@@ -407,6 +407,18 @@ def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
     assert catalog.method("plane.mine").load().id == "plane.mine"
 
 
+def test_labels_name_metrics_as_they_are_declared_or_more_closely_or_widely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["wall_[0-9]*_damp", "wall_0_damp", "*_damp"]
+    labels = ", ".join(f"{name!r}: MetricLabel(words='damp')" for name in names)
+    own = f"    metrics = ('wall_[0-9]*_damp',)\n    metric_labels = {{{labels}}}\n    Params"
+    text = hooks(methods=method("plane.mine", "labelled_class:Mine"))
+    source = CLASS.replace("    Params", own, 1)
+    catalog = with_plugin("labelled", text, tmp_path, monkeypatch, labelled_class=source)
+    assert list(catalog.method("plane.mine").load().metric_labels) == names
+
+
 def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
