@@ -48,12 +48,20 @@ class Run:
         output: reads an output by address and port from the record that is held open; None where
             it is opened for it.
         files_folder: what stands for the folder of the record, where its files lie elsewhere.
+        later_name: name that the record file gets once all beside it is written; empty where it has
+            its name.
     """
 
     path: Path
     record: RunRecord
     output: Callable[[str, str], StoredPayload] | None = field(default=None, compare=False)
     files_folder: Path | None = field(default=None, compare=False)
+    later_name: str = field(default="", compare=False)
+
+    @property
+    def file_name(self) -> str:
+        """What the record file is called in what is read of the run afterwards, such as a page."""
+        return self.later_name or self.path.name
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:

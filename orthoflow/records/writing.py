@@ -143,7 +143,7 @@ def _write_run(
     record, unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
     with writing_to(run_folder):
         if before_finish is not None:
-            before_finish(Run(path=unfinished, record=read_record(unfinished)))
+            before_finish(_under_way(unfinished))
         # All that the record names, before its own name says that it is there.
         sync_tree(run_folder)
         finished = unfinished.replace(run_folder / RECORD_FILE)
@@ -172,6 +172,10 @@ def _publish(
             leftover.unlink()
         _write_record(unfinished, record, store, plan, embed=embed)
     return record, unfinished
+
+
+def _under_way(unfinished: Path) -> Run:
+    return Run(path=unfinished, record=read_record(unfinished), later_name=RECORD_FILE)
 
 
 def show_unfinished(
@@ -213,7 +217,7 @@ def show_unfinished(
     try:
         _, unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
         try:
-            show(Run(path=unfinished, record=read_record(unfinished)))
+            show(_under_way(unfinished))
         finally:
             unfinished.unlink(missing_ok=True)
     except (OrthoflowError, OSError):

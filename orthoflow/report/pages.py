@@ -434,7 +434,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         plan=photo_plan(run, walls),
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
-        record_file=(from_page / run.path.name).as_posix(),
+        record_file=(from_page / run.file_name).as_posix(),
         citations=citations(run),
         viewers={
             text: (from_page / page).as_posix()

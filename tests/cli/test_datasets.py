@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,19 @@ def test_a_dataset_that_fails_keeps_its_place_and_the_others_go_on(folder: Path)
 def test_products_lie_below_the_address_of_their_dataset(folder: Path) -> None:
     found = {path.parent.name for path in (folder / "first" / "products").glob("*/*_ortho.tif")}
     assert found == {"paint@data=hall", "paint@data=stairs", "side"}
+
+
+def test_commands_on_the_pages_that_a_run_writes_are_of_its_record(folder: Path) -> None:
+    run = folder / "first"
+    pages = [run / "report.html", *sorted((run / "pages").glob("*.html"))]
+    assert [page.stem for page in pages] == ["report", "attic", "hall", "stairs"]
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        # So is the record called while pages are written.
+        assert "h5.unfinished" not in text
+        assert re.findall(r"orthoflow (?:verify|replay|show|export) (\S+)", text) == ["run.h5"] * 4
+        assert "<code>run.h5</code> beside" in text or "<code>../run.h5</code> seen" in text
+    assert (run / "run.h5").is_file()
 
 
 def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
