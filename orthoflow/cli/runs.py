@@ -134,10 +134,10 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 def runs_json(kept: Sequence[RunSummary]) -> list[dict[str, object]]:
     """Give runs as JSON, with every metric and parameter, and in what they differ."""
-    from orthoflow.report.browsing import differing_facts
+    from orthoflow.report.browsing import differing_facts, told_facts
 
-    facts = differing_facts(kept)
-    return [_row_json(run, facts[run.folder]) for run in kept]
+    facts, differs = told_facts(kept), differing_facts(kept)
+    return [_row_json(run, facts[run.folder], differs[run.folder]) for run in kept]
 
 
 def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[str] = ()) -> None:
@@ -256,17 +256,22 @@ def _facts_text(facts: Mapping[str, object]) -> str:
     return first_few(said, most=_FACTS_MOST)
 
 
-def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
+def _row_json(
+    run: RunSummary, facts: Mapping[str, object], differs: Mapping[str, object]
+) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "n_values", "swept", "shared", "set_as", "beside", "variants"):
+    for name in ("labels", "n_values", "variants"):
         del values[name]
-    return values | {"differs": dict(differs)}
+    return values | {"facts": dict(facts), "differs": dict(differs)}
 
 
 def _print_csv(kept: Sequence[RunSummary]) -> None:
+    from orthoflow.report.browsing import told_facts
+
+    told = told_facts(kept)
     metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
-    facts = list(dict.fromkeys(name for run in kept for name in run.facts))
+    facts = list(dict.fromkeys(name for run in kept for name in told[run.folder]))
     header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]
     rows = [
         [
@@ -277,7 +282,7 @@ def _print_csv(kept: Sequence[RunSummary]) -> None:
             run.run_id,
             run.reason,
             *(run.metrics.get(name) for name in metrics),
-            *(_cell(run.facts.get(name)) for name in facts),
+            *(_cell(told[run.folder].get(name)) for name in facts),
         ]
         for run in kept
     ]

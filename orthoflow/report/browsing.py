@@ -38,6 +38,28 @@ _FIRST_LINE_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
+class Fact:
+    """Something in which runs may differ.
+
+    Attributes:
+        values: of it, as JSON; one, but of a sweep all.
+        shared: of one of several datasets, its name without it.
+        set_as: of a parameter of a variant, the baseline's too, `step.variant.parameter`.
+        beside: of a parameter of another variant, the name that the fact of the baseline has.
+    """
+
+    values: tuple[JsonValue, ...]
+    shared: str = ""
+    set_as: str = ""
+    beside: str = ""
+
+    @property
+    def told(self) -> JsonValue:
+        """The value, of a sweep all of them as one text."""
+        return self.values[0] if len(self.values) == 1 else "|".join(map(_sorted_json, self.values))
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """What a table of runs says of one.
 
@@ -54,14 +76,9 @@ class RunSummary:
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
-        facts: what may differ between runs, as JSON: parameters of the baseline by
-            `step.parameter`, its methods by `step.use`, and parameters of other variants by
-            `step.variant.parameter`; `seed`, `orthoflow` (its version), and inputs by
-            `input <name>`.
-        swept: of facts that a sweep gives several values, all of them.
-        shared: of facts of one of several datasets, their name without it.
-        set_as: of parameters of a variant, the baseline's too, `step.variant.parameter`.
-        beside: of parameters of another variant, the fact of the baseline.
+        facts: what may differ between runs: parameters of the baseline by `step.parameter`, its
+            methods by `step.use`, and parameters of other variants by `step.variant.parameter`;
+            `seed`, `orthoflow` (its version), and inputs by `input <name>`.
         variants: all values of parameters as `--set` names them for one variant,
             `step.variant.parameter`; of one with a sweep those of all that it became.
     """
@@ -76,17 +93,14 @@ class RunSummary:
     n_datasets: int = 0
     n_values: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
-    facts: Mapping[str, JsonValue] = field(default_factory=dict)
-    swept: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
-    shared: Mapping[str, str] = field(default_factory=dict)
-    set_as: Mapping[str, str] = field(default_factory=dict)
-    beside: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Fact] = field(default_factory=dict)
     variants: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
         """What `values` knows something of."""
-        return (*self.metrics, *self.facts, *self.shared.values(), *self.variants)
+        shared = (fact.shared for fact in self.facts.values() if fact.shared)
+        return (*self.metrics, *self.facts, *shared, *self.variants)
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
         """Give a metric or a fact: of a sweep all values, without a dataset those of every one."""
@@ -94,19 +108,12 @@ class RunSummary:
             return (self.metrics[name],)
         if name in self.variants:
             return self.variants[name]
-        facts = [name, *(fact for fact, short in self.shared.items() if short == name)]
         return tuple(
             value
-            for fact in facts
-            if fact in self.facts
-            for value in self.swept.get(fact, (self.facts[fact],))
+            for own, fact in self.facts.items()
+            if name in (own, fact.shared)
+            for value in fact.values
         )
-
-    @property
-    def told(self) -> dict[str, JsonValue]:
-        """The facts, of a sweep all values as one text."""
-        swept = {name: "|".join(map(_sorted_json, found)) for name, found in self.swept.items()}
-        return {**self.facts, **swept}
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -130,48 +137,56 @@ def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """What of its facts tells each run from others of the same workflow, by its folder.
+    """What of its told facts tells each run from others of the same workflow, by its folder.
 
-    A fact that some of them lack differs only where two others disagree on it. Of a sweep all
-    values are told, without the dataset what is the same on all datasets of each such run, and
-    without the variant what is the same in all variants.
+    A fact that some of them lack differs only where two others disagree on it.
     """
-    told = {run.folder: run.told for run in runs}
-    apart: set[tuple[str, str]] = set()
-    for run in runs:
-        on_datasets: dict[str, set[str]] = {}
-        for name, short in run.shared.items():
-            on_datasets.setdefault(short, set()).add(_sorted_json(told[run.folder][name]))
-        apart |= {(run.workflow, short) for short, found in on_datasets.items() if len(found) > 1}
-
-    def called(run: RunSummary, name: str) -> str:
-        short = run.shared.get(name, name)
-        return name if (run.workflow, short) in apart else short
-
-    named = {
-        run.folder: {called(run, name): value for name, value in told[run.folder].items()}
-        for run in runs
-    }
+    told = told_facts(runs)
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:
-        for name, value in named[run.folder].items():
+        for name, value in told[run.folder].items():
             values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
-    names = _names_as_set(runs, named, called)
     return {
         run.folder: {
             name: value
-            for fact, value in named[run.folder].items()
-            if len(values[run.workflow, fact]) > 1
-            and (name := names.get((run.workflow, fact), fact))
+            for name, value in told[run.folder].items()
+            if len(values[run.workflow, name]) > 1
+        }
+        for run in runs
+    }
+
+
+def told_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
+    """All facts of each run, by its folder: each once, by the name that `--set` takes.
+
+    Of a sweep all values are told, without the dataset what is the same on all datasets of each
+    run of the workflow, and without the variant what is the same in all variants.
+    """
+    apart: set[tuple[str, str]] = set()
+    for run in runs:
+        on_datasets: dict[str, set[str]] = {}
+        for fact in run.facts.values():
+            if fact.shared:
+                on_datasets.setdefault(fact.shared, set()).add(_sorted_json(fact.told))
+        apart |= {(run.workflow, short) for short, found in on_datasets.items() if len(found) > 1}
+
+    def called(run: RunSummary, name: str) -> str:
+        short = run.facts[name].shared or name
+        return name if (run.workflow, short) in apart else short
+
+    names = _names_as_set(runs, called)
+    return {
+        run.folder: {
+            name: fact.told
+            for own, fact in run.facts.items()
+            if (name := names.get((run.workflow, called(run, own)), called(run, own)))
         }
         for run in runs
     }
 
 
 def _names_as_set(
-    runs: Sequence[RunSummary],
-    named: Mapping[Path, Mapping[str, JsonValue]],
-    called: Callable[[RunSummary, str], str],
+    runs: Sequence[RunSummary], called: Callable[[RunSummary, str], str]
 ) -> dict[tuple[str, str], str]:
     """Other names of parameters that several variants take, by workflow and name.
 
@@ -180,24 +195,23 @@ def _names_as_set(
     as long as that is the same one in all runs.
     """
     follows: dict[tuple[str, str], bool] = {}
-    for run in runs:
-        values = named[run.folder]
-        for fact, first in run.beside.items():
-            name = run.workflow, called(run, fact)
-            is_same = values[called(run, fact)] == values[called(run, first)]
-            follows[name] = is_same and follows.get(name, True)
-    names = {name: "" for name, does in follows.items() if does}
     of_baseline: dict[tuple[str, str], set[str]] = {}
     for run in runs:
-        for fact in run.facts.keys() - run.beside.keys():
-            name = run.workflow, called(run, fact)
-            of_baseline.setdefault(name, set()).add(run.set_as.get(fact, ""))
+        for own, fact in run.facts.items():
+            name = run.workflow, called(run, own)
+            if first := run.facts.get(fact.beside):
+                follows[name] = fact.told == first.told and follows.get(name, True)
+            elif not fact.beside:
+                of_baseline.setdefault(name, set()).add(fact.set_as)
+    names = {name: "" for name, does in follows.items() if does}
     for run in runs:
-        for fact, first in run.beside.items():
-            name = run.workflow, called(run, first)
-            if not follows[run.workflow, called(run, fact)] and len(of_baseline[name]) == 1:
-                (written,) = of_baseline[name]
-                names[name] = written or name[1]
+        for own, fact in run.facts.items():
+            name = run.workflow, called(run, own)
+            if fact.beside in run.facts and not follows[name]:
+                of_first = run.workflow, called(run, fact.beside)
+                if len(of_baseline[of_first]) == 1:
+                    (written,) = of_baseline[of_first]
+                    names[of_first] = written or of_first[1]
     return names
 
 
@@ -266,16 +280,16 @@ def _summary(folder: Path) -> RunSummary:
 def _of_run(folder: Path, run: Run) -> RunSummary:
     record = run.record
     failed = next((cell for cell in record.cells if cell.status == "failed"), None)
-    facts: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
+    said: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
     parts = parts_of(run)
     if parts:
-        facts["datasets"] = len(parts)
+        said["datasets"] = len(parts)
     for given in record.inputs:
-        facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
+        said[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
     baseline = {cell.address for part in parts.values() or (run,) for cell in baseline_cells(part)}
-    groups = tuple(_alike(record.cells, baseline))
-    named = [(one, f".{parameter}") for one in groups for parameter in one.values]
-    facts |= {f"{one.name}.{name}": value for one in groups for name, value in one.values.items()}
+    facts = {name: Fact(values=(value,)) for name, value in said.items()}
+    for one in _alike(record.cells, baseline):
+        facts |= one.facts
     values = _values(run)
     return RunSummary(
         folder=folder,
@@ -289,16 +303,6 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         n_values={name: len(found) for name, found in values.items()} if parts else {},
         labels=_labels(run),
         facts=facts,
-        swept={
-            f"{one.name}.{name}": several for one in groups for name, several in one.swept.items()
-        },
-        shared={one.name + name: one.shared + name for one, name in named if one.data},
-        set_as={one.name + name: one.written + name for one, name in named if one.variant},
-        beside={
-            one.name + name: first
-            for one, name in named
-            if one.variant and not one.chosen and (first := one.of_baseline + name) in facts
-        },
         variants=_variants(record.cells),
     )
 
@@ -341,41 +345,31 @@ class _Alike:
     chosen: RecordedCell | None
 
     @property
-    def values(self) -> dict[str, JsonValue]:
-        """Parameters, those of the baseline where it is among them, and then its method."""
-        values = dict((self.chosen or self.cells[0]).params)
-        return values | {"use": self.chosen.method} if self.chosen else values
-
-    @property
-    def swept(self) -> dict[str, tuple[JsonValue, ...]]:
-        """All values of the parameters that have several."""
-        found: dict[str, dict[str, JsonValue]] = {}
+    def facts(self) -> dict[str, Fact]:
+        """Their parameters, and the method of the baseline, by the names that no others have."""
+        values: dict[str, dict[str, JsonValue]] = {}
         for cell in self.cells:
             for name, value in cell.params.items():
-                found.setdefault(name, {})[_sorted_json(value)] = value
-        return {name: tuple(values.values()) for name, values in found.items() if len(values) > 1}
-
-    @property
-    def written(self) -> str:
-        """What `--set` takes."""
-        return f"{self.step}.{self.variant}" if self.variant else self.step
-
-    @property
-    def shared(self) -> str:
-        """The name without the dataset: the baseline's is its step, whatever its variant."""
-        return self.step if self.chosen else self.written
-
-    @property
-    def of_baseline(self) -> str:
-        """The name of the baseline's cell of the step, on the same dataset."""
-        return f"{self.step}@{DATA}={self.data}" if self.data else self.step
-
-    @property
-    def name(self) -> str:
-        """The name that no others have."""
-        if self.chosen or not self.variant:
-            return self.of_baseline
-        return f"{self.of_baseline},{self.step}={self.variant}" if self.data else self.written
+                values.setdefault(name, {})[_sorted_json(value)] = value
+        if self.chosen:
+            values["use"] = {"": self.chosen.method}
+        written = f"{self.step}.{self.variant}" if self.variant else self.step
+        of_baseline = f"{self.step}@{DATA}={self.data}" if self.data else self.step
+        is_beside = bool(self.variant) and self.chosen is None
+        own = of_baseline
+        if is_beside:
+            own = f"{of_baseline},{self.step}={self.variant}" if self.data else written
+        # Without the dataset the baseline's is its step, whatever its variant.
+        shared = written if is_beside else self.step
+        return {
+            f"{own}.{name}": Fact(
+                values=tuple(several.values()),
+                shared=f"{shared}.{name}" if self.data else "",
+                set_as=f"{written}.{name}" if self.variant else "",
+                beside=f"{of_baseline}.{name}" if is_beside else "",
+            )
+            for name, several in values.items()
+        }
 
 
 def _alike(cells: Iterable[RecordedCell], baseline: Collection[str]) -> Iterator[_Alike]:

@@ -15,7 +15,7 @@ from orthoflow_provenance.model import RecordedFile, RecordedInput
 from orthoflow_provenance.writer import write_record
 
 from orthoflow.cli import runs as module
-from orthoflow.report.browsing import RunSummary
+from orthoflow.report.browsing import Fact, RunSummary
 from tests.hostile_records import reseal, set_attribute
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
@@ -117,6 +117,16 @@ def test_a_sweep_differs_from_a_single_run_in_all_its_values(
     assert rows == {
         "alone": {"plane.cell_m": 0.05, "plane.use": "plane.toy"},
         "swept": {"plane.cell_m": "0.02|0.05", "plane.use": "plane.other"},
+    }
+    # And so do all facts, as JSON and as CSV.
+    told = {
+        row["folder"]: row["facts"]["plane.cell_m"] for row in json.loads(said("runs", "--json"))
+    }
+    assert told == {"alone": 0.05, "swept": "0.02|0.05"}
+    table = list(csv.DictReader(io.StringIO(said("runs", "--csv"))))
+    assert {row["folder"]: row["plane.cell_m"] for row in table} == {
+        "alone": "0.05",
+        "swept": "0.02|0.05",
     }
     assert folders("--where", "plane.cell_m = 0.02") == ["swept"]
     assert folders("--where", "plane.cell_m = 0.05") == ["alone", "swept"]
@@ -312,7 +322,7 @@ def test_a_condition_is_a_name_a_sign_and_a_number(
                 folder=Path("a"),
                 state="ok",
                 metrics={} if facts else {name: value},
-                facts={name: value} if facts else {},
+                facts={name: Fact(values=(value,))} if facts else {},
             )
             for value in (1, 2, 3)
         }
@@ -321,7 +331,7 @@ def test_a_condition_is_a_name_a_sign_and_a_number(
 
 @pytest.mark.parametrize("value", [True, "2", None, [2]])
 def test_what_is_no_number_meets_no_condition(value: object) -> None:
-    run = RunSummary(folder=Path("a"), state="ok", facts={"seed": value})  # type: ignore[dict-item]
+    run = RunSummary(folder=Path("a"), state="ok", facts={"seed": Fact(values=(value,))})  # type: ignore[arg-type]
     assert not any(module._Condition.of(f"seed {sign} 2").is_met_by(run) for sign in module._SIGNS)
     assert not module._Condition.of("other = 2").is_met_by(run)
 

@@ -14,12 +14,14 @@ from orthoflow_provenance.writer import write_record
 from orthoflow.errors import ArgumentError
 from orthoflow.report import browsing as module
 from orthoflow.report.browsing import (
+    Fact,
     RunSummary,
     differing_facts,
     key_metrics,
     run_folders,
     summaries,
     told_apart,
+    told_facts,
 )
 from tests.report_runs import HeldRun, cell, metrics, record
 
@@ -53,7 +55,8 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
 
 
 def summary(name: str, workflow: str = "hall", **facts: object) -> RunSummary:
-    return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=facts)  # type: ignore[arg-type]
+    told = {key: Fact(values=(value,)) for key, value in facts.items()}  # type: ignore[arg-type]
+    return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=told)
 
 
 def test_what_all_runs_of_a_workflow_share_tells_none_of_them() -> None:
@@ -130,7 +133,7 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     assert {name: told.metrics[name] for name in wanted} == wanted
     assert told.labels["check.rms_mm"] == told.labels["rms_mm"] == "check points, RMS"
     assert told.n_datasets == 0
-    assert told.facts == {
+    assert told_facts([told])[folder] == {
         "seed": 1,
         "orthoflow": "orthoflow 0.1.0",
         "input scan": ["hall.laz 01234567", "b.laz 01234567"],
@@ -164,7 +167,7 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     summary = module._of_run(tmp_path, run)
     assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
     assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
-    facts, labels = summary.facts, summary.labels
+    facts, labels = told_facts([summary])[tmp_path], summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "check points, RMS"
     assert {name: facts[name] for name in facts if name.endswith("tries")} == {
         "check@data=hall.tries": 0,
@@ -191,8 +194,6 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
         told("b", (4,), (4,)),
         told("c", (4,), (5,)),
     )
-    # What is filtered by is the baseline's.
-    assert swept.facts["check@data=hall.tries"] == 1
     assert list(differing_facts([swept, single]).values()) == [
         {"check.tries": "1|2|3"},
         {"check.tries": 4},
@@ -203,7 +204,10 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
     ]
     # Nor does it where others ran on no dataset.
     plain = replace(
-        single, folder=tmp_path / "p", facts={"check.tries": 4}, swept={}, shared={}, n_datasets=0
+        single,
+        folder=tmp_path / "p",
+        facts={"check.tries": Fact(values=(4,))},
+        n_datasets=0,
     )
     of_both = [facts["check.tries"] for facts in differing_facts([swept, plain]).values()]
     assert of_both == ["1|2|3", 4]
@@ -274,6 +278,12 @@ def test_what_was_changed_once_is_named_once_and_as_it_is_set(
 ) -> None:
     first, second = compared(tmp_path / "a"), compared(tmp_path / "b", **changed)
     assert list(differing_facts([first, second]).values()) == [of_first, of_second]
+    # Among all that is told each parameter stands once, too.
+    told = told_facts([first, second])[second.folder]
+    is_of_one = any(name.count(".") == 2 for name in of_second)
+    variants = ("plane.hough", "plane.ransac") if is_of_one else ("plane",)
+    wanted = {f"{name}.tol_m": 0.05 for name in variants} | {"wall.gsd_m": 0.01} | of_second
+    assert {name: told[name] for name in told if name.endswith("_m")} == wanted
     # Each of these names is one that `--where` takes.
     assert all(second.values(name) for name in of_second)
 
