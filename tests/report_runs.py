@@ -78,6 +78,7 @@ def cell(address: str, **more: object) -> RecordedCell:
         "environment": "e1",
         "wall_s": 1.0,
         "compile_s": 0.25,
+        "params_set": more.get("params", {}),
     }
     return RecordedCell(**{**wanted, **more})  # type: ignore[arg-type]
 

@@ -111,7 +111,7 @@ class Sweep:
         method: what its variants call, `plane.ransac`.
         parameter: name of the parameter.
         values: variant -> value.
-        others: variant -> what else it sets otherwise, in words.
+        others: variant -> what else is set to differ, in words.
     """
 
     step: str
@@ -129,7 +129,8 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
     for (step, method), variants in by_method.items():
-        names = sorted({name for cell in variants.values() for name in cell.params})
+        # What nobody set a method may have from what was set: a default that gives way to a value.
+        names = sorted({name for cell in variants.values() for name in cell.params_set})
         differ = [
             name
             for name in names

@@ -58,6 +58,25 @@ def test_one_value_other_differences_and_words_are_none(tmp_path: Path) -> None:
     assert list(sweeps(held(tmp_path, words).record.cells)) == []
 
 
+def test_what_nobody_set_tells_no_lines_apart(tmp_path: Path) -> None:
+    # The default of the one gives way to small values of the other.
+    cells = [
+        cell(
+            f"plane@plane=v{value}",
+            params={"tolerance_m": value, "fit_tolerance_m": min(value, 0.015)},
+            params_set={"tolerance_m": value},
+            metrics=metrics(rms_mm=value),
+        )
+        for value in (0.005, 0.01, 0.02, 0.05)
+    ]
+    (found,) = sweeps(cells)
+    assert (found.parameter, set(found.others.values())) == ("tolerance_m", {""})
+    (curve,) = curves(held(tmp_path, [*cells]))
+    (way,) = re.findall(r'class="line line-\d" d="([^"]*)"', curve.svg)
+    assert way.count("L") == 3
+    assert "fit_tolerance_m" not in curve.svg
+
+
 def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path) -> None:
     one = swept(0.02, 0.05, 0.1)
     other = [

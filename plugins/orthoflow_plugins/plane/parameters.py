@@ -48,7 +48,10 @@ class DetectorParams(MethodParams):
         0.05, gt=0.0, description="Points this near to a plane belong to it."
     )
     fit_tolerance_m: float = Field(
-        0.015, gt=0.0, description="Points this near to a plane take part in its final fit."
+        0.015,
+        gt=0.0,
+        description="Points this near to a plane take part in its final fit; at most "
+        "`tolerance_m`, which the default follows where that is set below it.",
     )
     constraint: Literal["any", "vertical", "horizontal"] = Field(
         "any", description="Which planes are looked for, within `max_tilt_deg`."
