@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from orthoflow.alike import first_few
 from orthoflow.foreign_text import shown
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
@@ -164,8 +165,26 @@ class _Point:
     x: float
     y: float
     spread: float
-    n: int  # datasets, or ways through the other variants, that it stands for
+    found: tuple[_Value, ...]  # what it stands for, one of each dataset
     is_baseline: bool
+
+    @property
+    def n(self) -> int:
+        return len(self.found)
+
+    @property
+    def origins(self) -> list[tuple[str, int]]:
+        """The datasets, and how many repeats of each have a value."""
+        return sorted((one.dataset, one.n_repeats) for one in self.found)
+
+    @property
+    def partly(self) -> list[str]:
+        """What has a value of only some repeats, in words."""
+        return [
+            f"{one.dataset} at {number(self.x)} ({one.n_repeats} of {one.n_all})".lstrip()
+            for one in self.found
+            if one.n_repeats < one.n_all
+        ]
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
@@ -209,11 +228,14 @@ def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
 
 
 class _Value(NamedTuple):
-    """What one combination measured."""
+    """What one combination measured, and of how many of its repeats."""
 
     value: float
     spread: float
     is_baseline: bool
+    dataset: str = ""
+    n_repeats: int = 1
+    n_all: int = 1
 
 
 def _lines(
@@ -235,7 +257,16 @@ def _lines(
         )
         others = ", ".join(filter(None, [sweep.others[variant], *variants]))
         at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
-        at.append(_Value(measured.value, measured.spread, one.is_baseline))
+        at.append(
+            _Value(
+                measured.value,
+                measured.spread,
+                one.is_baseline,
+                one.assignment.get(DATA, ""),
+                measured.n_repeats,
+                measured.n_all,
+            )
+        )
     return {
         name: [
             _point(x, found, is_over=is_over, is_error=column.sense is Sense.LESS)
@@ -256,7 +287,25 @@ def _point(x: float, found: Sequence[_Value], *, is_over: bool, is_error: bool) 
         y, spread = float(numbers[0]), math.nan if is_over else found[0].spread
     else:
         y, spread = float(np.median(numbers)), median_deviation(numbers)
-    return _Point(x=x, y=y, spread=spread, n=len(found), is_baseline=is_baseline)
+    return _Point(x=x, y=y, spread=spread, found=tuple(found), is_baseline=is_baseline)
+
+
+def _are_alike(one: _Point, other: _Point) -> bool:
+    """Whether both are of the same datasets and as many repeats of each.
+
+    The hard datasets are often those that a value fails on: no line says that it is better.
+    """
+    return one.origins == other.origins
+
+
+def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
+    """Say what is missing behind points: datasets and repeats; empty where nothing is."""
+    partly = [said for points in lines.values() for point in points for said in point.partly]
+    some = f"; of only some repeats: {first_few(partly)}" if partly else ""
+    if all(_are_alike(*pair) for points in lines.values() for pair in pairwise(points)):
+        return some
+    what = "datasets or repeats" if is_over else "numbers of repeats"
+    return f", no line between those of unlike {what}{some}"
 
 
 def _behind(points: Sequence[_Point], n_datasets: int) -> str:
@@ -266,11 +315,10 @@ def _behind(points: Sequence[_Point], n_datasets: int) -> str:
         return f"each of the only one of {n_datasets} datasets that has a value, without bars"
     counted = f"{least}" if least == most else f"{least} to {most}"
     of_all = f" of {n_datasets}" if least < n_datasets else ""
-    apart = ", no line between those of unlike numbers" if least < most else ""
     where = ", where there is more than one" if least == 1 else ""
     return (
         f"medians of {counted}{of_all} datasets, bars 1.4826 times the median absolute "
-        f"deviation{where}{apart}"
+        f"deviation{where}"
     )
 
 
@@ -289,6 +337,7 @@ def _curve(
         said = "means of the repeats, bars their standard deviation"
     else:
         said = "one value each: without repeats nobody knows how far they scatter"
+    said += _unlike(lines, is_over=n_datasets > 1)
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
     if column.sense is Sense.LESS and not cost_share(column.metric):
         good += ", of signed errors their sizes"
@@ -426,8 +475,7 @@ class _Axes:
 
     def _line(self, index: int, points: Sequence[_Point]) -> str:
         at = [(self.across(point.x), self.down(point.y)) for point in points]
-        # The hard datasets are often those that a value fails on: no line says that it is better.
-        joins = ["", *("L" if one.n == next_.n else "M" for one, next_ in pairwise(points))]
+        joins = ["", *("L" if _are_alike(*pair) else "M" for pair in pairwise(points))]
         way = "".join(f"{join}{x:.1f} {y:.1f}" for join, (x, y) in zip(joins, at, strict=True))
         bars = "".join(
             f"M{x:.1f} {self.down(max(point.y - point.spread, self.floor)):.1f}"

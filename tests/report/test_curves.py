@@ -248,12 +248,68 @@ def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> N
     parts = {"calm": held(tmp_path, fine), "dark": held(tmp_path, failing)}
     (curve,) = curves_over(parts)
     assert "medians of 1 to 2 of 2 datasets, bars" in curve.caption
-    assert "no line between those of unlike numbers" in curve.caption
+    assert "no line between those of unlike datasets or repeats" in curve.caption
     nothing = held(tmp_path, [replace(one, status="failed") for one in swept(0.02, 0.05, 0.1)])
     (curve,) = curves_over({"calm": held(tmp_path, fine), "broken": nothing})
     assert "each of the only one of 2 datasets that has a value, without bars" in curve.caption
     # Repeats of the one are no spread of datasets.
     assert 'class="bar' not in curve.svg
+
+
+def ways(svg: str) -> list[str]:
+    """Where the lines begin and go on, a letter per point."""
+    return [
+        "".join(re.findall("[ML]", way))
+        for way in re.findall(r'class="line line-\d" d="(M[^"h]*)"', svg)
+    ]
+
+
+def over_rooms(
+    folder: Path, values: dict[str, dict[float, tuple[float | None, ...]]], metric: str
+) -> dict[str, HeldRun]:
+    """Rooms with a value per tolerance and repeat, None where the repeat has none."""
+    return {
+        room: held(
+            folder,
+            [
+                cell(
+                    f"plane@data={room},plane=v{x}" + (f"#{repeat}" if repeat else ""),
+                    params={"tolerance_m": x},
+                    metrics=() if y is None else metrics(**{metric: y}),
+                )
+                for x, found in by_x.items()
+                for repeat, y in enumerate(found)
+            ],
+        )
+        for room, by_x in values.items()
+    }
+
+
+def test_no_line_joins_points_of_other_datasets_or_repeats(tmp_path: Path) -> None:
+    whole, none = (1.0, 2.0), (None, None)
+    values: dict[str, dict[float, tuple[float | None, ...]]] = {
+        "calm": {1.0: whole, 2.0: none, 3.0: whole, 4.0: whole, 5.0: whole},
+        "dark": {1.0: none, 2.0: whole, 3.0: whole, 4.0: whole, 5.0: (None, 2.0)},
+        "wide": dict.fromkeys((1.0, 2.0, 3.0, 4.0, 5.0), whole),
+    }
+    (curve,) = curves_over(over_rooms(tmp_path, values, "rms_mm"))
+    # Of two rooms the first and the second, but of others; the last lacks a repeat of one.
+    assert ways(curve.svg) == ["MMMLM"]
+    assert (
+        "medians of 2 to 3 of 3 datasets, bars 1.4826 times the median absolute deviation, no line "
+        "between those of unlike datasets or repeats; of only some repeats: dark at 5 (1 of 2)"
+    ) in curve.caption
+    alone = {"calm": {1.0: whole, 2.0: whole, 3.0: (1.0, None)}}
+    (run,) = over_rooms(tmp_path, alone, "rms_mm").values()
+    cells = [
+        replace(one, assignment={"plane": one.assignment["plane"]}) for one in run.record.cells
+    ]
+    (curve,) = curves(held(tmp_path, [*cells]))
+    assert ways(curve.svg) == ["MLM"]
+    assert (
+        "means of the repeats, bars their standard deviation, no line between those of unlike "
+        "numbers of repeats; of only some repeats: at 3 (1 of 2)"
+    ) in curve.caption
 
 
 def test_far_apart_values_lie_on_a_logarithmic_axis(tmp_path: Path) -> None:
