@@ -21,6 +21,7 @@ _VARYING: Final = re.compile(
     """,
     re.VERBOSE,
 )
+_NUMBER: Final = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?%?", re.ASCII)
 _MARK: Final = "\0"
 # A list of them is one: a photo, or two and three more.
 _MARKS: Final = re.compile(
@@ -39,7 +40,7 @@ class Alike:
     """Sentences of one sense.
 
     Attributes:
-        text: the first of them.
+        text: the first of them; with their lowest and highest numbers where no names differ.
         others: what stands in the others where the first has its name, each once, in their order.
         count: how many there are.
         places: who said it, each once, in their order; cells of a run, say.
@@ -83,6 +84,10 @@ class Alike:
 def alike(said: Iterable[tuple[str, str]]) -> tuple[Alike, ...]:
     """Put sentences together that differ only in names and numbers.
 
+    >>> said = [("check#1", "none of 5 planes"), ("check#2", "none of 12 planes")]
+    >>> alike(said)[0].sentence
+    'none of 5 to 12 planes'
+
     Args:
         said: place and sentence, in the order in which they were said.
 
@@ -123,24 +128,27 @@ def first_few(names: Sequence[str], most: int = _MOST_NAMED) -> str:
 
 def _together(group: Sequence[tuple[str, str]]) -> Alike:
     first = group[0][1]
+    # Sentences of one sense have equally many varying parts.
+    columns = list(zip(*(_parts(text) for _, text in group), strict=True))
+    names = next(
+        (part for part in columns if len(set(part)) > 1 and not all(map(_NUMBER.fullmatch, part))),
+        (),
+    )
+    # A count alone would not say what it is of: without names, amounts stand in their places.
     return Alike(
-        text=first,
-        others=_others([text for _, text in group]),
+        text=first if names else _filled(sense(first), [_amounts(part) for part in columns]),
+        others=tuple(name for name in dict.fromkeys(names) if name != names[0]),
         count=len(group),
         places=tuple(dict.fromkeys(place for place, _ in group)),
     )
 
 
-def _others(texts: Sequence[str]) -> tuple[str, ...]:
-    """What varies first among sentences of one sense, without that of the first sentence."""
-    if len(set(texts)) == 1:
-        return ()
-    parts = [_parts(text) for text in texts]
-    # Sentences of one sense have equally many varying parts.
-    column = next(column for column in zip(*parts, strict=True) if len(set(column)) > 1)
-    # A count alone would not say what it is of.
-    others = dict.fromkeys(part for part in column[1:] if part != column[0])
-    return tuple(part for part in others if not part.isdecimal())
+def _amounts(numbers: Sequence[str]) -> str:
+    """The lowest and the highest, where they differ."""
+    if len(set(numbers)) == 1:
+        return numbers[0]
+    in_order = sorted(numbers, key=lambda number: float(number.rstrip("%")))
+    return f"{in_order[0]} to {in_order[-1]}"
 
 
 def _parts(text: str) -> tuple[str, ...]:
@@ -150,7 +158,13 @@ def _parts(text: str) -> tuple[str, ...]:
     found, n_taken = [], 0
     for match in _MARKS.finditer(marked):
         n_names = match[0].count(_MARK)
-        pieces = iter(names[n_taken : n_taken + n_names])
-        found.append(re.sub(_MARK, lambda _, pieces=pieces: next(pieces), match[0]))  # type: ignore[misc]
+        found.append(_filled(match[0], names[n_taken : n_taken + n_names]))
         n_taken += n_names
     return tuple(found)
+
+
+def _filled(marked: str, parts: Sequence[str]) -> str:
+    """Put parts in the places of the marks."""
+    between = marked.split(_MARK)
+    ends = zip(parts, between[1:], strict=True)
+    return "".join([between[0], *(piece for part, after in ends for piece in (part, after))])

@@ -68,6 +68,30 @@ def test_what_is_told_of_the_others_is_what_differs() -> None:
     assert found.others == ("IMG_2.jpg",)
 
 
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        (
+            ["none of the 5 planes within 1 deg", "none of the 12 planes within 1 deg"] * 2,
+            "none of the 5 to 12 planes within 1 deg",
+        ),
+        (["-0.5 m off, 4.5% seen", "1e-3 m off, 21% seen"], "-0.5 to 1e-3 m off, 4.5% to 21% seen"),
+        # With a name, the numbers are those of the first.
+        (
+            ["3 ties of a.jpg agree", "7 ties of a.jpg agree", "3 ties of b.jpg agree"],
+            "3 ties of a.jpg agree (3 times; also b.jpg)",
+        ),
+    ],
+    ids=["counts", "amounts", "with names"],
+)
+def test_no_sentence_says_the_numbers_of_one_of_all(texts: list[str], sentence: str) -> None:
+    (found,) = alike([(f"check#{number}", text) for number, text in enumerate(texts)])
+    assert found.sentence == sentence
+    # Of one place the count tells that it was said several times.
+    (alone,) = alike([("check", text) for text in texts])
+    assert f"({len(texts)} times" in alone.sentence
+
+
 def test_one_sentence_of_several_cells_is_said_once() -> None:
     found = alike([("wall@a=1", "no intensity"), ("wall@a=2", "no intensity")])
     assert found == (
