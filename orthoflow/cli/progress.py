@@ -39,8 +39,9 @@ _REFRESH_PER_S: Final = 4
 # A log file gets a line at least so often.
 _EVERY_S: Final = 10.0
 _NOTEBOOK_EVERY_S: Final = 1.0
-# Of more lines a notebook shows the last.
+# Of more lines a notebook shows the last: while a run goes on, what runs stays in sight below them.
 _NOTEBOOK_LINES: Final = 40
+_NOTEBOOK_LINES_KEPT: Final = 1000
 # Before a step has said for long what it compiles, nobody misses that time.
 _TOLD_COMPILE_S: Final = 2.0
 _STARTING: Final = "starting"
@@ -184,7 +185,7 @@ class PlainProgress:
 class NotebookProgress:
     """A line per ended step and per sense of warnings, below them what runs: one output.
 
-    It is written anew every second, so that a notebook keeps its last state only.
+    It is written anew every second, so that a notebook keeps its last state only: what ended.
     """
 
     def __init__(
@@ -205,7 +206,7 @@ class NotebookProgress:
 
     def __exit__(self, *_: object) -> None:
         self._clock.stop()
-        self._draw()
+        self._place.show("\n".join(_last(self._lines, most=_NOTEBOOK_LINES_KEPT)))
 
     def tell(self, event: RunEvent) -> None:
         """Take an event; the clock shows it."""
@@ -221,11 +222,17 @@ class NotebookProgress:
                 return
 
     def _draw(self) -> None:
-        lines, running = list(self._lines), self._state.running_lines()
-        if (n_more := len(lines) - _NOTEBOOK_LINES) > 0:
-            lines = [lines[0], f"... {counted(n_more, 'line')} more", *lines[n_more + 1 :]]
+        lines, running = _last(self._lines, most=_NOTEBOOK_LINES), self._state.running_lines()
         left = self._state.left() if running else ""
         self._place.show("\n".join([*lines, *running, *([left] if left else [])]))
+
+
+def _last(lines: Sequence[str], *, most: int) -> list[str]:
+    """The first line and the last ones, and how many there are between them."""
+    n_more = len(lines) - most
+    if n_more <= 0:
+        return list(lines)
+    return [lines[0], f"... {counted(n_more, 'line')} more", *lines[n_more + 1 :]]
 
 
 class _NotebookPlace:
@@ -234,6 +241,11 @@ class _NotebookPlace:
     def __init__(self) -> None:
         # Any: IPython need not be there, and its types are none.
         self._handle: Any = None
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether a text stands there."""
+        return self._handle is not None
 
     def show(self, text: str) -> None:
         """Put a text into the place of the one before."""
@@ -368,11 +380,17 @@ def make_progress(cells: Sequence[PlannedCell], *, jobs: int = 1) -> Progress:
 
 @contextmanager
 def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
-    """Show while the block runs that something is done that no cell does, and since when."""
+    """Show while the block runs that something is done that no cell does, and since when.
+
+    A notebook keeps it where it took long, with the time it took.
+    """
     started = time.monotonic()
 
+    def took() -> str:
+        return duration(time.monotonic() - started)
+
     def line() -> str:
-        return f"{what}, {duration(time.monotonic() - started)} so far"
+        return f"{what}, {took()} so far"
 
     if sys.stderr.isatty():
         from rich.console import Console
@@ -390,10 +408,14 @@ def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
     place = _NotebookPlace() if in_notebook() else None
     clock = _Clock(lambda: place.show(line()) if place else say_error(line()), every_s)
     clock.start()
+    end = "broken off after"
     try:
         yield
+        end = "done in"
     finally:
         clock.stop()
+        if place and place.is_taken:
+            place.show(f"{what}: {end} {took()}")
 
 
 class _Clock:

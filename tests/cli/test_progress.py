@@ -231,14 +231,33 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
     assert capsys.readouterr().err == ""
 
 
-def test_of_many_steps_a_notebook_keeps_the_last_lines(places: list[list[str]]) -> None:
+@pytest.mark.parametrize(("n_steps", "first_kept"), [(999, 0), (1000, 1)])
+def test_of_many_steps_a_notebook_shows_the_last_lines_and_keeps_all_of_a_thousand(
+    places: list[list[str]], n_steps: int, first_kept: int
+) -> None:
+    ended = [f"c{index}: cached" for index in range(n_steps)]
     with NotebookProgress(()) as progress:
         progress.tell(EVENTS[0])
-        for index in range(1000):
+        for index in range(n_steps):
             progress.tell(CellFinished(address=f"c{index}", result=OK, cached=True))
-    head, more, *last = places[0][-1].splitlines()
-    assert (head, more) == ("run r1: 5 steps", "... 961 lines more")
-    assert last == [f"c{index}: cached" for index in range(961, 1000)]
+        progress._draw()
+    while_running, kept = (text.splitlines() for text in places[0])
+    n_more = n_steps + 1 - 40
+    assert while_running == ["run r1: 5 steps", f"... {n_more} lines more", *ended[n_more:]]
+    assert kept == [
+        "run r1: 5 steps",
+        *([f"... {first_kept} line more"] if first_kept else []),
+        *ended[first_kept:],
+    ]
+
+
+def test_what_was_broken_off_does_not_run_for_ever_in_a_notebook(places: list[list[str]]) -> None:
+    with NotebookProgress(()) as progress:
+        progress.tell(EVENTS[0])
+        progress.tell(CellStarted(address="plane"))
+        progress._draw()
+    assert places[0][0].splitlines()[1].startswith("plane: 0 %, starting, ")
+    assert places[0][1:] == ["run r1: 5 steps"]
 
 
 def test_a_terminal_s_ipython_is_no_notebook(
@@ -255,8 +274,21 @@ def test_what_a_notebook_waits_for_is_one_line_too(places: list[list[str]]) -> N
     with working_on("reading", every_s=5.0):
         pass
     (written,) = places
-    assert len(written) >= 2
-    assert all(text.startswith("writing the record, 0.") for text in written)
+    assert len(written) >= 3
+    assert all(re.fullmatch(r"writing the record, 0\.\d\d s so far", text) for text in written[:-1])
+    # What is kept does not say that it is still written.
+    assert re.fullmatch(r"writing the record: done in 0\.[34]\d s", written[-1])
+
+
+def test_what_breaks_off_in_a_notebook_is_kept_as_broken_off(places: list[list[str]]) -> None:
+    @working_on("writing", every_s=0.1)
+    def fail_slowly() -> None:
+        time.sleep(0.15)
+        raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        fail_slowly()
+    assert re.fullmatch(r"writing: broken off after 0\.\d\d s", places[0][-1])
 
 
 def test_what_no_cell_does_is_said_while_it_takes_long(capsys: pytest.CaptureFixture[str]) -> None:
