@@ -181,9 +181,13 @@ def _texts(row: Row) -> tuple[str, ...]:
 
 
 def _median(one: MethodOverDatasets) -> str:
-    from orthoflow.report.numbers import number_with_spread
+    from orthoflow.report import numbers
 
-    return _NOTHING if math.isnan(one.median) else number_with_spread(one.median, one.spread)
+    if math.isnan(one.median):
+        return _NOTHING
+    if math.isnan(one.spread):
+        return numbers.number(one.median)
+    return numbers.number_with_spread(one.median, one.spread)
 
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:

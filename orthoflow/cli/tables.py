@@ -239,7 +239,13 @@ def medians(counts: Mapping[str, Collection[int]], n_datasets: int) -> str:
     'medians of 2 datasets, of fewer where some have no value: depth_rmse_mm 1, n_oriented 0 to 2'
     >>> medians({"rms_mm": [2]}, 2)
     'medians of 2 datasets'
+    >>> medians({"rms_mm": [2], "check.main_found": [2]}, 2)
+    'medians (of check.main_found shares) of 2 datasets'
     """
+    from orthoflow.report.rankings import is_yes_or_no
+
+    shares = ", ".join(name for name in counts if is_yes_or_no(name.rpartition(".")[2]))
+    what = f"medians (of {shares} shares)" if shares else "medians"
     ends = {name: (min(found), max(found)) for name, found in counts.items()}
     fewer = [
         f"{name} {least}" if least == most else f"{name} {least} to {most}"
@@ -247,7 +253,7 @@ def medians(counts: Mapping[str, Collection[int]], n_datasets: int) -> str:
         if least < n_datasets
     ]
     of_fewer = f", of fewer where some have no value: {', '.join(fewer)}" if fewer else ""
-    return f"medians of {counted(n_datasets, 'dataset')}{of_fewer}"
+    return f"{what} of {counted(n_datasets, 'dataset')}{of_fewer}"
 
 
 def _distance_text(distance: Distance) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
+
+import numpy as np
 
 from orthoflow.engine.run_folder import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
@@ -22,6 +23,7 @@ from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import words_of
+from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.format import DATA
@@ -72,7 +74,7 @@ class RunSummary:
         run_id: of the run.
         started: ISO 8601 UTC; empty where nothing says it.
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
-            has it; of several datasets the median.
+            has it; of several datasets the median, of what is yes or no the share.
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
@@ -298,7 +300,10 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         workflow=record.name,
         run_id=record.run_id,
         started=record.started,
-        metrics={name: statistics.median(found) for name, found in values.items()},
+        metrics={
+            name: middle_of(np.array(found), name.rpartition(".")[2])
+            for name, found in values.items()
+        },
         n_datasets=len(parts),
         n_values={name: len(found) for name, found in values.items()} if parts else {},
         labels=_labels(run),

@@ -16,14 +16,14 @@ import numpy as np
 
 from orthoflow.alike import first_few
 from orthoflow.foreign_text import shown
-from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of, wanted_metrics
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
-from orthoflow.report.rankings import Sense, cost_share
+from orthoflow.report.paired import middle_of, spread_of
+from orthoflow.report.rankings import Sense, cost_share, is_yes_or_no
 from orthoflow.workflow.format import DATA
 
 _MOST_CURVES: Final = 12
@@ -269,24 +269,23 @@ def _lines(
         )
     return {
         name: [
-            _point(x, found, is_over=is_over, is_error=column.sense is Sense.LESS)
-            for x, found in sorted(line.items())
+            _point(x, found, is_over=is_over, column=column) for x, found in sorted(line.items())
         ]
         for name, line in values.items()
     }
 
 
-def _point(x: float, found: Sequence[_Value], *, is_over: bool, is_error: bool) -> _Point:
+def _point(x: float, found: Sequence[_Value], *, is_over: bool, column: Column) -> _Point:
     is_baseline = any(one.is_baseline for one in found)
     numbers = np.array([one.value for one in found])
-    if is_error:
+    if column.sense is Sense.LESS:
         # Errors of both signs would make each other small, and the most negative look best.
         numbers = np.abs(numbers)
     if len(found) == 1:
         # A bar over datasets is how far they lie apart, not how far the repeats of one do.
         y, spread = float(numbers[0]), math.nan if is_over else found[0].spread
     else:
-        y, spread = float(np.median(numbers)), median_deviation(numbers)
+        y, spread = middle_of(numbers, column.metric), spread_of(numbers, column.metric)
     return _Point(x=x, y=y, spread=spread, found=tuple(found), is_baseline=is_baseline)
 
 
@@ -308,13 +307,18 @@ def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
     return f", no line between those of unlike {what}{some}"
 
 
-def _behind(points: Sequence[_Point], n_datasets: int) -> str:
+def _behind(points: Sequence[_Point], n_datasets: int, metric: str) -> str:
     """Say how many datasets points over datasets are of: those that failed have no part."""
     least, most = min(point.n for point in points), max(point.n for point in points)
     if most == 1:
         return f"each of the only one of {n_datasets} datasets that has a value, without bars"
     counted = f"{least}" if least == most else f"{least} to {most}"
     of_all = f" of {n_datasets}" if least < n_datasets else ""
+    if is_yes_or_no(metric):
+        return (
+            f"means of {counted}{of_all} datasets: the share of them, and of their repeats, "
+            "where it is so (1)"
+        )
     where = ", where there is more than one" if least == 1 else ""
     return (
         f"medians of {counted}{of_all} datasets, bars 1.4826 times the median absolute "
@@ -332,7 +336,8 @@ def _curve(
     title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
     has_spread = any(math.isfinite(point.spread) for points in lines.values() for point in points)
     if n_datasets > 1:
-        said = _behind([point for points in lines.values() for point in points], n_datasets)
+        every = [point for points in lines.values() for point in points]
+        said = _behind(every, n_datasets, column.metric)
     elif has_spread:
         said = "means of the repeats, bars their standard deviation"
     else:

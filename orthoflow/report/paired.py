@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.alike import first_few
 from orthoflow.geometry.robust import median_deviation
@@ -17,7 +18,7 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments
-from orthoflow.report.rankings import Sense, badness
+from orthoflow.report.rankings import Sense, badness, is_yes_or_no
 from orthoflow.workflow.cells import variants_text
 from orthoflow.workflow.format import DATA
 
@@ -42,6 +43,7 @@ class Paired:
         losses: datasets on which it is worse.
         median: median of the differences, in the metric's unit; negative where it has less. For
             signed errors the sizes are compared, where 1 is best the factors to 1, as logarithms.
+            Of what is yes or no the mean, the difference of the shares.
         p: Wilcoxon's signed-rank test that the differences lie about zero, two-sided; NaN of
             fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
@@ -71,8 +73,9 @@ class MethodOverDatasets:
         failed: datasets on which the combination failed; they have no part in any number.
         n_absent: datasets that have no value though nothing failed, or were left out.
         partly: of datasets with a value of only some repeats, e.g. `r5 1 of 3 repeats`.
-        median: over the datasets, of signed errors of their sizes; NaN without any.
-        spread: 1.4826 times the median absolute deviation from it; NaN without any.
+        median: over the datasets, of signed errors of their sizes; NaN without any. Of what is yes
+            or no the mean, the share of yes.
+        spread: 1.4826 times the median absolute deviation from it; NaN without any, and of shares.
         paired: against the reference; None for itself, and where neither more nor less is better.
         n_unlike: datasets on which both have a value, of environments that are not alike.
         n_other_photos: datasets on which both have a value, of unequal numbers of photos.
@@ -113,6 +116,11 @@ class MetricOverDatasets:
     methods: tuple[MethodOverDatasets, ...]
 
     @property
+    def middle(self) -> str:
+        """What the medians are, which are shares where the metric is yes or no."""
+        return "share" if is_yes_or_no(self.metric) else "median"
+
+    @property
     def reference(self) -> str:
         """What the others are compared with, where nothing is said of them."""
         return next((one.name for one in self.told if one.is_reference), "")
@@ -136,6 +144,25 @@ class MetricOverDatasets:
             )
             for one in alike.values()
         )
+
+
+def middle_of(values: NDArray[np.float64], metric: str) -> float:
+    """What stands for the values of several datasets; NaN without any.
+
+    Their median, but of what is yes or no the mean, the share of yes: the median would hide all
+    that is so on fewer than half of them.
+    """
+    if not values.size:
+        return math.nan
+    return float(np.mean(values) if is_yes_or_no(metric) else np.median(values))
+
+
+def spread_of(values: NDArray[np.float64], metric: str) -> float:
+    """How far the values of several datasets lie apart; NaN without any.
+
+    A share has none: it says itself how many are the one and how many the other.
+    """
+    return math.nan if is_yes_or_no(metric) or not values.size else median_deviation(values)
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
@@ -340,9 +367,9 @@ def _methods(
                     for name, value in values.items()
                     if value.n_repeats < value.n_all
                 ),
-                median=float(np.median(numbers)) if numbers.size else math.nan,
-                spread=median_deviation(numbers) if numbers.size else math.nan,
-                paired=_paired(ours, theirs, sense),
+                median=middle_of(numbers, column.metric),
+                spread=spread_of(numbers, column.metric),
+                paired=_paired(ours, theirs, column),
                 n_unlike=len(both) - len(like),
                 n_other_photos=len(like) - len(ours),
                 own=_own(by_name.values(), step),
@@ -365,22 +392,24 @@ def _own(ways: Iterable[Combination], step: str) -> str:
 
 
 def _paired(
-    ours: Mapping[str, Measured], theirs: Mapping[str, Measured], sense: Sense
+    ours: Mapping[str, Measured], theirs: Mapping[str, Measured], column: Column
 ) -> Paired | None:
+    sense = column.sense
     worse = {
         name: badness(ours[name].value, sense) - badness(theirs[name].value, sense) for name in ours
     }
     worse = {name: value for name, value in worse.items() if math.isfinite(value)}
-    return paired_differences(worse, sense) if worse else None
+    return paired_differences(worse, sense, column.metric) if worse else None
 
 
-def paired_differences(worse: Mapping[str, float], sense: Sense) -> Paired:
+def paired_differences(worse: Mapping[str, float], sense: Sense, metric: str = "") -> Paired:
     """Judge differences of pairs.
 
     Args:
         worse: dataset -> how much worse than the reference the method is there, finite; at least
             one.
         sense: what makes a value good, for the sign of the differences that are told.
+        metric: its name.
     """
     sign = -1.0 if sense is Sense.MORE else 1.0
     differences = np.array(list(worse.values()))
@@ -403,7 +432,7 @@ def paired_differences(worse: Mapping[str, float], sense: Sense) -> Paired:
         n=len(worse),
         wins=int((differences < 0).sum()),
         losses=int((differences > 0).sum()),
-        median=sign * float(np.median(differences)),
+        median=sign * middle_of(differences, metric),
         p=p,
         effect=effect,
         deciding=deciding,

@@ -225,6 +225,18 @@ def count_of_photos(metric: str) -> str:
     return next((n for pattern, n in _OVER_PHOTOS.items() if fnmatchcase(metric, pattern)), "")
 
 
+_YES_OR_NO: Final = ("main_found", "is_*", "has_*")
+
+
+def is_yes_or_no(metric: str) -> bool:
+    """Whether a metric is 1 where something is so and 0 where not, as its name says.
+
+    >>> is_yes_or_no("main_found"), is_yes_or_no("n_found")
+    (True, False)
+    """
+    return any(fnmatchcase(metric, pattern) for pattern in _YES_OR_NO)
+
+
 def badness(value: float, sense: Sense) -> float:
     """Give a number that is smaller the better the value is; signed errors count by their size.
 

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from orthoflow.report import curves as module
+from orthoflow.report.comparisons import Column
 from orthoflow.report.curves import curve_files, curves, curves_over, sweeps
+from orthoflow.report.rankings import Sense
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
 CUT = "points to the first plane, RMS / mm, cut at its own tolerance"
@@ -268,20 +270,22 @@ def over_rooms(
     folder: Path, values: dict[str, dict[float, tuple[float | None, ...]]], metric: str
 ) -> dict[str, HeldRun]:
     """Rooms with a value per tolerance and repeat, None where the repeat has none."""
-    return {
-        room: held(
-            folder,
-            [
-                cell(
-                    f"plane@data={room},plane=v{x}" + (f"#{repeat}" if repeat else ""),
-                    params={"tolerance_m": x},
-                    metrics=() if y is None else metrics(**{metric: y}),
-                )
-                for x, found in by_x.items()
-                for repeat, y in enumerate(found)
-            ],
-        )
+    cells = {
+        room: [
+            cell(
+                f"plane@data={room},plane=v{x}" + (f"#{repeat}" if repeat else ""),
+                params={"tolerance_m": x},
+                metrics=() if y is None else metrics(**{metric: y}),
+            )
+            for x, found in by_x.items()
+            for repeat, y in enumerate(found)
+        ]
         for room, by_x in values.items()
+    }
+    asked = compared_resolved(f"*.{metric}")
+    return {
+        room: HeldRun(path=folder / "run.h5", record=record(own, workflow_resolved=asked))
+        for room, own in cells.items()
     }
 
 
@@ -310,6 +314,21 @@ def test_no_line_joins_points_of_other_datasets_or_repeats(tmp_path: Path) -> No
         "means of the repeats, bars their standard deviation, no line between those of unlike "
         "numbers of repeats; of only some repeats: at 3 (1 of 2)"
     ) in curve.caption
+
+
+def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) -> None:
+    found: dict[str, dict[float, tuple[float | None, ...]]] = {
+        "calm": {0.02: (1.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0,) * 4},
+        "dark": {0.02: (0.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0,) * 4},
+        "wide": {0.02: (1.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0, 0.0, 0.0, 0.0)},
+    }
+    (curve,) = curves_over(over_rooms(tmp_path, found, "main_found"))
+    assert re.findall("<title>([^<]*)", curve.svg) == ["0.02: 0.6667", "0.05: 1", "0.1: 0.75"]
+    assert 'class="bar' not in curve.svg
+    assert curve.caption.startswith(
+        "Points are means of 3 datasets: the share of them, and of their repeats, where it is so "
+        "(1); more is better."
+    )
 
 
 def test_far_apart_values_lie_on_a_logarithmic_axis(tmp_path: Path) -> None:
@@ -570,7 +589,9 @@ def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
 @pytest.mark.parametrize(("is_error", "y"), [(True, 3.0), (False, -2.0)])
 def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
     found = [module._Value(value, math.nan, False) for value in (-4.0, 3.0, -2.0)]
-    point = module._point(1.0, found, is_over=True, is_error=is_error)
+    sense = Sense.LESS if is_error else Sense.NEITHER
+    column = Column(step="plane", metric="shift_mm", label="", sense=sense)
+    point = module._point(1.0, found, is_over=True, column=column)
     assert (point.y, point.n) == (y, 3)
 
 

@@ -162,12 +162,14 @@ def test_values_of_no_size_are_not_paired() -> None:
         "d": measured(math.inf), "e": measured(-1.0),
     }  # fmt: skip
     theirs = {name: measured(1.5) for name in "ade"}
-    found = module._paired(ours, theirs, Sense.LESS)
+    found = module._paired(ours, theirs, column(Sense.LESS))
     assert found is not None
     # Of signed errors the sizes.
     assert (found.n, found.wins, found.losses) == (2, 1, 1)
     assert found.deciding == {"a": 0.5}
-    assert module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, Sense.LESS) is None
+    assert (
+        module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, column(Sense.LESS)) is None
+    )
 
 
 def column(sense: Sense) -> Column:
@@ -223,6 +225,21 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     first, second = module._methods(found, ("x", "y", "z"), partners, column(Sense.NEITHER), ALIKE)
     assert first.median == 3.0
     assert second.paired is None
+
+
+def test_of_what_is_found_or_not_the_share_of_datasets_is_told() -> None:
+    found = {
+        "plane=a": dict(zip("xyz", map(combination, (1.0, 1.0, 1.0)), strict=True)),
+        "plane=b": dict(zip("xyz", map(combination, (1.0, 0.0, 0.5)), strict=True)),
+    }
+    partners = {"plane=a": "", "plane=b": "plane=a"}
+    told = Column(step="check", metric="main_found", label="", sense=Sense.MORE)
+    first, second = module._methods(found, ("x", "y", "z"), partners, told, ALIKE)
+    # Their medians would be 1 and 0.5.
+    assert (first.median, second.median) == (1.0, 0.5)
+    assert math.isnan(second.spread)
+    assert second.paired is not None
+    assert (second.paired.median, second.paired.losses) == (-0.5, 2)
 
 
 def test_errors_of_unequal_numbers_of_photos_are_not_paired() -> None:
