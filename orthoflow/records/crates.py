@@ -460,7 +460,7 @@ def _how_to_read(record: RunRecord) -> str:
     return (
         f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
-        f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o again` computes it "
+        f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o ../again` computes it "
         f"anew from {source}; any HDF5 reader opens it, too. Paths in "
         f"{WORKFLOW_FILE} are of the machine that it ran on."
     )

@@ -64,7 +64,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
 
     Raises:
         InputError: the file is no such key, or the password does not open it.
-        ArgumentError: the record was signed with another key before.
+        ArgumentError: a signature of another key lies beside the record.
         RecordError: the record is damaged.
         StoreError: the disk refuses.
         PluginError: the library cryptography is missing.
@@ -74,8 +74,8 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
     public_key = _openssh(key.public_key())
     if earlier is not None and earlier.public_key != public_key:
         raise ArgumentError(
-            f"{path} is signed with the key {earlier.fingerprint} already: remove "
-            f"{path.name}{SIGNATURE_SUFFIX} to sign it with another"
+            f"beside {path} there is a signature already, said to be of the key "
+            f"{earlier.fingerprint}: remove {path.name}{SIGNATURE_SUFFIX} to sign with another"
         )
     content_sha256 = _content_sha256(path)
     made = Signature(
@@ -132,8 +132,8 @@ def check_signature(record: Path, signer: Path) -> Signature:
     wanted = _openssh(key)
     if found.public_key != wanted:
         raise RecordError(
-            f"{record.name} is signed with the key {found.fingerprint}, not with "
-            f"{_fingerprint(wanted)} of {signer}"
+            f"the signature beside {record.name} is said to be of the key {found.fingerprint}, "
+            f"not of {_fingerprint(wanted)} in {signer}"
         )
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - only those who sign
 

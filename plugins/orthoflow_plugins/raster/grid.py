@@ -331,8 +331,8 @@ def _log_cuts(
                 tell = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
                 tell(
                     f"{planes.names[index]}: what adjoins it at its {side} runs askew, and its "
-                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of the wall "
-                    "are left out there; margin_m adds them"
+                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
+                    "plane are left out there, more of what stands out of it; margin_m adds them"
                 )
 
 
