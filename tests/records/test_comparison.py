@@ -153,7 +153,7 @@ def test_what_only_one_of_the_runs_has_stands_alone() -> None:
         HeldRun(path=Path("run.h5"), record=record([cell(name, params={"x": value}, seed=None)]))
         for name, value in (("scan", 1), ("room", 2))
     )
-    one, two = (ParameterValue(value=value, is_set=False) for value in (1, 2))
+    one, two = (ParameterValue(value=value, is_set=True) for value in (1, 2))
     assert module._per_cell(left, right, {"room": "room"}, module._parameters) == (
         Pair(cell="scan", name="x", left=one, right=None),
         Pair(cell="room", name="x", left=None, right=two),
