@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.format import StepVariant, Workflow
 
 _CELL: Final = "gsd_m"
+_CROP: Final = "crop"
+# The kind whose methods find photos on walls.
+_MATCHING: Final = "match."
 # Cells of walls and plans: finer than any scan, coarser than anything that is drawn of a building.
 _LEAST_GSD_M: Final = 0.0001
 _MOST_GSD_M: Final = 0.5
@@ -16,7 +19,12 @@ _MILLIMETRES: Final = 1000.0
 
 def doubts_about(workflow: Workflow) -> tuple[str, ...]:
     """Say in a sentence each what is allowed and can hardly be meant."""
-    return (*_unused_inputs(workflow), *_idle_datasets(workflow), *_cell_sizes(workflow))
+    return (
+        *_unused_inputs(workflow),
+        *_idle_datasets(workflow),
+        *_cell_sizes(workflow),
+        *_cropped_matching(workflow),
+    )
 
 
 def _unused_inputs(workflow: Workflow) -> Iterator[str]:
@@ -44,16 +52,7 @@ def _idle_datasets(workflow: Workflow) -> Iterator[str]:
 
 
 def _cell_sizes(workflow: Workflow) -> Iterator[str]:
-    calls = [
-        ("", step.name, variant) for step in workflow.steps.values() for variant in step.variants
-    ]
-    for dataset in workflow.chosen_data:
-        calls += [
-            (f" of dataset {dataset.name}", step, variant)
-            for (step, _), variant in dataset.calls.items()
-            if _CELL in {key.rpartition(".")[2] for key in dataset.sets}
-        ]
-    for whose, step, variant in calls:
+    for whose, step, variant in _calls(workflow, _CELL):
         gsd_m = variant.params.get(_CELL)
         if isinstance(gsd_m, int | float) and not _LEAST_GSD_M <= gsd_m <= _MOST_GSD_M:
             place = ".".join(part for part in (step, variant.name, _CELL) if part)
@@ -65,3 +64,37 @@ def _cell_sizes(workflow: Workflow) -> Iterator[str]:
                 f"{place}{whose} is {gsd_m:g} m, which can hardly be meant: cells are "
                 f"{_LEAST_GSD_M:g} to {_MOST_GSD_M:g} m wide{hint}"
             )
+
+
+def _cropped_matching(workflow: Workflow) -> Iterator[str]:
+    cropped = {
+        step
+        for _, step, variant in _calls(workflow, _CROP)
+        if variant.params.get(_CROP) is not None
+    }
+    matching = [
+        step
+        for step in workflow.steps.values()
+        if any(variant.method.startswith(_MATCHING) for variant in step.variants)
+    ]
+    # Whose cameras are given needs no matching.
+    if any(step.unless and workflow.inputs[step.unless].files for step in matching):
+        return
+    for first in matching[:1]:
+        for wall in cropped.intersection(first.upstream()):
+            yield (
+                f"{wall}.{_CROP} leaves {first.name} less to match photos to: fewer are oriented, "
+                "and less well; run without it first, and hand on the cameras which that run "
+                "found: --input cameras=RUN/products/orient/cameras.json"
+            )
+
+
+def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
+    """Whose, of which step and how: all calls, of datasets those that set the parameter."""
+    for step in workflow.steps.values():
+        for variant in step.variants:
+            yield "", step.name, variant
+    for dataset in workflow.chosen_data:
+        if parameter in {key.rpartition(".")[2] for key in dataset.sets}:
+            for (name, _), variant in dataset.calls.items():
+                yield f" of dataset {dataset.name}", name, variant

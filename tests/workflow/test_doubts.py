@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.doubts import doubts_about
+from orthoflow.workflow.format import StepVariant, Workflow, WorkflowInputSpec, WorkflowStep
+from orthoflow.workflow.shapes import Reference
 from tests.laboratories import GOOD, load
 
 
@@ -34,6 +37,36 @@ def test_cells_that_cannot_be_meant_are_told(
 ) -> None:
     text = GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}")
     assert doubts_about(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
+
+
+@pytest.mark.parametrize("step", ["ties", "colours"])
+def test_a_crop_is_doubted_where_photos_are_matched_to_it(step: str) -> None:
+    """Who paints a scan's own colours loses nothing by a crop."""
+    method = {"ties": "match.sift", "colours": "ortho.pointcloud-direct"}[step]
+    wall = StepVariant(name="", method="raster.grid", params={"crop": [0, 0, 1, 1]})
+    steps = [
+        WorkflowStep(name="wall", variants=(wall,)),
+        WorkflowStep(
+            name=step,
+            variants=(StepVariant(name="", method=method),),
+            inputs={"walls": (Reference(source="wall", name="walls"),)},
+            unless="cameras",
+        ),
+    ]
+    flow = Workflow(
+        name="flow",
+        path=Path("flow.yaml"),
+        source="",
+        seed=1,
+        inputs={"cameras": WorkflowInputSpec(name="cameras")},
+        steps={one.name: one for one in steps},
+    )
+    told = doubts_about(flow)
+    assert len(told) == (step == "ties")
+    assert all(text.startswith("wall.crop leaves ties less to match photos to: ") for text in told)
+    # Who hands cameras on has done what it says.
+    given = {"cameras": WorkflowInputSpec(name="cameras", files=("cameras.json",))}
+    assert doubts_about(replace(flow, inputs=given)) == ()
 
 
 def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:

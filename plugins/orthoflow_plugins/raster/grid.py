@@ -59,13 +59,6 @@ _FAR_M: Final = 1.0
 # So much of a wall is missed on a drawing.
 _LARGE_CUT_M: Final = 0.05
 
-# Who hands cameras on has done what it says.
-_CROPPED: Final = (
-    "crop leaves less to match photos to: they find ties within it only, so that fewer are "
-    "oriented, and less well, unless cameras are given later (orient.given): run without crop "
-    "first, and hand on what that run found: --input cameras=RUN/products/orient/cameras.json"
-)
-
 
 class RasterGrid(Method):
     """Lay the cloud into a raster on each wall: depth, spread, count, intensity, colour.
@@ -394,7 +387,6 @@ def _crops(
         ctx.warn(
             f"crop cuts the same part out of {len(frames)} walls; choose one with near or ranks"
         )
-    ctx.warn(_CROPPED)
     return crops
 
 
