@@ -26,7 +26,7 @@ from orthoflow.engine.memory import (
     tree_memory,
 )
 from orthoflow.engine.results import CellResult
-from orthoflow.errors import StoreError
+from orthoflow.errors import ArgumentError, StoreError
 from tests.engine_world import World, has_ended, toy_world
 
 MIB = 1 << 20
@@ -375,7 +375,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_sentence(tiny_world: World) -
 def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> None:
     plan_first = "steps: {a: {use: make.range}}"
     (world.folder / "file").write_text("no folder")
-    with pytest.raises(StoreError, match=r"cannot write to .*file/run: a file stands where"):
+    with pytest.raises(ArgumentError, match=r"file/run can be no folder, for .*/file is a file; "):
         world.run(plan_first, into="file/run")
 
 

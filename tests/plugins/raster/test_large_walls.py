@@ -46,7 +46,6 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"orthoflow_plugins.{place}.IN_MEMORY_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.raster.reporting._LONGEST_PX", 100)
 
 
 @contextmanager
