@@ -196,7 +196,7 @@ class MosaicSeams(Method):
             verdict = _join(group, name, params, surroundings, allocate)
             image = replace(verdict.image, plane_index=inputs.layers.number(index))
             verdicts.append(replace(verdict, image=image))
-            _show(ctx, image)
+            _show(ctx, image, inputs.cameras)
         _report(ctx, verdicts)
         gains: dict[str, JsonValue] = {
             item.image.name: dict(item.gains) for item in verdicts if item.gains
@@ -334,19 +334,19 @@ def _wall(walls: Walls | None, index: int) -> Wall | None:
     return walls.walls[index] if walls is not None and index < len(walls.walls) else None
 
 
-def _show(ctx: StepContext, image: Orthoimage) -> None:
+def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
     if not image.sources:
         ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
     else:
-        _tell_of_empty(ctx, image)
+        _tell_of_empty(ctx, image, cameras)
     if len(image.sources) > 1:
         ctx.figure(f"wall_{image.number}_sources", _source_map(image), _caption(image))
 
 
-def _tell_of_empty(ctx: StepContext, image: Orthoimage) -> None:
+def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
     """Say in words why cells show nothing, where that is for want of photos."""
     words = {
-        OrthoMask.NONE: "lie in no photo (take one there)",
+        OrthoMask.NONE: f"lie in no oriented photo ({_way_to_a_photo(cameras)})",
         OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too flatly (take "
         "one from another side)",
         OrthoMask.NO_SURFACE: "have no surface (the step that rastered the wall says why)",
@@ -362,6 +362,15 @@ def _tell_of_empty(ctx: StepContext, image: Orthoimage) -> None:
         f"the orthoimage of {image.name}: {sum(shares.values()):.0%} of its cells are empty: "
         f"{causes}"
     )
+
+
+def _way_to_a_photo(cameras: Cameras | None) -> str:
+    """Say what would fill cells of no oriented photo; one that was refused may lie there."""
+    if cameras is None:
+        return "see which are refused, or take one there"
+    n_photos = len(cameras.cameras)
+    n_refused = n_photos - len(_oriented(cameras))
+    return f"{n_refused} of {n_photos} photos are not oriented" if n_refused else "take one there"
 
 
 def _source_map(image: Orthoimage) -> bytes:

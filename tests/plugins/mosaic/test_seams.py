@@ -20,7 +20,7 @@ from orthoflow.files.geotiff import read_raster
 from orthoflow.files.images import decode_image
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame, frame_over
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask
+from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, Orthoimages, OrthoMask
 from tests import raster_scenes as scenes
 
 
@@ -251,7 +251,10 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("missing", "words"),
     [
-        (LayerMask.OUTSIDE, "25% lie in no photo (take one there)"),
+        (
+            LayerMask.OUTSIDE,
+            "25% lie in no oriented photo (see which are refused, or take one there)",
+        ),
         (LayerMask.OCCLUDED, "25% are hidden in every photo that looks there"),
     ],
     ids=["no photo", "hidden"],
@@ -268,6 +271,33 @@ def test_cells_that_no_photo_shows_are_told_of_with_their_cause(
     (warning,) = ctx.warnings
     assert "the orthoimage of west: 35% of its cells are empty: " + words in warning
     assert "10% have no surface" in warning
+
+
+@pytest.mark.parametrize(
+    ("states", "way"),
+    [
+        (("ok", "ok"), "take one there"),
+        (("ok", "too few ties", "too few ties"), "2 of 3 photos are not oriented"),
+    ],
+    ids=["all oriented", "two refused"],
+)
+def test_a_new_photo_is_asked_for_only_where_none_was_refused(
+    tmp_path: Path, states: tuple[str, ...], way: str
+) -> None:
+    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
+    mask[:10] = LayerMask.OUTSIDE
+    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
+    cameras = Cameras(
+        cameras=tuple(
+            Camera(photo=f"{number}.jpg", status=status) for number, status in enumerate(states)
+        )
+    )
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)), cameras=cameras)
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    assert ctx.warnings == [
+        f"the orthoimage of west: 25% of its cells are empty: 25% lie in no oriented photo ({way})"
+    ]
 
 
 @pytest.mark.parametrize(("n_cells", "is_told"), [(15, False), (17, True)])
