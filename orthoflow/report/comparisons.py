@@ -41,6 +41,7 @@ _BUSY_TIMES: Final = 3.0
 _COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
 _TIMED_S: Final = 0.1
+_LEADS: Final = (Mark.BEST, Mark.NEAR)
 _NAMED: Final = 3  # numbers that a combination is best in
 
 
@@ -204,6 +205,12 @@ class ComparisonTable:
     def n_judged(self) -> int:
         """How many of the columns have a good side, time and memory included."""
         return sum(column.sense is not Sense.NEITHER for column in self.columns) + 2
+
+    @property
+    def n_undecided(self) -> int:
+        """In how many of these no combination leads, so that they count for nobody."""
+        places = zip(*(row.judged for row in self.rows), strict=True)
+        return self.n_judged - sum(any(one.mark in _LEADS for one in place) for place in places)
 
     @property
     def glance(self) -> tuple[Standing, ...]:

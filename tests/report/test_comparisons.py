@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from orthoflow.report.comparisons import ComparisonTable, Row
-from orthoflow.report.rankings import Sense
+from orthoflow.report.rankings import Mark, Sense, Value
 
 
 def row(*variants: str, **more: Any) -> Row:
@@ -53,3 +53,18 @@ def test_time_and_memory_are_judged_besides_what_has_a_good_side() -> None:
     assert table().n_judged == 2
     senses = (Sense.LESS, Sense.NEITHER, Sense.MORE, Sense.NEITHER, Sense.ONE)
     assert table(senses=senses).n_judged == 5
+
+
+def test_numbers_in_which_nobody_leads_are_counted() -> None:
+    def judged(*marks: Mark) -> Row:
+        *values, time, memory = (Value(text="1", sort=1.0, mark=mark) for mark in marks)
+        return row("a", "x", values=tuple(values), time=time, memory=memory)
+
+    # One is described, not judged; then one that one leads in, one that two share, three level.
+    senses = (Sense.NEITHER, Sense.LESS, Sense.MORE, Sense.LESS)
+    level = (Mark.NONE, Mark.NONE)
+    first = judged(Mark.NONE, Mark.BEST, Mark.NEAR, Mark.NONE, *level)
+    other = judged(Mark.NONE, Mark.WORST, Mark.NEAR, Mark.FEWER, *level)
+    assert table(first, other, senses=senses).n_undecided == 3
+    assert table(first, other, senses=senses).n_judged == 5
+    assert table(judged(Mark.BEST, Mark.NEAR), judged(Mark.NONE, Mark.NEAR)).n_undecided == 0

@@ -858,6 +858,31 @@ def test_numbers_have_four_digits_and_their_unit(value: float, unit: str, printe
     assert number_with_unit(value, unit) == printed
 
 
+@pytest.mark.parametrize(
+    ("factor_u", "factor_v", "factor_cost", "n_told"), [(1, 1, 1, 4), (3, 1, 1, 3), (3, 3, 3, 0)]
+)
+def test_a_glance_says_in_how_many_numbers_nobody_leads(
+    factor_u: float, factor_v: float, factor_cost: float, n_told: int, tmp_path: Path
+) -> None:
+    cells = [
+        cell(
+            f"check@plane={name}",
+            metrics=metrics(rmse_u_mm=u, rmse_v_mm=v),
+            wall_s=cost,
+            peak_rss_mib=100.0 * cost,
+        )
+        for name, u, v, cost in (("fine", 1, 1, 1), ("coarse", factor_u, factor_v, factor_cost))
+    ]
+    asked = compared_resolved("check.rmse_*")
+    told = (
+        f"; in {n_told} of them no combination leads (all are level, or cannot be ranked), which"
+        " counts for nobody"
+    )
+    write_report([run(*cells, workflow_resolved=asked)], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"Of the 4 numbers that have a good side{told if n_told else ''}. " in page
+
+
 def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:
     table = comparison_table([compared])
     assert table is not None
