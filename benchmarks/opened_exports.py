@@ -27,7 +27,6 @@ from typing import Final
 import ezdxf
 import laspy
 import numpy as np
-import open3d
 import pdfplumber
 import prov.model
 import pye57
@@ -40,6 +39,7 @@ from PIL import Image
 from pystac.validation import RegisteredValidator
 
 from orthoflow.cli.program import program
+from orthoflow.files.open3d_guard import load_open3d
 from tests.browser import PROGRAM, browser
 
 MM: Final = 25.4 / 72.0
@@ -204,7 +204,7 @@ def laz_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Places and colours by open3d."""
-    read = open3d.io.read_point_cloud(str(path))
+    read = load_open3d("looking at clouds").io.read_point_cloud(str(path))
     return np.asarray(read.points), np.rint(255 * np.asarray(read.colors)).astype(np.uint8)
 
 

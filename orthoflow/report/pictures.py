@@ -223,7 +223,7 @@ def _states(image: Orthoimage) -> str:
         OrthoMask.FILLED: "filled from neighbours",
         OrthoMask.NO_SURFACE: "where the scan has nothing of the wall",
         OrthoMask.OCCLUDED: "hidden from every photo",
-        OrthoMask.NONE: "in no photo",
+        OrthoMask.NONE: "in no oriented photo",
     }
     shares = {said: count_cells(image.mask, state) for state, said in words.items()}
     told = [f"{_percent(n / image.mask.size)} {said}" for said, n in shares.items() if n]

@@ -143,7 +143,7 @@ def test_an_orthoimage_says_what_became_of_its_cells() -> None:
     one, _ = orthoimage_pictures(run(orthoimages(), orthoimages()))
     assert one.caption == (
         "12.00 x 3.00 m at 10 mm, 1200 x 300 cells; of all cells 85.0 % painted, 10.0 % filled "
-        "from neighbours, 2.0 % hidden from every photo, 3.0 % in no photo"
+        "from neighbours, 2.0 % hidden from every photo, 3.0 % in no oriented photo"
     )
     assert (one.title, one.name, one.wall, one.number) == ("wall 4 (plane=fine)", "wall 4", 0, 4)
     assert (one.cell, one.frame, one.file) == ("mosaic@plane=fine", FRAME, "")
