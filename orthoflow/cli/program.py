@@ -44,8 +44,8 @@ that can be compared and repeated.
 A first run, on a simulated room: orthoflow run quickstart.yaml
 
 Exit codes: 0 good; 1 some step failed; 2 the workflow, an argument or an input is invalid; 3 a
-record is damaged, differs or cannot be replayed, for lack of its inputs too; 4 a plugin or a
-library is missing; 130 interrupted.
+record is damaged, differs or cannot be replayed; 4 a plugin or a library is missing; 130
+interrupted.
 """
 
 

@@ -197,7 +197,9 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
             replace(result, accuracy=(*(measured or unmeasured), *result.accuracy, *oriented))
             for number in ([wall] if wall in files else sorted(files))
             for measured in [tuple(_accuracy(inspections, number))]
-            for unmeasured in [(_unmeasured(run),) if "ortho" in files[number] else ()]
+            for unmeasured in [
+                (_unmeasured(run),) if "ortho" in files[number] and not measured else ()
+            ]
             for result in [_wall_result(run, number, files[number], kept, colours)]
         ),
         planes=kept,
