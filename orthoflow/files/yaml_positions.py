@@ -10,7 +10,6 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any, Final, Protocol, TypeAlias
 
 from ruamel.yaml import YAML
@@ -320,14 +319,13 @@ class _Converter:
         if str(node.tag) not in (_TAG + "map", _TAG + "seq"):
             self._refuse_tag(node, position, path)
         if isinstance(node, SequenceNode):
-            self._doubt_commas(node, path)
             items = (
                 self.convert(item, f"{path}[{index}]", depth + 1)
-                for index, item in enumerate(node.value)
+                for index, item in enumerate(self._joined_items(node.value, path))
             )
             return Listing(position=position, items=tuple(items))
         entries: dict[str, Entry] = {}
-        for key_node, value_node in node.value:
+        for key_node, value_node in self._joined_entries(node.value, path):
             key_position = _mark_position(key_node.start_mark)
             key, is_text = self._key(key_node, key_position, path)
             value = self.convert(value_node, join(path, key), depth + 1)
@@ -341,24 +339,48 @@ class _Converter:
             self._merge(entries, position, path)
         return Table(position=position, entries=tuple(entries.values()))
 
-    def _doubt_commas(self, node: SequenceNode, path: str) -> None:
-        """Refuse what a decimal comma leaves of a number: `[0,02]` is 0 and 02."""
-        for index, (before, item) in enumerate(pairwise(node.value), start=1):
-            is_split = (
-                self.dialect.is_strict
-                and isinstance(before, ScalarNode)
-                and isinstance(item, ScalarNode)
-                and item.start_mark.index == before.end_mark.index + 1
-                and str(before.tag) == str(item.tag) == _TAG + "int"
-                and re.fullmatch(r"0\d+", str(item.value)) is not None
-            )
-            if is_split:
-                self.log.add(
-                    _mark_position(before.start_mark),
-                    f"{path}[{index - 1}]",
-                    f"{before.value},{item.value} is two numbers; decimals have a point: "
-                    f"{before.value}.{item.value}",
-                )
+    def _joined_items(self, items: list[Node], path: str) -> list[Node]:
+        """Join what a decimal comma leaves of numbers: `[0,02]` is 0 and 02."""
+        joined = items[:1]
+        for item in items[1:]:
+            if self._is_split(joined[-1], item) and re.fullmatch(r"0\d+", str(item.value)):
+                joined[-1] = self._join(joined[-1], item, f"{path}[{len(joined) - 1}]")
+            else:
+                joined.append(item)
+        return joined
+
+    def _joined_entries(
+        self, entries: list[tuple[Node, Node]], path: str
+    ) -> list[tuple[Node, Node]]:
+        """Join them between braces, where `{a: 0,003}` is the value 0 and a key without value."""
+        joined = entries[:1]
+        for key, value in entries[1:]:
+            name, before = joined[-1]
+            if self._is_split(before, key) and str(value.value) == "":
+                joined[-1] = (name, self._join(before, key, join(path, str(name.value))))
+            else:
+                joined.append((key, value))
+        return joined
+
+    def _is_split(self, before: Node, behind: Node) -> bool:
+        """Whether whole numbers have a comma and nothing else between them."""
+        return (
+            self.dialect.is_strict
+            and isinstance(before, ScalarNode)
+            and isinstance(behind, ScalarNode)
+            and str(before.tag) == str(behind.tag) == _TAG + "int"
+            and behind.start_mark.index == before.end_mark.index + 1
+        )
+
+    def _join(self, before: Node, behind: Node, path: str) -> Node:
+        """Refuse the comma and go on with the number that was meant."""
+        meant = f"{before.value}.{behind.value}"
+        self.log.add(
+            _mark_position(before.start_mark),
+            path,
+            f"{before.value},{behind.value} is two numbers; decimals have a point: {meant}",
+        )
+        return ScalarNode(_TAG + "float", meant, before.start_mark, behind.end_mark)
 
     def _key(self, node: Node, position: Position, path: str) -> tuple[str, bool]:
         """Give a key and whether it is text."""
@@ -369,15 +391,7 @@ class _Converter:
         if self.dialect.is_strict and str(node.tag) == _TAG + "merge":
             return str(node.value), True
         if self.dialect.is_strict and not is_text:
-            # Between braces `0,003` is the value 0 and a key.
-            comma = (
-                f"; if it ends a number, decimals have a point: 0.{node.value}"
-                if str(node.value).isdigit()
-                else ""
-            )
-            self.log.add(
-                position, path, f"a key must be text, got {node.value or 'nothing'}{comma}"
-            )
+            self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
         return str(node.value), is_text
 
     def _merge(self, entries: dict[str, Entry], position: Position, path: str) -> None:

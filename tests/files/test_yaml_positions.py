@@ -243,8 +243,13 @@ def test_the_place_of_what_the_reader_refuses_is_told() -> None:
     [
         (
             "a: {b: 0,003}",
-            (1, 10, "a"),
-            "a key must be text, got 003; if it ends a number, decimals have a point: 0.003",
+            (1, 8, "a.b"),
+            "0,003 is two numbers; decimals have a point: 0.003",
+        ),
+        (
+            "a: {b: 0,5, c: 1}",
+            (1, 8, "a.b"),
+            "0,5 is two numbers; decimals have a point: 0.5",
         ),
         (
             "a: [1, 0,05]",
@@ -260,6 +265,7 @@ def test_the_place_of_what_the_reader_refuses_is_told() -> None:
     ],
     ids=[
         "decimal comma",
+        "comma before more",
         "comma in a list",
         "colon",
         "number",
@@ -273,6 +279,12 @@ def test_a_strange_value_is_told_in_whole(
     text: str, place: tuple[int, int, str], words: str
 ) -> None:
     assert problems_of(text) == [(*place, words)]
+
+
+def test_reading_goes_on_with_the_number_that_was_meant() -> None:
+    document = read_yaml("{a: 0,003, b: [1, 0,05, 2], c: 10,5}", Problems())
+    assert document is not None
+    assert plain(document) == {"a": 0.003, "b": [1, 0.05, 2], "c": 10.5}
 
 
 @pytest.mark.parametrize(
