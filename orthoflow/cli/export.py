@@ -172,11 +172,11 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    seals_anew = chosen.embed or chosen.split
-    # A crate hands on the record itself, with arrays that nobody has read.
-    doubt = broken_seal(opened, of_all=seals_anew or target == "ro-crate")
-    if doubt and seals_anew:
-        raise RecordError(f"{doubt}; what was changed is not sealed anew: take another copy of it")
+    # These hand on the record itself, with arrays that nobody has read.
+    hands_on = chosen.embed or chosen.split or target == "ro-crate"
+    doubt = broken_seal(opened, of_all=hands_on)
+    if doubt and hands_on:
+        raise RecordError(f"{doubt}; what was changed is not handed on: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             said = _export_to(FORMATS[target], opened, aside, chosen)

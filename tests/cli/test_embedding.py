@@ -98,13 +98,12 @@ def test_a_record_with_changed_arrays_is_not_handed_on(
         names: list[str] = []
         arrays.visititems(lambda name, item: names.append(name) if item.ndim else None)
         arrays[names[0]][...] = 0
-    for words in (("--embed",), ("--to", "ro-crate", "--embed")):
+    for words in (("--embed",), ("--to", "ro-crate", "--embed"), ("--to", "ro-crate")):
         refused = studio("export", "first", *words, "-o", "whole")
         assert refused.exit_code == 3, refused.output
-        assert "; what was changed is not sealed anew: take another copy of it" in refused.stderr
+        assert "its seal does not hold for /cells/survey" in refused.stderr
+        assert "; what was changed is not handed on: take another copy of it" in refused.stderr
         assert not (studio.folder / "whole").exists()
-    told = studio("export", "first", "--to", "ro-crate", "-o", "crate")
-    assert (told.exit_code, "its seal does not hold for /cells/survey" in told.stderr) == (3, True)
     with pytest.raises(RecordError, match=r"has the digest .*, the record says .* another copy"):
         open_run("first").product("survey", "planes")
 
