@@ -160,6 +160,28 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
                 )
 
 
+def _unswept(cells: Sequence[RecordedCell], step: str) -> list[Sweep]:
+    """Give each variant of a step that no sweep has, as one without a value."""
+    swept = {variant for one in sweeps(cells) if one.step == step for variant in one.values}
+    methods = {
+        cell.assignment[step]: cell.method
+        for cell in cells
+        if cell.step == step and step in cell.assignment and cell.status != "skipped"
+    }
+    alone = {variant: methods[variant] for variant in methods if variant not in swept}
+    counts = Counter(alone.values())
+    return [
+        Sweep(
+            step=step,
+            method=method,
+            parameter="",
+            values={variant: math.nan},
+            others={variant: variant if counts[method] > 1 else ""},
+        )
+        for variant, method in alone.items()
+    ]
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Point:
     x: float
@@ -167,6 +189,7 @@ class _Point:
     spread: float
     found: tuple[_Value, ...]  # what it stands for, one of each dataset
     is_baseline: bool
+    is_level: bool = False  # the end of a line of what was not swept
 
     @property
     def n(self) -> int:
@@ -180,8 +203,9 @@ class _Point:
     @property
     def partly(self) -> list[str]:
         """What has a value of only some repeats, in words."""
+        at = "" if self.is_level else f" at {number(self.x)}"
         return [
-            f"{one.dataset} at {number(self.x)} ({one.n_repeats} of {one.n_all})".lstrip()
+            f"{one.dataset}{at} ({one.n_repeats} of {one.n_all})".lstrip()
             for one in self.found
             if one.n_repeats < one.n_all
         ]
@@ -198,6 +222,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     for sweep in sweeps(cells):
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
+    unswept = {step: _unswept(cells, step) for step in behind}
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for (step, parameter), alike in swept.items():
             # A parameter over itself says nothing.
@@ -205,12 +230,13 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
             if is_itself or column.step not in behind[step]:
                 continue
             lines: dict[str, list[_Point]] = {}
-            for sweep in alike:
+            are_several = len(alike) + len(unswept[step]) > 1
+            for sweep in (*alike, *unswept[step]):
                 own = _lines(combinations, sweep, column, is_over=len(parts) > 1)
-                method = sweep.method if len(alike) > 1 else ""
+                method = sweep.method if are_several else ""
                 lines |= {", ".join(filter(None, [method, name])): own[name] for name in own}
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
-                shown_lines = dict(list(lines.items())[:_MOST_LINES])
+                shown_lines = _levelled(dict(list(lines.items())[:_MOST_LINES]))
                 curve = _curve(alike[0], column, shown_lines, n_datasets=len(parts))
                 yield replace(curve, caption=curve.caption + _unequal_photos(combinations, column))
 
@@ -272,6 +298,18 @@ def _lines(
             _point(x, found, is_over=is_over, column=column) for x, found in sorted(line.items())
         ]
         for name, line in values.items()
+    }
+
+
+def _levelled(lines: Mapping[str, list[_Point]]) -> dict[str, list[_Point]]:
+    """Draw what has no value of the parameter from its least to its largest."""
+    xs = [point.x for points in lines.values() for point in points if not math.isnan(point.x)]
+    ends = (min(xs), max(xs))
+    return {
+        name: [replace(points[0], x=x, is_level=True) for x in ends]
+        if math.isnan(points[0].x)
+        else points
+        for name, points in lines.items()
     }
 
 
@@ -346,6 +384,8 @@ def _curve(
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
     if column.sense is Sense.LESS and not cost_share(column.metric):
         good += ", of signed errors their sizes"
+    if any(point.is_level for points in lines.values() for point in points):
+        good += "; level lines are of what was not swept"
     if any(map(_has_baseline, lines.values())):
         good += "; the filled point is the baseline"
     shape = (
@@ -491,7 +531,8 @@ class _Axes:
         dots = "".join(
             f'<circle class="dot line-{index}{" base" if point.is_baseline else ""}" '
             f'cx="{x:.1f}" cy="{y:.1f}" r="3.6">'
-            f"<title>{number(point.x)}: {number(point.y)}</title></circle>"
+            f"<title>{'' if point.is_level else f'{number(point.x)}: '}{number(point.y)}"
+            "</title></circle>"
             for (x, y), point in zip(at, points, strict=True)
         )
         bar = f'<path class="bar line-{index}" d="{bars}"/>' if bars else ""

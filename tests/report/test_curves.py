@@ -100,6 +100,35 @@ def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path)
     assert all(toy > region for toy, region in zip(high["0"], high["1"], strict=True))
 
 
+def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
+    def region(repeat: int, name: str = "region") -> object:
+        return cell(
+            f"plane@plane={name}" + (f"#{repeat}" if repeat else ""),
+            method="plane.region",
+            params={"radius_m": 0.1},
+            metrics=metrics(rms_mm=0.004 + 0.001 * repeat),
+        )
+
+    own = swept(0.02, 0.05, 0.1, repeats=2)
+    (curve,) = curves(held(tmp_path, [*own, region(0), region(1)]))
+    assert re.findall(r">(plane\.[a-z]+)</text>", curve.svg) == ["plane.toy", "plane.region"]
+    assert ways(curve.svg) == ["MLL", "ML"]
+    dots = re.findall(r'class="dot line-(\d)[^"]*" cx="([\d.]+)" cy="([\d.]+)"', curve.svg)
+    swept_x = [x for line, x, _ in dots if line == "0"]
+    level = [(x, y) for line, x, y in dots if line == "1"]
+    assert [x for x, _ in level] == [swept_x[0], swept_x[-1]]
+    assert level[0][1] == level[1][1]
+    assert re.findall("<title>([^<]*)", curve.svg)[-2:] == ["0.0045", "0.0045"]
+    assert "; level lines are of what was not swept" in curve.caption
+    # Of one method several are told apart; nothing swept is no curve.
+    (curve,) = curves(held(tmp_path, [*own, region(0), region(0, "wider")]))
+    assert ">plane.region, wider</text>" in curve.svg
+    assert curves(held(tmp_path, [region(0), region(0, "wider")])) == ()
+    (curve,) = curves(held(tmp_path, own))
+    assert "level" not in curve.caption
+    assert ">plane.toy</text>" not in curve.svg
+
+
 def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: Path) -> None:
     cells = [
         *(
