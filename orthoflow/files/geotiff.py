@@ -31,13 +31,14 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-LOCAL_CRS_WKT: Final = (
-    'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
+# Word for word as GDAL reads it back from a GeoTIFF, so that what names it elsewhere is the same.
+_LOCAL_CRS_WKT: Final = (
+    'LOCAL_CS["{},'
+    ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
+LOCAL_CRS_WKT: Final = _LOCAL_CRS_WKT.format("plane of the wall")
 SITE_CRS: Final = "site"
-SITE_CRS_WKT: Final = (
-    'LOCAL_CS["coordinates of the scan, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
-)
+SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 # What is read is held as a whole, beside copies of it.
 MOST_CELLS: Final = 1 << 28
 MOST_BANDS: Final = 4

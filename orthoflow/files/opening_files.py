@@ -6,8 +6,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from orthoflow.files.drawings.geojson import opening_feature, write_features
+from orthoflow.files.drawings.geojson import opening_feature
 from orthoflow.files.drawings.room_lines import numbered_openings
+from orthoflow.files.geotiff import SITE_CRS
+from orthoflow.files.polygons import write_features
 from orthoflow.files.sidecars import write_text
 from orthoflow.foreign_text import Value, csv_text
 from orthoflow.products import Openings
@@ -47,7 +49,8 @@ def publish_openings(product: Openings, folder: Path, digest: str) -> None:
         opening_feature(opening, place, in_world=True)
         for place, opening in numbered_openings(product.openings)
     ]
-    write_features(folder / "openings.geojson", features, product.map_crs, digest=digest)
+    crs = product.map_crs or SITE_CRS
+    write_features(folder / "openings.geojson", features, crs, digest=digest)
     write_text(folder / "openings.csv", csv_text(_rows(product)))
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.files.geotiff import LOCAL_CRS_WKT, SITE_CRS_WKT, epsg_of
+from orthoflow.files.json_texts import json_bytes, parse_json
 from orthoflow.files.regular_files import open_file
+from orthoflow.files.sidecars import write_bytes
 from orthoflow.geometry.frames import FARTHEST_M
+from orthoflow.products.product import JsonValue
+
+Feature: TypeAlias = dict[str, JsonValue]
 
 MOST_BYTES: Final = 50_000_000
 # Each may be filled over a whole photo.
@@ -125,3 +130,38 @@ def outlines(values: NDArray[np.int16]) -> list[tuple[int, tuple[NDArray[np.floa
         rings = tuple(np.array(ring, dtype=np.float64) for ring in geometry["coordinates"])
         found.append((int(value), rings))
     return found
+
+
+def write_features(
+    path: Path,
+    features: Iterable[Feature],
+    crs: str | None,
+    *,
+    indent: int | None = 1,
+    digest: str | None = None,
+) -> None:
+    """Write a GeoJSON FeatureCollection in metres.
+
+    It names the coordinate system as GDAL reads it, though RFC 7946 knows degrees only: without a
+    name a GIS takes metres for degrees.
+
+    Args:
+        path: the file.
+        features: in order.
+        crs: an EPSG code or `site` (coordinates of the scan), as `WallFrame.map_crs`; None for the
+            plane of a wall, that of `WallFrame.raster_from_wall`.
+        indent: of the text; None for one line.
+        digest: of the product that it shows.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    epsg = epsg_of(crs)
+    local = LOCAL_CRS_WKT if crs is None else SITE_CRS_WKT
+    name = local if epsg is None else f"urn:ogc:def:crs:EPSG::{epsg}"
+    content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
+    if digest is not None:
+        content["product_digest"] = digest
+    content["crs"] = {"type": "name", "properties": {"name": name}}
+    content["features"] = list(features)
+    write_bytes(path, json_bytes(content, indent=indent) + b"\n")

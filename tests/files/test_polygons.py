@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.polygons import NamedPolygon, filled, outlines, read_polygons
+from orthoflow.files.geotiff import MapPlace, read_raster, write_raster
+from orthoflow.files.polygons import (
+    NamedPolygon,
+    filled,
+    outlines,
+    read_polygons,
+    write_features,
+)
 
 SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 0.0]]
 HOLE = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]
@@ -102,3 +109,34 @@ def test_areas_are_drawn_along_their_cells_and_touch_at_corners_only() -> None:
         painted[filled(rings, values.shape)] = value
         assert len(rings) == (2 if value == 7 else 1)
     np.testing.assert_array_equal(painted, values)
+
+
+@pytest.mark.parametrize("crs", [None, "site", "EPSG:25832"])
+def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str | None) -> None:
+    from rasterio.crs import CRS
+
+    ring: Any = [[[0.5, -0.5], [1.0, -0.5], [1.0, -1.0], [0.5, -0.5]]]
+    area = feature(ring)
+    write_features(tmp_path / "a.geojson", [area], crs, digest="ab12")
+    told = json.loads((tmp_path / "a.geojson").read_text())
+    name = told.pop("crs")["properties"]["name"]
+    assert told == {
+        "type": "FeatureCollection",
+        "name": "a",
+        "product_digest": "ab12",
+        "features": [area],
+    }
+    place = None if crs is None else MapPlace(corner_m=(0.0, 0.0), crs=crs)
+    write_raster(tmp_path / "a.tif", np.zeros((2, 2), np.uint8), gsd_m=1.0, tags={}, place=place)
+    # As GDAL reads it; without a name it takes metres for degrees.
+    raster = CRS.from_wkt(read_raster(tmp_path / "a.tif").crs_wkt)
+    assert CRS.from_user_input(name).to_wkt() == raster.to_wkt()
+    assert read_polygons(tmp_path / "a.geojson", "photo", what="areas")[0].name == "a.jpg"
+
+
+def test_features_are_written_in_one_line_on_request(tmp_path: Path) -> None:
+    write_features(tmp_path / "a.geojson", [], "EPSG:25832", indent=None)
+    text = (tmp_path / "a.geojson").read_text()
+    assert text.count("\n") == 1
+    assert "urn:ogc:def:crs:EPSG::25832" in text
+    assert "product_digest" not in text

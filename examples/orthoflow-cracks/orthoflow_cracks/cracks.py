@@ -10,7 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from orthoflow.errors import ProductError
-from orthoflow.files.sidecars import write_json
+from orthoflow.files.geotiff import SITE_CRS
+from orthoflow.files.polygons import write_features
 from orthoflow.products import Product, Tolerance
 
 
@@ -74,5 +75,4 @@ def publish_cracks(product: Cracks, folder: Path, digest: str) -> None:
         }
         for index in range(len(product))
     ]
-    content = {"type": "FeatureCollection", "digest": digest, "features": features}
-    write_json(folder / "cracks.geojson", content)
+    write_features(folder / "cracks.geojson", features, SITE_CRS, digest=digest)

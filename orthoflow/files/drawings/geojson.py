@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of, numbered_openings
-from orthoflow.files.json_texts import json_bytes
-from orthoflow.files.polygons import outlines
-from orthoflow.files.sidecars import numbers, write_bytes
+from orthoflow.files.geotiff import SITE_CRS
+from orthoflow.files.polygons import Feature, outlines, write_features
+from orthoflow.files.sidecars import numbers
 from orthoflow.geometry.adjoining import Edge
 from orthoflow.products import JsonValue, Opening, Orthoimage, OutlineSource
 
-Feature: TypeAlias = dict[str, JsonValue]
 _DIGITS: Final = 6
 _SEAM_CELLS_MOST: Final = 16_000_000
 
@@ -90,7 +89,7 @@ def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> Non
         opening_feature(opening, place, in_world=True)
         for place, opening in numbered_openings(lines.openings)
     ]
-    write_features(path, features, map_crs)
+    write_features(path, features, map_crs or SITE_CRS)
 
 
 def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> Feature:
@@ -152,34 +151,3 @@ def _feature(
     places: JsonValue = np.round(coordinates, _DIGITS).tolist()
     geometry: dict[str, JsonValue] = {"type": kind, "coordinates": places}
     return {"type": "Feature", "properties": dict(about), "geometry": geometry}
-
-
-def write_features(
-    path: Path,
-    features: list[Feature],
-    map_crs: str | None,
-    *,
-    indent: int | None = 1,
-    digest: str | None = None,
-) -> None:
-    """Write a FeatureCollection.
-
-    Args:
-        path: the file.
-        features: in order.
-        map_crs: coordinate system; named in the file where it has an EPSG code.
-        indent: of the text; None for one line.
-        digest: of the product that it shows.
-
-    Raises:
-        StoreError: it cannot be written.
-    """
-    content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
-    if digest is not None:
-        content["product_digest"] = digest
-    if map_crs is not None and map_crs.startswith("EPSG:"):
-        # Not of RFC 7946, which knows degrees only, but what GIS programs read.
-        name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"
-        content["crs"] = {"type": "name", "properties": {"name": name}}
-    content["features"] = list(features)
-    write_bytes(path, json_bytes(content, indent=indent) + b"\n")

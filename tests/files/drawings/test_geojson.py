@@ -84,30 +84,6 @@ def test_seams_lie_in_the_metres_of_the_wall_however_coarse(
         assert sorted(map(list, set(map(tuple, ring)))) == corners
 
 
-@pytest.mark.parametrize(
-    ("map_crs", "name"),
-    [(None, None), ("site", None), ("EPSG:25832", "urn:ogc:def:crs:EPSG::25832")],
-)
-def test_a_system_that_programs_know_is_named(
-    tmp_path: Path, map_crs: str | None, name: str | None
-) -> None:
-    geojson.write_features(tmp_path / "a.geojson", [], map_crs, digest="ab12")
-    told = json.loads((tmp_path / "a.geojson").read_text())
-    expected: dict[str, Any] = {
-        "type": "FeatureCollection",
-        "name": "a",
-        "product_digest": "ab12",
-        "features": [],
-    }
-    if name is not None:
-        expected["crs"] = {"type": "name", "properties": {"name": name}}
-    assert told == expected
-    geojson.write_features(tmp_path / "a.geojson", [], map_crs, indent=None)
-    text = (tmp_path / "a.geojson").read_text()
-    assert text.count("\n") == 1
-    assert "product_digest" not in text
-
-
 @pytest.mark.parametrize("is_known", [True, False])
 def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
     tmp_path: Path, is_known: bool
