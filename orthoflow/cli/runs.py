@@ -239,7 +239,9 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         if name not in known:
             from orthoflow.catalog.wording import nearest
 
-            near = nearest(name, known)
+            # Of a parameter people remember the end: its step and method stand before it.
+            ends = sorted(one for one in known if one.endswith(f".{name}"))
+            near = ends[0] if ends else nearest(name, known)
             hint = f"did you mean {near!r}?" if near else "--json has the names of all"
             raise click.UsageError(f"no run has a metric or parameter {name!r}; {hint}")
 

@@ -447,7 +447,8 @@ class _Crate:
             "@type": "SoftwareApplication",
             "name": name,
             "softwareVersion": version,
-            "description": f"Python package: pip install {DISTRIBUTION}=={version}",
+            "description": f"Python package: pip install {DISTRIBUTION}=={version}, or, where no "
+            "index has that version, of its wheel or sources, which those who made this crate have",
         }
 
 
@@ -458,7 +459,8 @@ def _how_to_read(record: RunRecord) -> str:
     is_whole = bool(given) and all(given)
     source = "the input files, which lie in it" if is_whole else "the input files"
     return (
-        f"With the Python package {DISTRIBUTION} {version} `orthoflow verify {RECORD_FILE}` in "
+        f"With the Python package {DISTRIBUTION} {version} (of an index, or its wheel from those "
+        f"who made this crate) `orthoflow verify {RECORD_FILE}` in "
         "this folder says whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o ../again` computes it "
         f"anew from {source}; any HDF5 reader opens it, too. Paths in "
