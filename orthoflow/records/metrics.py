@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,8 @@ from orthoflow_provenance.model import RecordedCell, cost_metrics
 
 from orthoflow.foreign_text import csv_text
 
+# As of fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
+_ROUNDING: Final = 1e-6
 _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
 
 
@@ -58,6 +61,21 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
             good=metric.good,
         )
         for metric in (*cell.metrics, *cost_metrics(cell))
+    )
+
+
+def is_rounding(left: float, right: float) -> bool:
+    """Whether two values of a metric are equal or differ by what libraries round.
+
+    By a millionth of the larger one that is, or by a millionth where that is below 1; counts are
+    never rounded.
+
+    >>> is_rounding(0.84536087, 0.84536104), is_rounding(1.0, 1.00001), is_rounding(3e7, 3e7 + 1)
+    (True, False, False)
+    """
+    is_counted = all(float(value).is_integer() for value in (left, right))
+    return left == right or (
+        not is_counted and math.isclose(left, right, rel_tol=_ROUNDING, abs_tol=_ROUNDING)
     )
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
 from orthoflow_provenance.model import RecordedCell
 
 from orthoflow.records.comparison import ComparedMetric, compare_metrics
 from orthoflow.records.distances import ProductDistance
+from orthoflow.records.metrics import is_rounding
 from orthoflow.records.runs import Run
-
-# As of fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
-_ROUNDING: Final = 1e-6
 
 MetricVerdict = Literal["same", "excused", "different"]
 
@@ -78,12 +76,7 @@ def replayed_metrics(
 
 
 def _is_rounded(left: ComparedMetric, right: ComparedMetric | None) -> bool:
-    if right is None or left.unit != right.unit:
-        return False
-    values = left.value, right.value
-    is_counted = all(value.is_integer() for value in values)
-    limit = _ROUNDING * max(1.0, *map(abs, values))
-    return not is_counted and abs(left.value - right.value) <= limit
+    return right is not None and left.unit == right.unit and is_rounding(left.value, right.value)
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:

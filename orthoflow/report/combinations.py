@@ -103,7 +103,8 @@ class Combination:
             values = np.abs(values)
         return Measured(
             value=float(values.mean()),
-            spread=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
+            # The mean of equal values may be off in its last digit; from the first one none is.
+            spread=float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan,
             n_repeats=len(values),
             n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
             unit=found[0][0].unit,

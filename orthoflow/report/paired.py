@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.alike import first_few
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
+from orthoflow.records.metrics import is_rounding
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
@@ -36,6 +37,9 @@ _NAMED: Final = 6
 @dataclass(frozen=True, kw_only=True)
 class Paired:
     """How a method does against another one on the datasets that both have a value of.
+
+    What differs by rounding only (`is_rounding`) is level: neither better nor worse, and a
+    difference of zero.
 
     Attributes:
         n: datasets with both values.
@@ -395,10 +399,16 @@ def _paired(
     ours: Mapping[str, Measured], theirs: Mapping[str, Measured], column: Column
 ) -> Paired | None:
     sense = column.sense
-    worse = {
-        name: badness(ours[name].value, sense) - badness(theirs[name].value, sense) for name in ours
+    pairs = {
+        name: (badness(ours[name].value, sense), badness(theirs[name].value, sense))
+        for name in ours
     }
-    worse = {name: value for name, value in worse.items() if math.isfinite(value)}
+    # A rank test would take the last digits of six datasets for a proof.
+    worse = {
+        name: 0.0 if is_rounding(own, other) else own - other
+        for name, (own, other) in pairs.items()
+        if math.isfinite(own - other)
+    }
     return paired_differences(worse, sense, column.metric) if worse else None
 
 
@@ -407,7 +417,7 @@ def paired_differences(worse: Mapping[str, float], sense: Sense, metric: str = "
 
     Args:
         worse: dataset -> how much worse than the reference the method is there, finite; at least
-            one.
+            one; zero where they are level.
         sense: what makes a value good, for the sign of the differences that are told.
         metric: its name.
     """

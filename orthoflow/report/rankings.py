@@ -9,11 +9,12 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow.records.metrics import MetricRow
+from orthoflow.records.metrics import MetricRow, is_rounding
 
-# Without repeats of both nobody knows how far values of the same method lie apart. What is nearer
-# than this share of the best is no difference then; times and memory scatter more, times from run
-# to run by so much (docs/performance.md), whatever their repeats in one run say.
+# Without repeats of both nobody knows how far values of the same method lie apart, nor where they
+# all give one value. What is nearer than this share of the best is no difference then; times and
+# memory scatter more, times from run to run by so much (docs/performance.md), whatever their
+# repeats in one run say.
 _ALIKE_SHARE: Final = 0.01
 _ALIKE_COST_SHARES: Final = {"_s": 0.3, "_mib": 0.1}
 
@@ -58,13 +59,13 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
     """Mark the best and the worst of each group; a group whose values are all alike has neither.
 
     A value whose distance from the best is not above both their standard deviations together (in
-    quadrature), or where one of them has no repeats not above a hundredth of the best (repeats or
-    not a tenth of a memory, three tenths of a time), is marked as near the best and never as worst;
-    the best is then only among the best, too, as are several that are alike. The worst is marked
-    where every other value is as far from it, and where nobody of its group found nothing, which is
-    worse; costs, which a method may just not have, are ranked all the same. What sums up fewer
-    photos than another of its group is not ranked: who refuses the difficult ones has smaller
-    errors of the rest.
+    quadrature), or where one of them has no repeats, or repeats of one value, not above a hundredth
+    of the best (repeats or not a tenth of a memory, three tenths of a time), or just of rounding,
+    is marked as near the best and never as worst; the best is then only among the best, too. The
+    worst is marked where every other value is as far from it, and where nobody of its group found
+    nothing, which is worse; costs, which a method may just not have, are ranked all the same. What
+    sums up fewer photos than another of its group is not ranked: who refuses the difficult ones has
+    smaller errors of the rest.
 
     Args:
         values: a column.
@@ -84,45 +85,43 @@ def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]
         for index in [index for index in members if values[index].n_photos < most]:
             members.remove(index)
             marked[index] = replace(values[index], mark=Mark.FEWER)
-        scores = {index: badness(values[index].sort, sense) for index in members}
-        if len(set(scores.values())) < 2:
+        if not members:
             continue
-        best = min(members, key=scores.__getitem__)
-        # What several share nobody leads in.
-        n_first = sum(scores[index] == scores[best] for index in members)
-        near = {
-            index
-            for index in members
-            if scores[index] != scores[best]
-            and abs(values[index].sort - values[best].sort)
-            <= _spread(values[index], values[best], metric)
-        }
-        if len(near) == sum(scores[index] != scores[best] for index in members):
+        scores = {index: badness(values[index].sort, sense) for index in members}
+        best = values[min(members, key=scores.__getitem__)]
+        leading = {i for i in members if _are_alike(values[i], best, sense, metric)}
+        if len(leading) == len(members):
             continue
         worst = max(members, key=scores.__getitem__)
-        is_worst = not (_has_found_nothing(values, group) and cost_share(metric) == 0.0) and all(
-            scores[index] != scores[worst]
-            and abs(values[index].sort - values[worst].sort)
-            > _spread(values[worst], values[index], metric)
-            for index in members
-            if index != worst
+        is_worst = not (
+            _has_found_nothing(values, group) and cost_share(metric) == 0.0
+        ) and not any(
+            _are_alike(values[worst], values[i], sense, metric) for i in members if i != worst
         )
         for index in members:
             mark = Mark.NONE
-            if scores[index] == scores[best]:
-                mark = Mark.NEAR if near or n_first > 1 else Mark.BEST
-            elif index in near:
-                mark = Mark.NEAR
+            if index in leading:
+                # What several share nobody leads in.
+                mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
             elif index == worst and is_worst:
                 mark = Mark.WORST
             marked[index] = replace(values[index], mark=mark)
     return marked
 
 
-def _spread(one: Value, other: Value, metric: str) -> float:
-    known = [value.spread for value in (one, other) if math.isfinite(value.spread)]
+def _are_alike(one: Value, other: Value, sense: Sense, metric: str) -> bool:
+    """Whether nothing shows that a value differs from a better one."""
+    if is_rounding(badness(one.sort, sense), badness(other.sort, sense)):
+        return True
+    known = [
+        value.spread
+        for value in (one, other)
+        if math.isfinite(value.spread) and not is_rounding(value.sort, value.sort + value.spread)
+    ]
     share = max(cost_share(metric), 0.0 if len(known) == 2 else _ALIKE_SHARE)
-    return max(math.hypot(*known), share * abs(other.sort))
+    # Signed errors count by their size.
+    own, better = (abs(v.sort) if sense is Sense.LESS else v.sort for v in (one, other))
+    return abs(own - better) <= max(math.hypot(*known), share * abs(better))
 
 
 def cost_share(metric: str) -> float:

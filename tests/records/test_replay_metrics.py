@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,7 @@ def told(recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict]) -> tuple[R
         (2.5, 2.5, IDENTICAL, "same"),
         (2.5, 2.5 + 1e-9, IDENTICAL, "excused"),
         (2.5, 2.5001, IDENTICAL, "different"),
+        (2.5, math.inf, IDENTICAL, "different"),
         # Counts are not rounded, however many.
         (3e7, 3e7 + 1, IDENTICAL, "different"),
         (2.5, 2.6, ("identical", "within tolerance"), "excused"),

@@ -178,6 +178,12 @@ def test_a_metric_is_the_mean_of_its_repeats_and_their_spread(
     assert found.spread == pytest.approx(math.sqrt((9 + 1 + 16) / 2))
     assert one.measured("plane", "nothing") is None
     assert one.measured("nothing", "rms_mm") is None
+    # Their sum is rounded, and a third of it no longer one of them.
+    values |= dict.fromkeys(values, 0.1)
+    equal = one.measured("plane", "rms_mm")
+    assert equal is not None
+    assert equal.spread == 0.0
+    values[0] = 3.0
     single = one.measured("wall", "rms_mm")
     assert single is not None
     assert (single.value, single.n_repeats) == (3.0, 1)

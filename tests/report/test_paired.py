@@ -16,6 +16,7 @@ from orthoflow.report.environments import AlikeEnvironments
 from orthoflow.report.paired import (
     MethodOverDatasets,
     MetricOverDatasets,
+    Paired,
     paired_differences,
 )
 from orthoflow.report.rankings import Sense
@@ -170,6 +171,52 @@ def test_values_of_no_size_are_not_paired() -> None:
     assert (
         module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, column(Sense.LESS)) is None
     )
+
+
+def pairs(sense: Sense, *values: tuple[float, float]) -> Paired:
+    ours, theirs = (
+        {name: measured(pair[side]) for name, pair in zip("abcdefgh", values, strict=False)}
+        for side in (0, 1)
+    )
+    found = module._paired(ours, theirs, column(sense))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("sense", "ours", "theirs"),
+    [
+        (Sense.LESS, 0.84536087, 0.84536104),
+        (Sense.MORE, 0.84536104, 0.84536087),
+        (Sense.LESS, 3.2e6 + 0.5, 3.2e6 + 2.5),
+        # Angles of next to nothing, in degrees; errors of both signs; factors to 1.
+        (Sense.LESS, 1e-13, 4.5e-13),
+        (Sense.LESS, -0.84536087, 0.84536104),
+        (Sense.ONE, 0.5, 2.0000001),
+    ],
+)
+def test_what_differs_by_rounding_is_level_and_tests_nothing(
+    sense: Sense, ours: float, theirs: float
+) -> None:
+    found = pairs(sense, *[(ours, theirs)] * 8)
+    assert (found.n, found.wins, found.losses, found.median) == (8, 0, 0, 0.0)
+    assert math.isnan(found.p)
+    assert math.isnan(found.effect)
+    assert found.deciding == {}
+
+
+def test_rank_tests_leave_out_what_differs_by_rounding() -> None:
+    # Five that differ, all for the better, and three that would make p 0.0078 of 0.0625.
+    differing = [(1.0, 1.0 + 0.1 * k) for k in range(1, 6)]
+    found = pairs(Sense.LESS, *differing, *[(2.0, 2.0 + 1e-7)] * 3)
+    assert (found.n, found.wins, found.losses) == (8, 5, 0)
+    assert found.p == pytest.approx(0.0625)
+    assert found.effect == 1.0
+
+
+def test_more_than_rounding_and_every_count_is_a_difference() -> None:
+    found = pairs(Sense.LESS, (1.0, 1.000002), (3e7 + 1.0, 3e7), (0.0, 2e-6))
+    assert (found.wins, found.losses) == (2, 1)
 
 
 def column(sense: Sense) -> Column:

@@ -101,6 +101,48 @@ def test_with_repeats_their_spread_alone_says_what_differs() -> None:
     assert marks(near, of(101.5), far) == ["BEST", "NONE", "WORST"]
 
 
+@pytest.mark.parametrize("spread", [0.0, 7e-16])
+def test_repeats_of_one_value_say_nothing_of_scatter(spread: float) -> None:
+    exact = of(7.414482203957, spread), of(7.414482243713, spread)
+    assert marks(*exact) == ["NONE", "NONE"]
+    assert marks(*exact, of(9.0, spread)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(100.0, spread), of(100.9, spread), of(200.0, spread)) == [
+        "NEAR",
+        "NEAR",
+        "WORST",
+    ]
+    assert marks(of(100.0, spread), of(101.1, spread), of(200.0, spread)) == [
+        "BEST",
+        "NONE",
+        "WORST",
+    ]
+    # Where one of two scatters, the larger of both: its spread, and a hundredth.
+    assert marks(of(100.0, spread), of(100.9, 0.1), of(200.0, 0.1)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(100.0, 3.0), of(102.9, spread), of(200.0, 0.1)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(100.0, 3.0), of(103.1, spread), of(200.0, 0.1)) == ["BEST", "NONE", "WORST"]
+    # Counts, too.
+    assert marks(of(500.0, spread), of(501.0, spread), of(900.0, spread)) == [
+        "NEAR",
+        "NEAR",
+        "WORST",
+    ]
+
+
+def test_rounding_is_no_difference_whatever_the_share() -> None:
+    # Errors of next to nothing: in degrees, 3.5e-13 apart.
+    assert marks(of(1e-13), of(4.5e-13)) == ["NONE", "NONE"]
+    assert marks(of(1e-13), of(4.5e-13), of(0.2)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(0.1), of(0.2), of(0.2 + 1e-9)) == ["BEST", "NONE", "NONE"]
+    halves = marks(of(0.5), of(2.0 + 1e-9), of(4.0), sense=Sense.ONE)
+    assert halves == ["NEAR", "NEAR", "WORST"]
+
+
+def test_errors_of_both_signs_are_as_far_apart_as_their_sizes() -> None:
+    assert marks(of(-1.0), of(1.005)) == ["NONE", "NONE"]
+    assert marks(of(-1.0, 0.1), of(1.12, 0.1), of(-3.0, 0.1)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(0.1), of(3.0), of(-3.01)) == ["BEST", "NONE", "NONE"]
+
+
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
     for spread in (math.nan, 0.01):
         times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
