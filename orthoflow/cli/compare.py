@@ -23,7 +23,6 @@ from orthoflow.cli.tables import (
     echo_table,
     first_rows,
     number,
-    quality_places,
     say_more,
     say_verify,
 )
@@ -31,6 +30,7 @@ from orthoflow.cli.tables import (
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile
     from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
+    from orthoflow.report.moved import Alike
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
@@ -41,7 +41,7 @@ _READDRESSED_MOST: Final = 3
 @click.argument("first", metavar="A", type=click.Path(path_type=Path))
 @click.argument("second", metavar="B", type=click.Path(path_type=Path))
 @store_option
-@click.option("--all", "is_whole", is_flag=True, help="Print every row that differs.")
+@click.option("--all", "is_whole", is_flag=True, help="Print every row that differs, rounding too.")
 @json_option
 def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: bool) -> int:
     """Lay the runs A and B, run folders or their run.h5, side by side.
@@ -50,8 +50,9 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     far their metrics and products lie apart. A parameter with * was set, others are defaults.
     Steps are the same when their addresses are, or else when all that varies on their way has one
     method with the same parameters; what only one run has is counted apart. Of long tables
-    the first rows are printed, of metrics those that say how good results are. --json has also
-    what is equal. Ends with 3 where the seal of a record does not hold; of large arrays, which
+    the first rows are printed, of metrics those that say how good results are, none of rounding
+    (a millionth), and what is said alike of many steps or repeats is one row. --json has also what
+    is equal. Ends with 3 where the seal of a record does not hold; of large arrays, which
     are not read where digests are equal, `orthoflow verify` says so.
     """
     from orthoflow.engine.store import Store
@@ -107,7 +108,11 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
             f"seed {record.seed}, {counted(len(record.cells), 'step')}"
         )
-    _print_pairs("inputs", comparison.inputs, _files_text, most)
+    step_of = comparison.step_of
+    if comparison.inputs:
+        _print_pairs("inputs", comparison.inputs, _files_text, most)
+    else:
+        echo("", "inputs: neither has any")
     if comparison.workflow:
         echo("", "workflow, A (-) against B (+)")
         for line in comparison.workflow[2:]:
@@ -115,7 +120,7 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
-    _print_pairs("steps", comparison.cells, str, most)
+    _print_pairs("steps", comparison.cells, str, most, step_of)
     if comparison.readdressed:
         pairs = [f"{ours} (A) is {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
         named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
@@ -125,47 +130,65 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
         comparison.shared(comparison.parameters),
         _parameter_text,
         most,
+        step_of,
     )
     _print_pairs("environment", comparison.environment, str, most)
-    step_of = {
-        cell.address: cell.step
-        for record in (comparison.left, comparison.right)
-        for cell in record.cells
-    }
     _print_metrics(comparison.shared(comparison.metrics), step_of, most)
     echo("", "products")
     echo_distances(comparison.products, most)
 
 
 def _print_pairs(
-    title: str, rows: Sequence[Pair[Value]], text: Callable[[Value], str], most: int | None
+    title: str,
+    rows: Sequence[Pair[Value]],
+    text: Callable[[Value], str],
+    most: int | None,
+    step_of: Mapping[str, str] | None = None,
 ) -> None:
-    """Print the rows that differ under a title, what both have first, or that none does."""
+    """Print the rows that differ under a title, what both have first, or that none does.
+
+    Args:
+        title: what they are.
+        rows: all.
+        text: how a side is said.
+        most: rows that are printed, what is said alike of a step as one; all of them without it.
+        step_of: the step of each cell.
+    """
+    from orthoflow.report.moved import alike_rows, alike_texts
+
     different = [row for row in rows if not row.is_same]
     if not different:
         echo("", f"{title}: same")
         return
     echo("", f"{title}: {_counts(rows)}")
+    told = (
+        alike_rows(different, id) if most is None else alike_texts(different, text, step_of or {})
+    )
     echo_table(
         ("", "A", "B"),
         [
             (
-                ".".join(part for part in (row.cell, row.name) if part),
-                *(_NOTHING if side is None else text(side) for side in (row.left, row.right)),
+                one.label(step_of or {}),
+                *(
+                    _NOTHING if side is None else text(side)
+                    for side in (one.pair.left, one.pair.right)
+                ),
             )
-            for row in first_rows(different, most, lambda row: not row.is_shared)
+            for one in first_rows(told, most, lambda one: not one.pair.is_shared)
         ],
     )
-    say_more(len(different), most)
+    say_more(len(told), most)
 
 
 # Any: rows of all kinds.
-def _counts(rows: Sequence[Pair[Any]]) -> str:
-    """Say in how many rows the runs differ."""
+def _counts(rows: Sequence[Pair[Any]], n_rounded: int = 0) -> str:
+    """Say in how many rows the runs differ, those aside that differ by rounding."""
     from orthoflow.records.comparison import Difference
 
     found = Difference.of(rows)
-    counts = [f"{found.n_different} of {found.n_shared} differ"] if found.n_shared else []
+    counts = (
+        [f"{found.n_different - n_rounded} of {found.n_shared} differ"] if found.n_shared else []
+    )
     alone = ((found.n_left, "only in A"), (found.n_right, "only in B"))
     counts += [f"{n} {where}" for n, where in alone if n]
     return ", ".join(counts) or "none"
@@ -184,36 +207,44 @@ def _parameter_text(parameter: ParameterValue) -> str:
 def _print_metrics(
     rows: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str], most: int | None
 ) -> None:
-    """Print every metric that differs; times and memory, which always do, apart and last."""
+    """Print metrics that differ by more than rounding; times and memory apart and last."""
+    from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one, rounded
 
-    def told(row: Pair[ComparedMetric]) -> tuple[str, str]:
-        return step_of[row.cell], row.name
+    measured = [row for row in rows if not row.either.is_cost]
+    n_rounded = sum(map(rounded, measured))
+    more = f", another {n_rounded} differ by less than a millionth" if n_rounded else ""
+    echo("", f"metrics: {_counts(measured, n_rounded)}{more}")
+    different = moved_first([row for row in measured if not row.is_same], step_of)
+    if most is None:
+        _print_numbers(alike_rows(different, id))
+    else:
+        told = repeats_as_one(row for row in different if not rounded(row))
+        _print_numbers(told[:most])
+        say_more(len(told), most)
+    costs = [row for row in rows if row.either.is_cost]
+    different = [row for row in costs if not row.is_same]
+    echo("", f"times and memory: {_counts(costs)}")
+    _print_numbers(alike_rows(different, id)[:most])
+    say_more(len(different), most)
 
-    place = quality_places(map(told, rows))
-    for title, is_cost in (("metrics", False), ("times and memory", True)):
-        chosen = [row for row in rows if row.either.is_cost == is_cost]
-        different = [row for row in chosen if not row.is_same]
-        echo("", f"{title}: {_counts(chosen)}")
-        if different:
-            _print_numbers(first_rows(different, most, lambda row: place(told(row))))
-        say_more(len(different), most)
 
+def _print_numbers(rows: Sequence[Alike[ComparedMetric]]) -> None:
+    from orthoflow.report.moved import metric_label
 
-def _print_numbers(rows: Sequence[Pair[ComparedMetric]]) -> None:
     echo_table(
         ("metric", "A", "B", "B - A", "unit"),
         [
             (
-                f"{row.cell}.{row.name}",
+                metric_label(one),
                 *(
                     _NOTHING if side is None else number(side.value)
-                    for side in (row.left, row.right)
+                    for side in (one.pair.left, one.pair.right)
                 ),
                 ""
-                if row.left is None or row.right is None
-                else number(row.right.value - row.left.value),
-                row.either.unit,
+                if one.pair.left is None or one.pair.right is None
+                else number(one.pair.right.value - one.pair.left.value),
+                one.pair.either.unit,
             )
-            for row in rows
+            for one in rows
         ],
     )

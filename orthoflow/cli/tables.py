@@ -152,17 +152,10 @@ def quality_places(
     Args:
         rows: step and metric of all, in the order of the run.
     """
+    from orthoflow.report.moved import quality_place
+
     steps = {step: place for place, step in enumerate(dict.fromkeys(step for step, _ in rows))}
     return lambda row: (quality_place(row[1]), -steps[row[0]])
-
-
-def quality_place(metric: str) -> int:
-    """Where a number stands among those that say how good results are; the others last."""
-    from orthoflow.report.comparisons import FOUND
-    from orthoflow.report.summaries import QUALITY
-
-    order = [*QUALITY, *FOUND]
-    return order.index(metric) if metric in order else len(order)
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:

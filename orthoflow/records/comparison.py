@@ -223,7 +223,11 @@ class RunComparison:
             for name, one in counted.items()
             if one.n_shared
         ]
-        apart = [name for name, one in counted.items() if not one.n_shared]
+        apart = [
+            name
+            for name, one in counted.items()
+            if not one.n_shared and (name != "inputs" or self.inputs)
+        ]
         n_products = sum(item.verdict == "different" for item in self.products)
         n_unknown = sum(item.verdict == "not measured" for item in self.products)
         unknown = f" ({n_unknown} more not measured)" if n_unknown else ""
@@ -272,6 +276,11 @@ class RunComparison:
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:
         """Numbers of the cells that both runs have, without times and memory."""
         return tuple(row for row in self.shared(self.metrics) if not row.either.is_cost)
+
+    @property
+    def step_of(self) -> dict[str, str]:
+        """The step of each cell of either run."""
+        return {cell.address: cell.step for side in (self.left, self.right) for cell in side.cells}
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
         """Leave out what belongs to cells that only one of the runs has: it cannot differ."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from orthoflow.records import RecordedFile
 from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
+from orthoflow.records.comparison import Difference as DifferenceCounts
 from orthoflow.records.distances import ProductDistance
+from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one, rounded
 from orthoflow.report.numbers import number, number_with_unit
 
 Side = TypeVar("Side")
@@ -35,14 +37,18 @@ class DifferenceTable:
     Attributes:
         title: what kind.
         n_compared: how many things both runs have.
-        rows: those that differ.
-        n_alone: how many of the rows only one run has.
+        n_different: of how many of them they say something else.
+        rows: those that differ, and those that only one run has; what is said alike is one.
+        n_alone: how many things only one run has.
+        n_rounded: how many things differ by rounding only; they have no row.
     """
 
     title: str
     n_compared: int
+    n_different: int
     rows: tuple[Difference, ...]
     n_alone: int = 0
+    n_rounded: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +82,7 @@ class Differences:
 
 def differences(comparison: RunComparison) -> Differences:
     """Put a comparison of two runs into tables of what differs."""
+    step_of = comparison.step_of
     return Differences(
         left=comparison.left.run_id,
         right=comparison.right.run_id,
@@ -83,10 +90,12 @@ def differences(comparison: RunComparison) -> Differences:
         tables=(
             _table("Inputs", comparison.inputs, _files_text),
             _table("Options", [comparison.overrides], " ".join),
-            _table("Steps", comparison.cells, str),
-            _table("Parameters", comparison.shared(comparison.parameters), _parameter_text),
+            _table("Steps", comparison.cells, str, step_of),
+            _table(
+                "Parameters", comparison.shared(comparison.parameters), _parameter_text, step_of
+            ),
             _table("Environment", comparison.environment, str),
-            _metric_table(comparison.shared(comparison.metrics)),
+            _metric_table(comparison.shared(comparison.metrics), step_of),
         ),
         products=tuple(
             sorted(
@@ -97,43 +106,65 @@ def differences(comparison: RunComparison) -> Differences:
     )
 
 
-def _table(title: str, pairs: Sequence[Pair[Side]], text: Callable[[Side], str]) -> DifferenceTable:
-    return DifferenceTable(
-        title=title,
-        n_compared=sum(pair.is_shared for pair in pairs),
-        n_alone=sum(not pair.is_shared for pair in pairs),
-        rows=tuple(
+def _table(
+    title: str,
+    pairs: Sequence[Pair[Side]],
+    text: Callable[[Side], str],
+    step_of: Mapping[str, str] | None = None,
+) -> DifferenceTable:
+    """Say of things what differs, of those of a step once what is said alike."""
+    steps = step_of or {}
+    counts = DifferenceCounts.of(pairs)
+    rows = []
+    for one in alike_texts([pair for pair in pairs if not pair.is_same], text, steps):
+        pair = one.pair
+        rows.append(
             Difference(
-                cell=pair.cell,
-                name=pair.name,
+                cell=pair.cell if one.n == 1 else "",
+                name=pair.name if one.n == 1 else one.label(steps),
                 left=_NOTHING if pair.left is None else text(pair.left),
                 right=_NOTHING if pair.right is None else text(pair.right),
             )
-            for pair in pairs
-            if not pair.is_same
-        ),
+        )
+    return DifferenceTable(
+        title=title,
+        n_compared=counts.n_shared,
+        n_different=counts.n_different,
+        n_alone=counts.n_left + counts.n_right,
+        rows=tuple(rows),
     )
 
 
-def _metric_table(pairs: Sequence[Pair[ComparedMetric]]) -> DifferenceTable:
-    """Metrics that differ; time and memory always do, and stand in the comparison table."""
+def _metric_table(
+    pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
+) -> DifferenceTable:
+    """Metrics that differ by more than rounding, how good results are first.
+
+    Time and memory always differ, and stand in the comparison table.
+    """
     measured = [pair for pair in pairs if not pair.either.is_cost]
+    counts = DifferenceCounts.of(measured)
+    n_rounded = sum(map(rounded, measured))
+    moved = [pair for pair in measured if not pair.is_same and not rounded(pair)]
     rows = []
-    for pair in measured:
-        left, right = pair.left, pair.right
-        if left is not None and right is not None and left.value == right.value:
-            continue
+    for one in repeats_as_one(moved_first(moved, step_of)):
+        left, right = one.pair.left, one.pair.right
         rows.append(
             Difference(
-                cell=pair.cell,
-                name=pair.name,
+                cell=one.pair.cell,
+                name=one.pair.name + (f", {one.n} repeats" if one.n > 1 else ""),
                 left=_NOTHING if left is None else number_with_unit(left.value, left.unit),
                 right=_NOTHING if right is None else number_with_unit(right.value, right.unit),
                 change="" if left is None or right is None else number(right.value - left.value),
             )
         )
     return DifferenceTable(
-        title="Metrics, time and memory left aside", n_compared=len(measured), rows=tuple(rows)
+        title="Metrics, time and memory left aside",
+        n_compared=counts.n_shared,
+        n_different=counts.n_different - n_rounded,
+        n_alone=counts.n_left + counts.n_right,
+        n_rounded=n_rounded,
+        rows=tuple(rows),
     )
 
 

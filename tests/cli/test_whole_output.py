@@ -162,7 +162,7 @@ def test_equal_runs_are_said_to_be_equal(capsys: pytest.CaptureFixture[str]) -> 
     _print(same_runs())
     titles = ["inputs", "workflow", "options", "steps", "parameters (* set, others are defaults)"]
     lines = [f"{title}: same" for title in [*titles, "environment"]]
-    lines[1] = "workflow: same text"
+    lines[:2] = ["inputs: neither has any", "workflow: same text"]
     lines += ["metrics: none", "times and memory: none", "products"]
     spaced = [text for line in lines for text in ("", line)]
     assert printed(capsys) == [*HEADS, *spaced, "0 products"]
@@ -234,6 +234,42 @@ def test_of_a_long_comparison_what_says_how_good_results_are_is_printed(
         *("a.rmse_u_mm", "a.rms_mm", "a.odd_0"),
     ]
     assert lines[start + 22] == "and 12 more, which --all prints"
+
+
+def test_a_short_comparison_counts_rounding_and_says_once_what_is_said_alike(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    names = ("plane@data=a", "plane@data=a#1", "plane@data=b")
+    left = record([cell(name) for name in names])
+    numbers = [
+        Pair(cell=name, name="tiny_mm", left=metric(1e-13), right=metric(3e-13)) for name in names
+    ]
+    numbers += [
+        Pair(cell=name, name="rms_mm", left=metric(1.5), right=metric(1.25)) for name in names
+    ]
+    values = [ParameterValue(value=value, is_set=True) for value in (10, 14)]
+    comparison = dataclasses.replace(
+        same_runs(),
+        left=left,
+        cells=tuple(Pair(cell=name, name="plane", left=facts(), right=facts()) for name in names),
+        parameters=tuple(
+            Pair(cell=name, name="angle_deg", left=values[0], right=values[1]) for name in names
+        ),
+        metrics=tuple(numbers),
+    )
+    _print(comparison, most=20)
+    lines = printed(capsys)
+    start = lines.index("parameters (* set, others are defaults): 3 of 3 differ")
+    assert lines[start + 2 : start + 4] == ["plane.angle_deg, 3 steps  10*  14*", ""]
+    start = lines.index("metrics: 3 of 6 differ, another 3 differ by less than a millionth")
+    assert lines[start + 1 : start + 5] == [
+        "metric                          A    B     B - A  unit",
+        "plane@data=a.rms_mm, 2 repeats  1.5  1.25  -0.25  mm",
+        "plane@data=b.rms_mm             1.5  1.25  -0.25  mm",
+        "",
+    ]
+    _print(comparison)
+    assert sum("tiny_mm" in line for line in printed(capsys)) == 3
 
 
 def test_a_comparison_in_json_says_of_each_row_whether_it_is_the_same() -> None:

@@ -131,6 +131,8 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     check = Pair(cell="check", name="rms_mm", left=number(2.0), right=number(3.0))
     html = compared(*rows, check, alone=("wall",))._repr_html_()
     assert html.index("<td>check</td>") < html.index("<td>plane</td>")
+    # Runs of a workflow without inputs have none to share.
+    assert "inputs" not in repr(replace(comparison, inputs=()))
     # What shares nothing is not alike.
     apart = compared(rows[3], alone=("wall",))
     assert "; no inputs, parameters, metrics in common; " in repr(apart)

@@ -347,7 +347,7 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
         ("Steps", 1),
         ("Parameters", 1),
         ("Environment", 1),
-        ("Metrics, time and memory left aside", 4),
+        ("Metrics, time and memory left aside", 2),
     ]
     named = "a.e57 0123456789ab"
     assert [table.rows for table in told.tables] == [

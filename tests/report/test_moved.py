@@ -1,0 +1,71 @@
+"""Rows that tell in what two runs differ: which are one, and which come first."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.report.moved import alike_texts, moved_first, rounded
+
+
+def metric(value: float, unit: str = "mm") -> ComparedMetric:
+    return ComparedMetric(value=value, unit=unit, is_cost=False, is_cached=False, environment="e")
+
+
+def moved(cell: str, name: str, left: float, right: float) -> Pair[ComparedMetric]:
+    return Pair(cell=cell, name=name, left=metric(left), right=metric(right))
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "is_rounded"),
+    [
+        (metric(1e-13), metric(4e-13), True),
+        (metric(0.5), metric(0.500002), False),
+        (metric(2e6 + 0.5), metric(2e6 + 1.5), True),
+        (metric(2e6), metric(2e6 + 1.0), False),
+        (metric(0.5), metric(0.5), False),
+        (metric(0.5), metric(0.5 + 1e-9, "m"), False),
+        (metric(0.5), None, False),
+    ],
+)
+def test_rounding_is_a_difference_of_a_millionth_and_none_of_counts(
+    left: ComparedMetric, right: ComparedMetric | None, is_rounded: bool
+) -> None:
+    assert rounded(Pair(name="x", left=left, right=right)) is is_rounded
+
+
+def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> None:
+    rooms = [f"check@data={index}" for index in range(3)]
+    pairs = [
+        *(moved(room, "odd", 1.0, 9.0) for room in rooms),
+        moved(rooms[0], "rms_mm", 1.0, 1.0 + 1e-12),
+        moved(rooms[0], "colour_rmse_grey", 1.0, 1.5),
+        *(moved(room, "plane_angle_deg", 1.0, 2.0 + k) for k, room in enumerate(rooms)),
+        moved(rooms[1], "label_iou_mean", 0.9, 0.9024),
+        moved(rooms[2], "label_iou_mean", 0.9, math.nan),
+    ]
+    told = moved_first(pairs, dict.fromkeys(rooms, "check"))
+    assert [(pair.name, pair.cell[-1]) for pair in told] == [
+        ("plane_angle_deg", "2"),
+        ("label_iou_mean", "2"),
+        ("plane_angle_deg", "1"),
+        ("label_iou_mean", "1"),
+        ("plane_angle_deg", "0"),
+        ("colour_rmse_grey", "0"),
+        ("odd", "0"),
+        ("odd", "1"),
+        ("odd", "2"),
+        ("rms_mm", "0"),
+    ]
+
+
+def test_steps_that_one_run_alone_has_are_one_row_per_step_whatever_their_seeds() -> None:
+    cells = {f"{step}#{repeat}": step for step in ("plane", "wall") for repeat in (1, 2)}
+    pairs = [
+        Pair(cell=cell, name=step, left=f"seed {index}", right=None)
+        for index, (cell, step) in enumerate(cells.items())
+    ]
+    rows = alike_texts(pairs, str, cells)
+    assert [row.label(cells) for row in rows] == ["plane, 2 steps", "wall, 2 steps"]
