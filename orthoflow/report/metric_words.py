@@ -241,6 +241,8 @@ WORDS: Final[Mapping[str, str]] = {
     "n_overlap_patches": "patches compared where photos overlap",
     "overlap_u_rms_cells": "photos apart along u where they overlap, RMS",
     "overlap_v_rms_cells": "photos apart along v where they overlap, RMS",
+    "overlap_u_rms_mm": "photos apart along u where they overlap, RMS on the wall",
+    "overlap_v_rms_mm": "photos apart along v where they overlap, RMS on the wall",
     # Openings.
     "n_openings": "openings found",
     "n_through": "openings looked through",

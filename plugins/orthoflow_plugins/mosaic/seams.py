@@ -115,6 +115,8 @@ class MosaicSeams(Method):
         "n_overlap_patches",
         "overlap_u_rms_cells",
         "overlap_v_rms_cells",
+        "overlap_u_rms_mm",
+        "overlap_v_rms_mm",
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4)",
@@ -420,6 +422,13 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
         ctx.metric("overlap_u_rms_cells", rms[0], "cells")
         ctx.metric("overlap_v_rms_cells", rms[1], "cells")
+        # In millimetres two runs compare whose cells have other sizes.
+        shifts_mm = np.concatenate(
+            [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
+        )
+        rms_mm = np.sqrt(np.mean(shifts_mm**2, axis=0))
+        ctx.metric("overlap_u_rms_mm", rms_mm[0], "mm")
+        ctx.metric("overlap_v_rms_mm", rms_mm[1], "mm")
     grey = np.concatenate([item.steps.grey for item in verdicts])
     if len(grey):
         delta_e = np.concatenate([item.steps.delta_e for item in verdicts])

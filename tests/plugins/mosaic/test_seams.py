@@ -370,6 +370,10 @@ def test_displacements_between_photos_are_measured(tmp_path: Path, shift: tuple[
     assert metrics["n_overlap_patches"] == 16
     assert metrics["overlap_u_rms_cells"] == pytest.approx(abs(u), abs=0.15)
     assert metrics["overlap_v_rms_cells"] == pytest.approx(abs(v), abs=0.15)
+    cell_mm = 1e3 * layers[0].frame.gsd_m
+    for axis in "uv":
+        in_cells = metrics[f"overlap_{axis}_rms_cells"]
+        assert metrics[f"overlap_{axis}_rms_mm"] == pytest.approx(cell_mm * in_cells)
 
 
 def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
