@@ -14,6 +14,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from textwrap import indent
 from typing import Final, NoReturn
@@ -206,13 +207,17 @@ _OF_OTHERS: Final = frozenset(("ipykernel", "nbclient", "roc-validator"))
 
 
 def _of_pip(words: list[str]) -> str:
-    named = [word for word in words[1:] if not word.startswith("-")]
+    named = [
+        word
+        for before, word in pairwise(words)
+        if not word.startswith("-") and before != "--wheel-dir"
+    ]
     ours = [word for word in named if word not in _OF_OTHERS]
     if words[0] == "install" and named and not ours:
         return ""
     (wanted,) = ours
     found = re.fullmatch(r"(?:\.|orthoflow-tls)(?:\[([\w,]+)\])?", wanted)
-    if words[0] != "install" or found is None:
+    if words[0] not in ("install", "wheel") or found is None:
         return f"installs {wanted}"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = set(found[1].split(",")) if found[1] else set()
