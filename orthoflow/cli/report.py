@@ -8,6 +8,7 @@ import click
 
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import code_for
+from orthoflow.cli.options import store_option
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError
 
@@ -21,13 +22,16 @@ from orthoflow.errors import ArgumentError
     metavar="FILE",
     help="Where to write it; for a single run its own report.html.",
 )
-def report(runs: tuple[str, ...], output: Path | None) -> int:
+@store_option
+def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     """Write the HTML report of one or more runs, each a run folder or its run.h5.
 
     Without -o it lies in the run's folder, with figures/ beside it: the figures as PNG or
     SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
+    Of two runs it compares products, too, those that records only name from the store.
     Where a record's seal does not hold, the page says so, and this ends with 3.
     """
+    from orthoflow.engine.store import Store
     from orthoflow.records.runs import REPORT_FILE, open_run
     from orthoflow.records.verification import broken_seal
     from orthoflow.report import write_page, write_report
@@ -44,6 +48,7 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
     if output is None:
         write_page(opened[0], target, doubts=doubts)
     else:
-        write_report(opened, target, doubts=doubts)
+        stores = (Store(store),) if store.is_dir() else ()
+        write_report(opened, target, doubts=doubts, stores=stores)
     echo(f"report: {target}")
     return code_for(doubts.values(), "the page says so")

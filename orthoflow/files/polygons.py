@@ -120,6 +120,8 @@ def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> ND
 def outlines(values: NDArray[np.int16]) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
     """Areas of one value each, as rings (n, 2) of (column, row) along the sides of their cells.
 
+    The outer ring comes first, then holes; each ends with its first corner, as GeoJSON wants it.
+
     Args:
         values: (rows, cols); negative ones belong to no area.
     """
@@ -147,7 +149,7 @@ def write_features(
 
     Args:
         path: the file.
-        features: in order.
+        features: in order, as RFC 7946 has them: type, properties and geometry.
         crs: an EPSG code or `site` (coordinates of the scan), as `WallFrame.map_crs`; None for the
             plane of a wall, that of `WallFrame.raster_from_wall`.
         indent: of the text; None for one line.

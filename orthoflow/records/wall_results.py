@@ -326,7 +326,8 @@ def _wall_result(
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         said.append(
-            f"plane fitted to {int(planes.n_points[plane_index]):,} points, RMS {rms_mm:.1f} mm"
+            f"plane with {int(planes.n_points[plane_index]):,} points, which lie {rms_mm:.1f} mm "
+            "from it (RMS)"
         )
     return WallResult(
         number=number,

@@ -16,7 +16,7 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 import jinja2
@@ -74,6 +74,9 @@ from orthoflow.report.summaries import (
 )
 from orthoflow.report.ways import Way, improved_on, ways
 from orthoflow.version import __version__
+
+if TYPE_CHECKING:
+    from orthoflow.engine.store import Store
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
@@ -205,6 +208,7 @@ def write_report(
     *,
     go_on: str = "",
     doubts: Mapping[Path, str] = MappingProxyType({}),
+    stores: Sequence[Store] = (),
 ) -> None:
     """Write one self-contained HTML file about one or more runs.
 
@@ -213,13 +217,15 @@ def write_report(
         path: file to write; replaced as a whole, never half.
         go_on: of a run that was broken off, the command that goes on with it.
         doubts: record -> why nobody should rely on it.
+        stores: where products are that the records of two runs only name.
 
     Raises:
         StoreError: the file cannot be written.
         RecordError: a record is damaged.
     """
     title = ", ".join(dict.fromkeys(run.record.name for run in runs))
-    _write(runs, path, _Place(folder=path.parent, title=title, go_on=go_on, doubts=doubts))
+    place = _Place(folder=path.parent, title=title, go_on=go_on, doubts=doubts, stores=stores)
+    _write(runs, path, place)
 
 
 def _make_folder(folder: Path) -> None:
@@ -244,6 +250,7 @@ class _Place:
         pages: dataset -> its own page; empty for a page that leads to none.
         whole: the page of all datasets, for the one of a single dataset.
         has_figures: the figures' own files are written beside it.
+        stores: where products are that the records of two runs only name.
     """
 
     folder: Path
@@ -253,6 +260,7 @@ class _Place:
     pages: Mapping[str, str] = field(default_factory=dict)
     whole: str = ""
     has_figures: bool = False
+    stores: Sequence[Store] = ()
 
 
 def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
@@ -267,7 +275,9 @@ def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
                 for index, run in enumerate(runs)
             ],
             comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
-            differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
+            differences=differences(compare_runs(*runs, stores=place.stores))
+            if len(runs) == 2
+            else None,
             title=place.title,
             go_on=place.go_on,
         )

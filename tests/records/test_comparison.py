@@ -19,7 +19,8 @@ from orthoflow.records.comparison import (
     RunComparison,
     compare_runs,
 )
-from orthoflow.records.runs import open_run
+from orthoflow.records.runs import Run, open_run
+from orthoflow.report.pages import write_report
 from tests.report_runs import HeldRun, cell, distance, metrics, record
 from tests.studios import Studio, open_studio
 
@@ -289,25 +290,35 @@ def test_the_workflow_is_compared_line_by_line(
     assert [row["right"] for row in rates] == [None]
 
 
-def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: Studio) -> None:
-    from dataclasses import replace
-
-    runs = [open_run(studio.folder / name) for name in ("first", "near")]
-
-    def unembedded(run):  # type: ignore[no-untyped-def]
-        cells = tuple(
-            replace(
-                cell,
-                outputs={port: replace(out, embedded=False) for port, out in cell.outputs.items()},
-            )
-            for cell in run.record.cells
+def unembedded(run: Run) -> Run:
+    cells = tuple(
+        replace(
+            cell,
+            outputs={port: replace(out, embedded=False) for port, out in cell.outputs.items()},
         )
-        return replace(run, record=replace(run.record, cells=cells))
+        for cell in run.record.cells
+    )
+    return replace(run, record=replace(run.record, cells=cells))
 
-    left, right = (unembedded(run) for run in runs)
+
+def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: Studio) -> None:
+    left, right = (unembedded(open_run(studio.folder / name)) for name in ("first", "near"))
     assert {item.verdict for item in compare_runs(left, right).products} == {"not measured"}
     measured = compare_runs(left, right, stores=[Store(studio.folder / ".orthoflow")]).products
     assert {item.verdict for item in measured} == {"within tolerance"}
+
+
+def test_a_page_of_two_runs_looks_into_the_store_as_the_command_does(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.records.runs.open_run", lambda path: unembedded(open_run(path)))
+    # Studios write empty pages.
+    monkeypatch.setattr("orthoflow.report.write_report", write_report)
+    told = "in no record and no store at hand"
+    for more, is_told in (((), False), (("--store", "nowhere"), True)):
+        done = studio("report", "first", "near", "-o", "both.html", *more)
+        assert done.exit_code == 0, done.output
+        assert (told in (studio.folder / "both.html").read_text(encoding="utf-8")) is is_told
 
 
 def test_what_was_skipped_has_no_versions_to_differ_in() -> None:

@@ -107,10 +107,12 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
-        if wall.count.any() and of_wall.share >= _EMPTY_WORTH_WORDS:
-            is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
-            causes = _causes(of_wall, is_dense=is_dense)
-            ctx.warn(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {causes}")
+        if not wall.count.any() or not of_wall.share:
+            continue
+        is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
+        causes = _causes(of_wall, is_dense=is_dense)
+        tell = ctx.warn if of_wall.share >= _EMPTY_WORTH_WORDS else ctx.log
+        tell(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {causes}")
 
 
 def _causes(empty: Emptiness, *, is_dense: bool) -> str:

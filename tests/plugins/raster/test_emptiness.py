@@ -78,6 +78,23 @@ def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> N
     assert "lie behind the buffer, about 1.3 m behind the plane (raise buffer_behind_m" in text
 
 
+def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
+    lines: list[str] = []
+    ctx = dataclasses.replace(
+        scenes.context(tmp_path),
+        listen=lambda event: lines.append(event.text) if event.kind == "log" else None,
+    )
+    wall = without(grid((0, 4), (0, 3)), (1.0, 1.8), (0.5, 1.3))
+    params = RasterGrid.Params.model_validate({"gsd_m": WALL.gsd_m})
+    RasterGrid().run(RasterGrid.In(cloud=scenes.cloud_of(wall), planes=WALL.planes()), params, ctx)
+    assert not [text for text in ctx.warnings if "cells are empty" in text]
+    (told,) = (text for text in lines if "cells are empty" in text)
+    assert told == (
+        "wall 0: 5% of its cells are empty: 5% show nothing that was scanned: glass, or what no "
+        "station sees"
+    )
+
+
 def test_an_opening_that_shows_nothing_has_no_setting(tmp_path: Path) -> None:
     wall = without(grid((0, 4), (0, 3)), (1.0, 2.5), (0.5, 2.0))
     shares, said = causes(scenes.cloud_of(wall), tmp_path)
