@@ -150,7 +150,7 @@ def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck)
         *(["its signature is not the one asked for"] if signature.findings else []),
         *(["published files beside it are not as they were written"] if check.changed else []),
     ]
-    return f"{record} is as it was written, but {' and '.join(wrong)}" if wrong else ""
+    return f"the seal of {record} holds, but {' and '.join(wrong)}" if wrong else ""
 
 
 def _check_signature(record: Path, signer: Path | None) -> Verification:

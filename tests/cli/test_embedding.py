@@ -192,7 +192,7 @@ def test_a_changed_published_file_is_named_and_does_not_hinder_a_replay(studio: 
     refused = studio("verify", "first")
     assert refused.exit_code == 3
     assert "products/metrics.csv: changed since it was published" in refused.stdout
-    assert "is as it was written, but published files beside it are not" in refused.stderr
+    assert "holds, but published files beside it are not" in refused.stderr
     assert studio("replay", "first", "-o", "again").exit_code == 0
 
 

@@ -112,7 +112,7 @@ def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Pa
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
     assert "run.h5 is not signed: there is no run.h5.sig beside it" in done.output
-    assert "run.h5 is as it was written, but its signature is not the one asked for" in done.output
+    assert "run.h5 holds, but its signature is not the one asked for" in done.output
     finished("sign", run, "--key", "joe")
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3

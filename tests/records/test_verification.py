@@ -138,17 +138,17 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     ("signed", "changed", "said"),
     [
         ((), (), ""),
-        (("x",), (), "r is as it was written, but its signature is not the one asked for"),
+        (("x",), (), "the seal of r holds, but its signature is not the one asked for"),
         (
             (),
             ("y",),
-            "r is as it was written, but published files beside it are not as they were written",
+            "the seal of r holds, but published files beside it are not as they were written",
         ),
         (
             ("x",),
             ("y",),
             (
-                "r is as it was written, but its signature is not the one asked for and published "
+                "the seal of r holds, but its signature is not the one asked for and published "
                 "files beside it are not as they were written"
             ),
         ),
