@@ -108,15 +108,15 @@ def runs(
     found = list_runs(folders or (Path(),))
     kept = _sorted(_filtered(found, where, **only), sort)
     if as_json:
-        echo_json(runs_json(kept))
+        echo_json(runs_json(kept, found))
     elif as_csv:
-        _print_csv(kept)
+        _print_csv(kept, found)
     else:
-        print_runs(kept, n_found=len(found), metrics=metrics)
+        print_runs(kept, found, metrics=metrics)
     if page is not None:
         from orthoflow.report.run_tables import write_run_table
 
-        write_run_table(kept, page)
+        write_run_table(kept, page, among=found)
         if not (as_json or as_csv):
             echo(f"page: {page}")
     return EXIT_GOOD
@@ -132,21 +132,23 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
         return _sorted(list(summaries(run_folders(folders))), "started")
 
 
-def runs_json(kept: Sequence[RunSummary]) -> list[dict[str, object]]:
-    """Give runs as JSON, with every metric and parameter, and in what they differ."""
+def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
+    """Give runs as JSON, with every metric and parameter, and in what they differ from others."""
     from orthoflow.report.browsing import differing_facts, told_facts
 
-    facts, differs = told_facts(kept), differing_facts(kept)
+    facts, differs = told_facts(found), differing_facts(found)
     return [_row_json(run, facts[run.folder], differs[run.folder]) for run in kept]
 
 
-def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[str] = ()) -> None:
-    """Print a table of runs, what went wrong in them, and how many there are."""
+def print_runs(
+    kept: Sequence[RunSummary], found: Sequence[RunSummary], *, metrics: Sequence[str] = ()
+) -> None:
+    """Print a table of runs of those found, what went wrong in them, and how many there are."""
     from orthoflow.report.browsing import differing_facts, key_metrics, told_apart
 
     names = list(metrics) or list(told_apart(key_metrics(kept, most=_METRICS_MOST), kept))
     _require_known(names, kept)
-    facts = differing_facts(kept)
+    facts = differing_facts(found)
     echo_table(
         (*_COLUMNS, *names, "differs in"),
         [
@@ -168,7 +170,7 @@ def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[st
         if run.n_datasets > 1:
             counts = {name: (run.n_values[name],) for name in names if name in run.n_values}
             echo_folded(f"{run.folder}: {medians(counts, run.n_datasets)}")
-    n_left_out = n_found - len(kept)
+    n_left_out = len(found) - len(kept)
     others = f", {counted(n_left_out, 'other')} left out" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")
 
@@ -268,10 +270,10 @@ def _row_json(
     return values | {"facts": dict(facts), "differs": dict(differs)}
 
 
-def _print_csv(kept: Sequence[RunSummary]) -> None:
+def _print_csv(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     from orthoflow.report.browsing import told_facts
 
-    told = told_facts(kept)
+    told = told_facts(found)
     metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
     facts = list(dict.fromkeys(name for run in kept for name in told[run.folder]))
     header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]

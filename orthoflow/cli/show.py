@@ -65,9 +65,9 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
         found = list_runs([run])
         if any(one.folder != run for one in found):
             if as_json:
-                echo_json(runs_json(found))
+                echo_json(runs_json(found, found))
             else:
-                print_runs(found, n_found=len(found))
+                print_runs(found, found)
             return EXIT_GOOD
     opened = open_run(run)
     if as_json:
@@ -155,14 +155,17 @@ def _print_comparison(run: Run) -> bool:
         said = who_leads(over, len(parts))
         shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
         counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
-        about = f"of repeats their mean, {medians(counts, len(parts))}"
+        about = (
+            "± is 1.4826 times the median absolute deviation; of repeats their mean, "
+            f"{medians(counts, len(parts))}"
+        )
     elif table := comparison_table([run]):
         names = [f"{one.step}.{one.metric}" for one in table.columns]
         rows = [
             (variants_text(dict(zip(table.steps, row.variants, strict=True))), *_texts(row))
             for row in table.rows
         ]
-        said, about = "", "means of the repeats, where there are some"
+        said, about = "", "means of the repeats ± their standard deviation, where there are some"
     else:
         return False
     if not names:

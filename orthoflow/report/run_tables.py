@@ -32,17 +32,18 @@ class _Row:
     differs: str
 
 
-def write_run_table(runs: Sequence[RunSummary], path: Path) -> None:
+def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[RunSummary]) -> None:
     """Write a page with a row per run.
 
     Args:
         runs: in the order of the rows.
         path: file to write.
+        among: those that they were chosen from; in what they differ is told against all of these.
 
     Raises:
         StoreError: it cannot be written.
     """
-    facts = differing_facts(runs)
+    facts = differing_facts(among)
     known = [name for name in WORDS if any(name in run.metrics for run in runs)]
     names = {
         name: next(run.labels[name] for run in runs if name in run.labels)

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -129,6 +130,13 @@ def test_a_sweep_differs_from_a_single_run_in_all_its_values(
         "swept": "0.02|0.05",
     }
     assert folders("--where", "plane.cell_m = 0.02") == ["swept"]
+    # Against all that were found, not only those that a filter leaves.
+    (row,) = json.loads(said("runs", "--json", "--where", "plane.cell_m = 0.02"))
+    assert row["differs"] == rows["swept"]
+    assert "plane.cell_m=0.02|0.05" in said(
+        "runs", "--where", "plane.cell_m = 0.02", "--html", "r.html"
+    )
+    assert "plane.cell_m=&#34;0.02|0.05&#34;" in (tmp_path / "r.html").read_text()
     assert folders("--where", "plane.cell_m = 0.05") == ["alone", "swept"]
     # By the names that --set takes for a variant, whether a sweep made several of it or not.
     assert folders("--where", "plane.fine.cell_m = 0.02") == ["swept"]
@@ -347,7 +355,7 @@ def test_long_names_and_reasons_are_cut(capsys: pytest.CaptureFixture[str]) -> N
     )
     fine = RunSummary(folder=Path("b"), state="ok", workflow="v" * 60, n_datasets=2)
     one = RunSummary(folder=Path("c"), state="ok", n_datasets=1)
-    module.print_runs([run, fine, one], n_found=4)
+    module.print_runs([run, fine, one], [run, fine, one, replace(one, folder=Path("d"))])
     said = capsys.readouterr().out
     lines = said.splitlines()
     assert lines[1].split() == ["a", "2026-01-02", "03:04", "w" * 60, "damaged"]
