@@ -51,6 +51,13 @@ _LARGEST_RATIO: Final = 1100
 _LONGEST_CRS: Final = 100
 _SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
+# Types of single bands, and the value that means nothing in them.
+_NOTHING: Final[Mapping[str, float | None]] = {
+    "float32": math.nan,
+    "int16": -1,
+    "int32": -1,
+    "uint8": None,
+}
 
 
 _COG_OPTIONS: Final[dict[str, object]] = {
@@ -180,13 +187,14 @@ def write_raster(
     tags: Mapping[str, str],
     place: MapPlace | None = None,
 ) -> None:
-    """Write one band: float32 with NaN for nothing, or uint8 classes without a nodata value.
+    """Write one band: values with NaN for nothing, labels with -1 for it, or classes.
 
     Rasters of more than 64 million cells are written band by band of rows.
 
     Args:
         path: file to write; its folder exists.
-        values: (rows, cols) float32 or uint8.
+        values: (rows, cols) float32, int16 or int32 labels, or uint8 classes, which have no value
+            for nothing.
         gsd_m: side of a cell in metres.
         tags: text to keep with the raster.
         place: in a map; without one X and Y count from the top-left corner.
@@ -194,24 +202,24 @@ def write_raster(
     Raises:
         StoreError: the file cannot be written.
     """
-    if values.ndim != 2 or values.dtype not in (np.dtype(np.float32), np.dtype(np.uint8)):
+    if values.ndim != 2 or str(values.dtype) not in _NOTHING:
         raise ProductError(
-            f"{path.name} takes a flat raster of float32 or uint8, got {values.dtype} of shape "
-            f"{values.shape}"
+            f"{path.name} takes a flat raster of {', '.join(_NOTHING)}, got {values.dtype} of "
+            f"shape {values.shape}"
         )
-    is_float = values.dtype == np.dtype(np.float32)
+    nothing = _NOTHING[str(values.dtype)]
     profile: dict[str, object] = {
         "driver": "GTiff",
         "count": 1,
         "dtype": str(values.dtype),
         "compress": "DEFLATE",
-        "predictor": 3 if is_float else 2,
+        "predictor": 3 if values.dtype == np.float32 else 2,
         "tiled": True,
         "blockxsize": TILE_PX,
         "blockysize": TILE_PX,
     }
-    if is_float:
-        profile["nodata"] = math.nan
+    if nothing is not None:
+        profile["nodata"] = nothing
     profile |= _placed(values.shape, gsd_m, place)
     if values.size > _IN_MEMORY_CELLS:
         _write_large_raster(path, values, profile, tags)

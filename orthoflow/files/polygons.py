@@ -117,7 +117,9 @@ def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> ND
     return np.asarray(rasterize([polygon], out_shape=shape, dtype=np.uint8), dtype=np.bool_)
 
 
-def outlines(values: NDArray[np.int16]) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
+def outlines(
+    values: NDArray[np.int16 | np.int32],
+) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
     """Areas of one value each, as rings (n, 2) of (column, row) along the sides of their cells.
 
     The outer ring comes first, then holes; each ends with its first corner, as GeoJSON wants it.

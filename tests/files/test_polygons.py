@@ -140,3 +140,19 @@ def test_features_are_written_in_one_line_on_request(tmp_path: Path) -> None:
     assert text.count("\n") == 1
     assert "urn:ogc:def:crs:EPSG::25832" in text
     assert "product_digest" not in text
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32])
+def test_labels_are_outlined_and_written_alike(tmp_path: Path, dtype: type) -> None:
+    labels = np.full((3, 4), -1, dtype)
+    labels[1, 1:3], labels[2, 0] = 300, 0
+    write_raster(tmp_path / "a.tif", labels, gsd_m=0.5, tags={})
+    raster = read_raster(tmp_path / "a.tif")
+    assert raster.values.dtype == dtype
+    np.testing.assert_array_equal(raster.values, labels)
+    np.testing.assert_array_equal(raster.shown, labels >= 0)
+    assert raster.nodata == -1
+    found = {label: filled(rings, labels.shape) for label, rings in outlines(labels)}
+    assert sorted(found) == [0, 300]
+    for label, cells in found.items():
+        np.testing.assert_array_equal(cells, labels == label)
