@@ -52,12 +52,7 @@ _LONGEST_CRS: Final = 100
 _SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
 # Types of single bands, and the value that means nothing in them.
-_NOTHING: Final[Mapping[str, float | None]] = {
-    "float32": math.nan,
-    "int16": -1,
-    "int32": -1,
-    "uint8": None,
-}
+_NOTHING: Final = {"float32": math.nan, "int16": -1, "int32": -1, "uint8": None}
 
 
 _COG_OPTIONS: Final[dict[str, object]] = {
@@ -207,7 +202,6 @@ def write_raster(
             f"{path.name} takes a flat raster of {', '.join(_NOTHING)}, got {values.dtype} of "
             f"shape {values.shape}"
         )
-    nothing = _NOTHING[str(values.dtype)]
     profile: dict[str, object] = {
         "driver": "GTiff",
         "count": 1,
@@ -217,9 +211,8 @@ def write_raster(
         "tiled": True,
         "blockxsize": TILE_PX,
         "blockysize": TILE_PX,
+        "nodata": _NOTHING[str(values.dtype)],
     }
-    if nothing is not None:
-        profile["nodata"] = nothing
     profile |= _placed(values.shape, gsd_m, place)
     if values.size > _IN_MEMORY_CELLS:
         _write_large_raster(path, values, profile, tags)

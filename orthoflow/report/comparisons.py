@@ -10,7 +10,7 @@ from string import ascii_uppercase
 from typing import Final, TypeAlias
 
 from orthoflow.records import COSTS
-from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.metrics import MetricRow, cell_metrics, is_rounding
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import (
     Combination,
@@ -22,7 +22,7 @@ from orthoflow.report.combinations import (
 from orthoflow.report.environments import alike_environments
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
+from orthoflow.report.rankings import Mark, Sense, Value, cost_share, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
 from orthoflow.workflow.cells import NOT_ASKED_FOR, variants_text
 from orthoflow.workflow.format import DATA
@@ -42,6 +42,7 @@ _COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
 _TIMED_S: Final = 0.1
 _LEADS: Final = (Mark.BEST, Mark.NEAR)
+_DESCRIBED_MOST: Final = 12  # metrics that are shown where none of quality differs
 _NAMED: Final = 3  # numbers that a combination is best in
 
 
@@ -55,6 +56,7 @@ class Column:
         label: what the metric is, in words, with its unit.
         sense: what makes a value good.
         is_declared: its method says so itself.
+        is_described: nothing of quality differs, so that what does is shown without a judgement.
     """
 
     step: str
@@ -62,6 +64,7 @@ class Column:
     label: str
     sense: Sense
     is_declared: bool = False
+    is_described: bool = False
 
     @property
     def is_key(self) -> bool:
@@ -266,13 +269,17 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
-    """Metrics that the workflows ask for, else those of quality; the cost has its own places."""
+    """Metrics that the workflows ask for, else those of quality; the cost has its own places.
+
+    Where none of quality differs, what does is described behind them and not judged.
+    """
     first: dict[tuple[str, str], MetricRow] = {}
     for cell in (cell for one in combinations for cell in one.cells):
         for row in cell_metrics(cell):
             first.setdefault((row.step, row.metric), row)
     runs = {one.run.path: one.run for one in combinations}.values()
     patterns = dict.fromkeys(pattern for run in runs for pattern in wanted_metrics(run))
+    described: list[tuple[str, str]] = []
     if patterns:
         wanted = _matching(patterns, first)
     else:
@@ -292,7 +299,32 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
             for key in last
             if key[1] == name and first[key].method.startswith("inspect.")
         ]
-    return tuple(_column(first[key], combinations) for key in dict.fromkeys(wanted))
+        if not any(_differs(key, combinations) for key in wanted):
+            described = _described([key for key in last if key not in wanted], combinations)
+    columns = [_column(first[key], combinations) for key in dict.fromkeys(wanted)]
+    columns += [
+        replace(_column(first[key], combinations), sense=Sense.NEITHER, is_described=True)
+        for key in described
+    ]
+    return tuple(columns)
+
+
+def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
+    """Whether a metric is not the same in all combinations that have it."""
+    found = [one.measured(*key) for one in combinations]
+    values = [one.value for one in found if one is not None]
+    return any(not is_rounding(values[0], value) for value in values[1:])
+
+
+def _described(
+    keys: Iterable[tuple[str, str]], combinations: Sequence[Combination]
+) -> list[tuple[str, str]]:
+    """Metrics that differ and are no costs, those of the last step first."""
+    by_step: dict[str, list[tuple[str, str]]] = {}
+    for key in keys:
+        if not cost_share(key[1]) and _differs(key, combinations):
+            by_step.setdefault(key[0], []).append(key)
+    return [key for own in reversed(by_step.values()) for key in own][:_DESCRIBED_MOST]
 
 
 def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:

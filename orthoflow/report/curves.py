@@ -215,7 +215,11 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     columns = comparison_columns(combinations)
     is_asked = any(wanted_metrics(part) for part in parts)
-    chosen = [one for one in columns if is_asked or one.is_key or one.sense is not Sense.NEITHER]
+    chosen = [
+        one
+        for one in columns
+        if is_asked or one.is_key or one.is_described or one.sense is not Sense.NEITHER
+    ]
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}

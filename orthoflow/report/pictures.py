@@ -221,7 +221,7 @@ def _states(image: Orthoimage) -> str:
     words = {
         OrthoMask.PAINTED: "painted",
         OrthoMask.FILLED: "filled from neighbours",
-        OrthoMask.NO_SURFACE: "where the scan has nothing of the wall",
+        OrthoMask.NO_SURFACE: "with no point of the scan near enough",
         OrthoMask.OCCLUDED: "hidden from every photo",
         OrthoMask.NONE: "in no oriented photo",
     }

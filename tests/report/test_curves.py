@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from orthoflow.report import curves as module
-from orthoflow.report.comparisons import Column
+from orthoflow.report.comparisons import Column, comparison_table
 from orthoflow.report.curves import curve_files, curves, curves_over, sweeps
-from orthoflow.report.rankings import Sense
+from orthoflow.report.rankings import Mark, Sense
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
 CUT = "points to the first plane, RMS / mm, cut at its own tolerance"
@@ -98,6 +98,36 @@ def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path)
     high = {index: [float(y) for y in re.findall(r"[0-9.]+ ([0-9.]+)", d)] for index, d in lines}
     assert len(high["0"]) == len(high["1"]) == 3
     assert all(toy > region for toy, region in zip(high["0"], high["1"], strict=True))
+
+
+def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path) -> None:
+    cells: list[object] = [cell("plane", metrics=metrics(rms_mm=11.5))]
+    cells += [
+        cell(
+            f"wall@wall=v{value}",
+            method="raster.toy",
+            params={"gsd_m": value},
+            metrics=metrics(
+                void_share=0.001 / value, scan_step_mm=7.0, sigma_median_mm=100 * value
+            ),
+        )
+        for value in (0.005, 0.01, 0.02)
+    ]
+    run = held(tmp_path, cells)
+    names = [curve.name for curve in curves(run)]
+    assert names == ["wall.void_share_over_wall.gsd_m", "wall.sigma_median_mm_over_wall.gsd_m"]
+    # Nobody says what of it is good, so nobody is best in it.
+    assert all(" is better" not in curve.caption for curve in curves(run))
+    table = comparison_table([run])
+    assert table is not None
+    marks = {value.mark for row in table.rows for value in row.values}
+    assert marks == {Mark.NONE}
+    # Where quality differs, the rest is not shown.
+    judged = [*cells, cell("check@wall=v0.005", metrics=metrics(rmse_u_mm=1.0))]
+    judged += [cell("check@wall=v0.01", metrics=metrics(rmse_u_mm=2.0))]
+    assert [curve.name for curve in curves(held(tmp_path, judged))] == [
+        "check.rmse_u_mm_over_wall.gsd_m"
+    ]
 
 
 def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
