@@ -880,7 +880,7 @@ def test_a_glance_says_in_how_many_numbers_nobody_leads(
     )
     write_report([run(*cells, workflow_resolved=asked)], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert f"4 numbers have a good side{told if n_told else ''}. " in page
+    assert f"Numbers that have a good side: 4{told if n_told else ''}. " in page
 
 
 def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:
