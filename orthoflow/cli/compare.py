@@ -55,14 +55,13 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     is equal. Ends with 3 where the seal of a record does not hold; of large arrays, which
     are not read where digests are equal, `orthoflow verify` says so.
     """
-    from orthoflow.engine.store import Store
+    from orthoflow.engine.store import stores_at
     from orthoflow.records.comparison import compare_runs
     from orthoflow.records.runs import open_run
     from orthoflow.records.verification import broken_seal
 
-    stores = (Store(store),) if store.is_dir() else ()
     runs = (open_run(first), open_run(second))
-    comparison = compare_runs(*runs, stores=stores)
+    comparison = compare_runs(*runs, stores=stores_at(store))
     if as_json:
         echo_json(comparison_json(comparison))
     else:

@@ -136,9 +136,9 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
 
 def _earlier_stores() -> tuple[Store, ...]:
     """The store of runs made here: it has products, and remembers where input files lay."""
-    from orthoflow.engine.store import Store
+    from orthoflow.engine.store import stores_at
 
-    return (Store(DEFAULT_STORE),) if DEFAULT_STORE.is_dir() else ()
+    return stores_at(DEFAULT_STORE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,7 +31,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     Of two runs it compares products, too, those that records only name from the store.
     Where a record's seal does not hold, the page says so, and this ends with 3.
     """
-    from orthoflow.engine.store import Store
+    from orthoflow.engine.store import stores_at
     from orthoflow.records.runs import REPORT_FILE, open_run
     from orthoflow.records.verification import broken_seal
     from orthoflow.report import write_page, write_report
@@ -48,7 +48,6 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     if output is None:
         write_page(opened[0], target, doubts=doubts)
     else:
-        stores = (Store(store),) if store.is_dir() else ()
-        write_report(opened, target, doubts=doubts, stores=stores)
+        write_report(opened, target, doubts=doubts, stores=stores_at(store))
     echo(f"report: {target}")
     return code_for(doubts.values(), "the page says so")

@@ -535,6 +535,11 @@ class Store:
         return True
 
 
+def stores_at(folder: str | Path) -> tuple[Store, ...]:
+    """Give the store of a folder, if there is one: to look for it makes none."""
+    return (Store(Path(folder)),) if Path(folder).is_dir() else ()
+
+
 def publish_into(folder: Path, product: Product, publisher: Publisher, digest: str) -> None:
     """Let a product publish its files in a new folder: plain files alone."""
     folder.mkdir(parents=True)

@@ -26,7 +26,7 @@ from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.foreign_text import shown
 from orthoflow.products.product import JsonValue
 from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.metrics import cell_metrics, is_rounding
 from orthoflow.records.runs import Run
 from orthoflow.workflow.format import DATA
 
@@ -178,6 +178,12 @@ class ComparedMetric:
     is_cost: bool = field(compare=False)
     is_cached: bool = field(compare=False)
     environment: str = field(compare=False)
+
+    def is_near(self, other: ComparedMetric | None) -> bool:
+        """Whether it is equal to another one but for rounding."""
+        return (
+            other is not None and self.unit == other.unit and is_rounding(self.value, other.value)
+        )
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -8,9 +8,8 @@ from typing import Literal
 
 from orthoflow_provenance.model import RecordedCell
 
-from orthoflow.records.comparison import ComparedMetric, compare_metrics
+from orthoflow.records.comparison import compare_metrics
 from orthoflow.records.distances import ProductDistance
-from orthoflow.records.metrics import is_rounding
 from orthoflow.records.runs import Run
 
 MetricVerdict = Literal["same", "excused", "different"]
@@ -55,7 +54,7 @@ def replayed_metrics(
     for pair in compare_metrics(original, made):
         is_excused = (
             pair.left is None
-            or _is_rounded(pair.left, pair.right)
+            or pair.left.is_near(pair.right)
             or not _is_of_identical(original.cells[pair.cell], identical)
         )
         verdict: MetricVerdict = (
@@ -73,10 +72,6 @@ def replayed_metrics(
             )
         )
     return tuple(found)
-
-
-def _is_rounded(left: ComparedMetric, right: ComparedMetric | None) -> bool:
-    return right is not None and left.unit == right.unit and is_rounding(left.value, right.value)
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:

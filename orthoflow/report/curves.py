@@ -160,9 +160,9 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
                 )
 
 
-def _unswept(cells: Sequence[RecordedCell], step: str) -> list[Sweep]:
+def _unswept(cells: Sequence[RecordedCell], step: str, found: Iterable[Sweep]) -> list[Sweep]:
     """Give each variant of a step that no sweep has, as one without a value."""
-    swept = {variant for one in sweeps(cells) if one.step == step for variant in one.values}
+    swept = {variant for one in found if one.step == step for variant in one.values}
     methods = {
         cell.assignment[step]: cell.method
         for cell in cells
@@ -223,10 +223,11 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}
-    for sweep in sweeps(cells):
+    found = list(sweeps(cells))
+    for sweep in found:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
-    unswept = {step: _unswept(cells, step) for step in behind}
+    unswept = {step: _unswept(cells, step, found) for step in behind}
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for (step, parameter), alike in swept.items():
             # A parameter over itself says nothing.

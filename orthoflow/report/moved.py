@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
 from orthoflow.records.comparison import ComparedMetric, Pair
-from orthoflow.records.metrics import is_rounding
 from orthoflow.report.comparisons import FOUND
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
@@ -77,14 +76,7 @@ def alike_texts(
 
 def rounded(pair: Pair[ComparedMetric]) -> bool:
     """Whether the two values of a metric differ, and by no more than libraries round."""
-    left, right = pair.left, pair.right
-    return (
-        left is not None
-        and right is not None
-        and left.unit == right.unit
-        and left.value != right.value
-        and is_rounding(left.value, right.value)
-    )
+    return not pair.is_same and pair.left is not None and pair.left.is_near(pair.right)
 
 
 def moved_first(

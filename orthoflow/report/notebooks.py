@@ -178,11 +178,10 @@ class OpenedRun(Run):
             ArgumentError: there is no such run.
             RecordError: a record is damaged.
         """
-        from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
+        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - few ask
 
-        stores = (Store(Path(store)),) if Path(store).is_dir() else ()
         opened = other if isinstance(other, Run) else open_run(other)
-        return compare_runs(self, opened, stores=stores)
+        return compare_runs(self, opened, stores=stores_at(store))
 
     def _way_to_logs(self) -> str:
         """How to read what the steps said that failed; empty where none did."""
