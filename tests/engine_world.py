@@ -56,7 +56,10 @@ class World:
 
     def plan(self, steps: str, *, sets: Sequence[str] = (), **options: object) -> RunPlan:
         path = self.folder / "toy.yaml"
-        path.write_text(f"orthoflow: 1\nname: toy\nseed: 7\n{steps}")
+        # Two processes plan at once: neither must read what the other has begun to write.
+        written = self.folder / f"toy.{os.getpid()}.yaml"
+        written.write_text(f"orthoflow: 1\nname: toy\nseed: 7\n{steps}")
+        written.replace(path)
         catalog = self.catalog()
         workflow = load_workflow(path, catalog, sets=sets)
         cells = expand_cells(workflow, catalog)

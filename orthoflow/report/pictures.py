@@ -233,6 +233,7 @@ def _states(image: Orthoimage) -> str:
 def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
     known = 1.0 - count_cells(wall.mask, SurfaceMask.VOID) / wall.mask.size
     limit_m = _depth_limit_m(sampled_rows(wall.depth_m))
+    log = run.cells[address].log
 
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         return depth_colours(wall.depth_m[part], limit_m), wall.mask[part] != SurfaceMask.VOID
@@ -242,7 +243,8 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
         frame=wall.frame,
         picture=replace(
             _raster(run, address, index, wall, "depth"),
-            caption=f"{_percent(known)} of the cells known",
+            caption=f"{_percent(known)} of the cells known"
+            + (f"; causes of the others: log of {address}" if known < 1.0 and log else ""),
             reading="Relief shows as even colours with sharp edges; stripes, or a slope over the "
             "whole wall, are scans or a plane that do not fit.",
             depths=coarse_depths(wall.depth_m),

@@ -62,13 +62,15 @@ def orthoimages(n_images: int = 1) -> Orthoimages:
     )
 
 
-def run(*products: Any, type_name: str = "orthoimages", variants: str = "fine coarse") -> HeldRun:
+def run(
+    *products: Any, type_name: str = "orthoimages", variants: str = "fine coarse", log: str = ""
+) -> HeldRun:
     """A product per variant of `plane`, whose first is the baseline."""
     cells, held = [], {}
     for product, variant, digest in zip(products, variants.split(), "abcdef", strict=False):
         address = f"mosaic@plane={variant}"
         cells.append(cell(f"plane@plane={variant}"))
-        cells.append(cell(address, outputs={"out": given("", digest, type_name)}))
+        cells.append(cell(address, outputs={"out": given("", digest, type_name)}, log=log))
         held[address, "out"] = product
     told = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
     return HeldRun(path=Path("run") / "run.h5", record=told, products=held)
@@ -203,6 +205,13 @@ def walls(*, has_intensity: bool = True, source: str = "laser") -> Walls:
         buffer_front_m=0.1,
         buffer_behind_m=0.1,
     )
+
+
+def test_causes_of_unknown_cells_are_found_where_the_step_has_told_them() -> None:
+    told = run(walls(), type_name="walls", variants="fine", log="4.0% show nothing")
+    *_, depth = wall_pictures(told)
+    words = "96.0 % of the cells known; causes of the others: log of mosaic@plane=fine"
+    assert depth.caption == words
 
 
 def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:

@@ -17,8 +17,13 @@ from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
-# Causes of empty cells are told in words where so many of a wall are.
+# Points of a scan lie so many cells apart at most, where nearly all cells are to have one.
+_STEP_MOST_CELLS: Final = 2.0 / 3.0
+# Empty cells are warned of where so many of a wall are, and what to do where a cause has so many.
 _EMPTY_WORTH_WORDS: Final = 0.1
+_CAUSE_WORTH_ADVICE: Final = 0.01
+# The least share that is not printed as 0.0 %.
+_SHARE_LEAST: Final = 0.0005
 # Where a cell that has points has so many, no cell is empty for want of larger ones.
 _DENSE_POINTS: Final = 4.0
 # A net leaves a few cells void along the rim of every wall.
@@ -37,12 +42,16 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
         wall, gsd_m = raster.wall, raster.wall.frame.gsd_m
         if not wall.count.any():
             ctx.warn(f"{wall.name}: no point lies within its buffer")
-        elif raster.scan_step_m > gsd_m:
+        elif raster.scan_step_m > _STEP_MOST_CELLS * gsd_m:
+            step_m = raster.scan_step_m
+            finer = "finer than the scan" if step_m > gsd_m else "hardly coarser than the scan"
             measured = np.count_nonzero(wall.count) / wall.count.size
+            filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
             ctx.warn(
-                f"{wall.name}: cells of gsd_m = {gsd_m:g} m are finer than the scan, "
-                f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
-                "cells have a point"
+                f"{wall.name}: cells of gsd_m = {gsd_m:g} m are {finer}, whose points lie about "
+                f"{step_m:.2g} m apart; {measured:.0%} of the cells have a point, {filled:.0%} are "
+                f"interpolated (raise gsd_m to {step_m / _STEP_MOST_CELLS:.2g}, where nearly all "
+                "have one)"
             )
 
 
@@ -107,46 +116,43 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
-        if not wall.count.any() or not of_wall.share:
+        if not wall.count.any() or of_wall.share < _SHARE_LEAST:
             continue
         is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
         causes = _causes(of_wall, is_dense=is_dense)
         tell = ctx.warn if of_wall.share >= _EMPTY_WORTH_WORDS else ctx.log
-        tell(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {causes}")
+        tell(f"{wall.name}: {of_wall.share:.1%} of its cells are empty: {causes}")
 
 
 def _causes(empty: Emptiness, *, is_dense: bool) -> str:
-    """Causes of empty cells in words, the largest first, with what would change them."""
+    """Causes of empty cells in words, the largest first, with what would change the large ones."""
     sparse = (
-        "lie beside what was scanned (recover_gap_cells closes narrow gaps)"
+        ("lie beside what was scanned", "recover_gap_cells closes narrow gaps")
         if is_dense
-        else "lie between the scan's points (raise gsd_m or recover_gap_cells)"
-    )
-    behind = (
-        f"lie behind the buffer, about {empty.behind_m:.2g} m behind the plane (raise "
-        "buffer_behind_m if that is the wall)"
-    )
-    hidden = (
-        "are hidden by what stands before the wall (scan from another station, or raise "
-        "buffer_front_m if it is relief)"
+        else ("lie between the scan's points", "raise gsd_m or recover_gap_cells")
     )
     causes = [
-        (empty.behind_share, behind),
-        (empty.hidden_share, hidden),
-        (empty.sparse_share, sparse),
-        (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees"),
+        (
+            empty.behind_share,
+            f"lie behind the buffer, about {empty.behind_m:.2g} m behind the plane",
+            "raise buffer_behind_m if that is the wall",
+        ),
+        (
+            empty.hidden_share,
+            "are hidden by what stands before the wall",
+            "scan from another station, or raise buffer_front_m if it is relief",
+        ),
+        (empty.sparse_share, *sparse),
+        (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees", ""),
     ]
     causes.sort(key=lambda cause: -cause[0])
-    # Tiles on the rim of a hole belong to it and to what is about it.
-    least = max(0.01, 0.1 * empty.share)
-    told = [(round(100.0 * share), words) for share, words in causes if share >= least]
-    # What is printed adds up to the whole that is printed.
-    rest = round(100.0 * empty.share) - sum(percent for percent, _ in told)
-    if rest > 0 and any(0.0 < share < least for share, _ in causes):
-        told.append((rest, "have smaller causes"))
-    elif rest and told:
-        told[0] = (told[0][0] + rest, told[0][1])
-    return "; ".join(f"{percent}% {words}" for percent, words in told)
+    # Tiles on the rim of a hole belong to it and to what is about it: no advice for those few.
+    worth_advice = max(_CAUSE_WORTH_ADVICE, 0.1 * empty.share)
+    return "; ".join(
+        f"{share:.1%} {what}" + (f" ({advice})" if advice and share >= worth_advice else "")
+        for share, what, advice in causes
+        if share >= _SHARE_LEAST
+    )
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

@@ -90,8 +90,8 @@ def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
     assert not [text for text in ctx.warnings if "cells are empty" in text]
     (told,) = (text for text in lines if "cells are empty" in text)
     assert told == (
-        "wall 0: 5% of its cells are empty: 5% show nothing that was scanned: glass, or what no "
-        "station sees"
+        "wall 0: 5.0% of its cells are empty: 4.6% show nothing that was scanned: glass, or what "
+        "no station sees; 0.5% lie beside what was scanned"
     )
 
 

@@ -109,15 +109,24 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
         [
             WallRaster(wall=wall([[0, 0]], name="empty"), scan_step_m=0.01),
             WallRaster(wall=wall(given, name="coarse"), scan_step_m=0.0123),
-            WallRaster(wall=wall(given, name="just fine"), scan_step_m=0.005),
+            WallRaster(
+                wall=wall(given, name="close", mask=[[1, 2, 1], [2, 0, 0]]), scan_step_m=0.0034
+            ),
+            WallRaster(wall=wall(given, name="just fine"), scan_step_m=0.0033),
         ],
         "laser",
     )
-    empty, coarse = listener.warnings
+    empty, coarse, close = listener.warnings
     assert empty == "empty: no point lies within its buffer"
     assert coarse == (
         "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
-        "apart; 33% of the cells have a point"
+        "apart; 33% of the cells have a point, 0% are interpolated (raise gsd_m to 0.018, where "
+        "nearly all have one)"
+    )
+    assert close == (
+        "close: cells of gsd_m = 0.005 m are hardly coarser than the scan, whose points lie about "
+        "0.0034 m apart; 33% of the cells have a point, 33% are interpolated (raise gsd_m to "
+        "0.0051, where nearly all have one)"
     )
 
 
@@ -169,12 +178,11 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
         [emptiness(behind=0.2, hidden=0.025, sparse=0.31, unseen=0.06), emptiness(unseen=1.0)],
     )
     [said] = listener.warnings
-    # 60 % are empty: a cause of less than a tenth of them is left out.
     assert said == (
-        "wall 0: 60% of its cells are empty: 31% lie between the scan's points (raise gsd_m or "
-        "recover_gap_cells); 20% lie behind the buffer, about 0.43 m behind the plane (raise "
-        "buffer_behind_m if that is the wall); 6% show nothing that was scanned: glass, or what no "
-        "station sees; 3% have smaller causes"
+        "wall 0: 59.5% of its cells are empty: 31.0% lie between the scan's points (raise gsd_m or "
+        "recover_gap_cells); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
+        "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
+        "no station sees; 2.5% are hidden by what stands before the wall"
     )
 
 
@@ -191,25 +199,29 @@ def test_larger_cells_are_advised_only_where_cells_lack_points(
     assert ("beside what was scanned" in said) == is_dense
 
 
-def test_a_tenth_of_empty_cells_is_worth_words_and_a_hundredth_of_a_cause(
-    listener: Listener,
+@pytest.mark.parametrize(
+    ("sparse", "advised"), [(0.0099, False), (0.0101, True)], ids=["below", "above"]
+)
+def test_a_hundredth_of_a_wall_is_worth_advice(
+    listener: Listener, sparse: float, *, advised: bool
 ) -> None:
     reporting.report_empty(
-        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.0901, sparse=0.0099)]
+        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.0901, sparse=sparse)]
     )
     [said] = listener.warnings
-    assert said.startswith("wall 0: 10% of its cells are empty: 9% are hidden by what stands")
-    assert said.endswith("; 1% have smaller causes")
-    assert "gsd_m" not in said
+    assert said.startswith("wall 0: 10.0% of its cells are empty: 9.0% are hidden by what stands")
+    assert "; 1.0% lie between the scan's points" in said
+    assert ("gsd_m" in said) == advised
 
 
-def test_rounded_shares_of_empty_cells_add_up(listener: Listener) -> None:
-    reporting.report_empty(
-        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.154, sparse=0.104, unseen=0.094)]
-    )
+def test_shares_of_causes_are_those_of_the_metrics(listener: Listener) -> None:
+    given = emptiness(hidden=0.154, sparse=0.104, unseen=0.0943, behind=0.0004)
+    reporting.report_empty(listener.context, [wall([[1, 1]])], [given])
     [said] = listener.warnings
-    shares = [int(text) for text in re.findall(r"(\d+)%", said)]
-    assert shares[0] == sum(shares[1:]) == 35
+    shares = [float(text) for text in re.findall(r"([\d.]+)%", said)]
+    assert shares == pytest.approx([35.3, 15.4, 10.4, 9.4])
+    metrics = [listener.metrics[f"void_{cause}_share"] for cause in ("hidden", "sparse", "unseen")]
+    assert shares[1:] == pytest.approx([100.0 * share for share in metrics], abs=0.05)
 
 
 def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
