@@ -160,26 +160,37 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
                 )
 
 
-def _unswept(cells: Sequence[RecordedCell], step: str, found: Iterable[Sweep]) -> list[Sweep]:
-    """Give each variant of a step that no sweep has, as one without a value."""
+def _unswept(
+    cells: Sequence[RecordedCell], step: str, parameter: str, found: Iterable[Sweep]
+) -> list[Sweep]:
+    """Give each variant of a step that no sweep has, as one without a value.
+
+    Those that have the parameter all the same, at their default, are named by it.
+    """
     swept = {variant for one in found if one.step == step for variant in one.values}
-    methods = {
-        cell.assignment[step]: cell.method
+    alone = {
+        cell.assignment[step]: cell
         for cell in cells
-        if cell.step == step and step in cell.assignment and cell.status != "skipped"
+        if cell.step == step
+        and cell.assignment.get(step, next(iter(swept))) not in swept
+        and cell.status != "skipped"
     }
-    alone = {variant: methods[variant] for variant in methods if variant not in swept}
-    counts = Counter(alone.values())
-    return [
-        Sweep(
-            step=step,
-            method=method,
-            parameter="",
-            values={variant: math.nan},
-            others={variant: variant if counts[method] > 1 else ""},
+    counts = Counter(cell.method for cell in alone.values())
+    found_alone = []
+    for variant, cell in alone.items():
+        others = [variant] if counts[cell.method] > 1 else []
+        if parameter in cell.params:
+            others.append(f"{parameter}={cell.params[parameter]}")
+        found_alone.append(
+            Sweep(
+                step=step,
+                method=cell.method,
+                parameter="",
+                values={variant: math.nan},
+                others={variant: ", ".join(others)},
+            )
         )
-        for variant, method in alone.items()
-    ]
+    return found_alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +238,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     for sweep in found:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
-    unswept = {step: _unswept(cells, step, found) for step in behind}
+    unswept = {place: _unswept(cells, *place, found) for place in swept}
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for (step, parameter), alike in swept.items():
             # A parameter over itself says nothing.
@@ -235,8 +246,8 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
             if is_itself or column.step not in behind[step]:
                 continue
             lines: dict[str, list[_Point]] = {}
-            are_several = len(alike) + len(unswept[step]) > 1
-            for sweep in (*alike, *unswept[step]):
+            are_several = len(alike) + len(unswept[step, parameter]) > 1
+            for sweep in (*alike, *unswept[step, parameter]):
                 own = _lines(combinations, sweep, column, is_over=len(parts) > 1)
                 method = sweep.method if are_several else ""
                 lines |= {", ".join(filter(None, [method, name])): own[name] for name in own}

@@ -208,7 +208,7 @@ WORDS: Final[Mapping[str, str]] = {
     "recovered_share": "cells recovered between measured ones",
     "void_behind_share": "cells whose points lie behind the buffer",
     "void_hidden_share": "cells hidden by what stands before the wall",
-    "void_sparse_share": "cells between the scan's points",
+    "void_sparse_share": "cells beside scanned ones: gaps, shadows of relief, rims",
     "void_unseen_share": "cells of glass, or that no station sees",
     "void_*_share": "cells without a depth, by cause",
     "empty*_share": "cells without a depth, by cause",

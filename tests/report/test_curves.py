@@ -153,6 +153,15 @@ def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
     # Of one method several are told apart; nothing swept is no curve.
     (curve,) = curves(held(tmp_path, [*own, region(0), region(0, "wider")]))
     assert ">plane.region, wider</text>" in curve.svg
+    # What has the parameter too, at its default, is named by the value.
+    default = cell(
+        "plane@plane=default",
+        method="plane.region",
+        params={"tolerance_m": 0.04},
+        metrics=metrics(rms_mm=0.004),
+    )
+    (curve,) = curves(held(tmp_path, [*own, default]))
+    assert ">plane.region, tolerance_m=0.04</text>" in curve.svg
     assert curves(held(tmp_path, [region(0), region(0, "wider")])) == ()
     (curve,) = curves(held(tmp_path, own))
     assert "level" not in curve.caption

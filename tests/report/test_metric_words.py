@@ -51,7 +51,7 @@ def test_cards_and_tables_say_the_same() -> None:
         ("a_stranger_s", "a_stranger_s"),
         ("all_", "all_"),
         ("within_2_sigma", "distances to the first plane within two sigmas"),
-        ("void_sparse_share", "cells between the scan's points"),
+        ("void_sparse_share", "cells beside scanned ones: gaps, shadows of relief, rims"),
         ("void_other_share", "cells without a depth, by cause"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Why cells of a wall are empty: behind the buffer, hidden, finer than the scan, or never seen."""
+"""Why cells of a wall are empty: behind the buffer, hidden, beside scanned cells, or never seen."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Emptiness:
         behind_share: what was scanned there lies behind the buffer.
         behind_m: how far behind the plane, median; NaN where nothing does.
         hidden_share: something stands before the wall.
-        sparse_share: points of the wall lie about the cell, but too far apart.
+        sparse_share: points of the wall lie about the cell: in gaps, shadows of relief, rims.
         unseen_share: nothing was scanned there.
     """
 

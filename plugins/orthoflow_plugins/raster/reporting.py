@@ -17,10 +17,11 @@ from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
-# Points of a scan lie so many cells apart at most, where nearly all cells are to have one.
+# Points of a scan are to lie so many cells apart at most.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
-# Empty cells are warned of where so many of a wall are, and what to do where a cause has so many.
-_EMPTY_WORTH_WORDS: Final = 0.1
+# Empty and interpolated cells are warned of where so many of a wall are; what to do is told of
+# causes that have so many.
+_SHARE_WORTH_WORDS: Final = 0.1
 _CAUSE_WORTH_ADVICE: Final = 0.01
 # The least share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
@@ -42,16 +43,19 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
         wall, gsd_m = raster.wall, raster.wall.frame.gsd_m
         if not wall.count.any():
             ctx.warn(f"{wall.name}: no point lies within its buffer")
-        elif raster.scan_step_m > _STEP_MOST_CELLS * gsd_m:
-            step_m = raster.scan_step_m
-            finer = "finer than the scan" if step_m > gsd_m else "hardly coarser than the scan"
-            measured = np.count_nonzero(wall.count) / wall.count.size
-            filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
+            continue
+        step_m = raster.scan_step_m
+        is_close = step_m > _STEP_MOST_CELLS * gsd_m
+        measured = np.count_nonzero(wall.count) / wall.count.size
+        filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
+        if is_close or filled >= _SHARE_WORTH_WORDS:
+            finer = (
+                "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
+            )
             ctx.warn(
-                f"{wall.name}: cells of gsd_m = {gsd_m:g} m are {finer}, whose points lie about "
-                f"{step_m:.2g} m apart; {measured:.0%} of the cells have a point, {filled:.0%} are "
-                f"interpolated (raise gsd_m to {step_m / _STEP_MOST_CELLS:.2g}, where nearly all "
-                "have one)"
+                f"{wall.name}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
+                f"{measured:.0%} of the cells have a point, {filled:.0%} are interpolated"
+                + (" (a larger gsd_m leaves fewer)" if is_close else "")
             )
 
 
@@ -120,17 +124,13 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
             continue
         is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
         causes = _causes(of_wall, is_dense=is_dense)
-        tell = ctx.warn if of_wall.share >= _EMPTY_WORTH_WORDS else ctx.log
+        tell = ctx.warn if of_wall.share >= _SHARE_WORTH_WORDS else ctx.log
         tell(f"{wall.name}: {of_wall.share:.1%} of its cells are empty: {causes}")
 
 
 def _causes(empty: Emptiness, *, is_dense: bool) -> str:
     """Causes of empty cells in words, the largest first, with what would change the large ones."""
-    sparse = (
-        ("lie beside what was scanned", "recover_gap_cells closes narrow gaps")
-        if is_dense
-        else ("lie between the scan's points", "raise gsd_m or recover_gap_cells")
-    )
+    closing = "recover_gap_cells closes" if is_dense else "larger gsd_m or recover_gap_cells close"
     causes = [
         (
             empty.behind_share,
@@ -142,7 +142,11 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
             "are hidden by what stands before the wall",
             "scan from another station, or raise buffer_front_m if it is relief",
         ),
-        (empty.sparse_share, *sparse),
+        (
+            empty.sparse_share,
+            "lie beside scanned cells: gaps between points, shadows of relief, rims",
+            f"{closing} narrow gaps",
+        ),
         (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees", ""),
     ]
     causes.sort(key=lambda cause: -cause[0])

@@ -91,7 +91,8 @@ def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
     (told,) = (text for text in lines if "cells are empty" in text)
     assert told == (
         "wall 0: 5.0% of its cells are empty: 4.6% show nothing that was scanned: glass, or what "
-        "no station sees; 0.5% lie beside what was scanned"
+        "no station sees; 0.5% lie beside scanned cells: gaps between points, shadows of relief, "
+        "rims"
     )
 
 
@@ -125,7 +126,7 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     shares, said = causes(cloud, tmp_path, gsd_m=0.005, recover_gap_cells=0)
     assert shares["sparse"] > 0.9
     assert shares["unseen"] < SHARE
-    assert "lie between the scan's points (raise gsd_m or recover_gap_cells)" in said[0]
+    assert "rims (larger gsd_m or recover_gap_cells close narrow gaps)" in said[0]
 
 
 # A wall of 40 x 40 cells of 2 cm, void in the middle: four by four tiles of three cells each.

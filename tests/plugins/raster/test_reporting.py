@@ -113,21 +113,26 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
                 wall=wall(given, name="close", mask=[[1, 2, 1], [2, 0, 0]]), scan_step_m=0.0034
             ),
             WallRaster(wall=wall(given, name="just fine"), scan_step_m=0.0033),
+            WallRaster(
+                wall=wall(given, name="gaps", mask=[[1, 2, 1], [0, 0, 0]]), scan_step_m=0.003
+            ),
         ],
         "laser",
     )
-    empty, coarse, close = listener.warnings
+    empty, coarse, close, gaps = listener.warnings
     assert empty == "empty: no point lies within its buffer"
     assert coarse == (
         "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
-        "apart; 33% of the cells have a point, 0% are interpolated (raise gsd_m to 0.018, where "
-        "nearly all have one)"
+        "apart; 33% of the cells have a point, 0% are interpolated (a larger gsd_m leaves "
+        "fewer)"
     )
     assert close == (
-        "close: cells of gsd_m = 0.005 m are hardly coarser than the scan, whose points lie about "
-        "0.0034 m apart; 33% of the cells have a point, 33% are interpolated (raise gsd_m to "
-        "0.0051, where nearly all have one)"
+        "close: cells of gsd_m = 0.005 m lie on points about 0.0034 m apart; "
+        "33% of the cells have a point, 33% are interpolated (a larger gsd_m leaves fewer)"
     )
+    # An uneven scan leaves many cells to be interpolated, however close its points lie elsewhere.
+    assert gaps.startswith("gaps: cells of gsd_m = 0.005 m lie on points about 0.003 m")
+    assert gaps.endswith("17% are interpolated")
 
 
 def emptiness(
@@ -179,10 +184,11 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
     )
     [said] = listener.warnings
     assert said == (
-        "wall 0: 59.5% of its cells are empty: 31.0% lie between the scan's points (raise gsd_m or "
-        "recover_gap_cells); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
-        "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
-        "no station sees; 2.5% are hidden by what stands before the wall"
+        "wall 0: 59.5% of its cells are empty: 31.0% lie beside scanned cells: gaps between "
+        "points, shadows of relief, rims (larger gsd_m or recover_gap_cells close narrow gaps); "
+        "20.0% lie behind the buffer, about 0.43 m behind the plane (raise buffer_behind_m if "
+        "that is the wall); 6.0% show nothing that was scanned: glass, or what no station sees; "
+        "2.5% are hidden by what stands before the wall"
     )
 
 
@@ -195,8 +201,8 @@ def test_larger_cells_are_advised_only_where_cells_lack_points(
     raster = replace(wall([[1, 1, 1, 1]]), count=np.array(counts))
     reporting.report_empty(listener.context, [raster], [emptiness(sparse=0.5)])
     [said] = listener.warnings
-    assert ("raise gsd_m" in said) != is_dense
-    assert ("beside what was scanned" in said) == is_dense
+    assert ("larger gsd_m" in said) != is_dense
+    assert "recover_gap_cells close" in said
 
 
 @pytest.mark.parametrize(
@@ -210,7 +216,7 @@ def test_a_hundredth_of_a_wall_is_worth_advice(
     )
     [said] = listener.warnings
     assert said.startswith("wall 0: 10.0% of its cells are empty: 9.0% are hidden by what stands")
-    assert "; 1.0% lie between the scan's points" in said
+    assert "; 1.0% lie beside scanned cells" in said
     assert ("gsd_m" in said) == advised
 
 
