@@ -207,7 +207,8 @@ def _print_metrics(
     rows: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str], most: int | None
 ) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one, rounded
+    from orthoflow.records.comparison import rounded
+    from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one
 
     measured = [row for row in rows if not row.either.is_cost]
     n_rounded = sum(map(rounded, measured))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
@@ -69,6 +70,7 @@ class RunState:
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
         self._senses: set[str] = set()
+        self._n_alike: Counter[str] = Counter()
         self._calls = {item.cell.address: item.cell for item in cells}
         self._names = SettingNames.of(self._calls.values())
 
@@ -98,7 +100,16 @@ class RunState:
         with self._lock:
             n_before = len(self._senses)
             self._senses.add(sense(warning.text))
-            return len(self._senses) > n_before
+            is_new = len(self._senses) > n_before
+            self._n_alike[warning.address] += not is_new
+            return is_new
+
+    def end(self, event: CellFinished) -> str:
+        """How a cell ended, and how many of its warnings were left out: others said the like."""
+        with self._lock:
+            n_alike = self._n_alike.pop(event.address, 0)
+        more = f", {counted(n_alike, 'warning')} like one above" if n_alike else ""
+        return f"{end_text(event)}{more}"
 
     def told(self, warning: CellWarned) -> str:
         """A warning in a line, with parameters as they are set."""
@@ -169,7 +180,7 @@ class PlainProgress:
             case CellWarned() if self._state.is_new(event):
                 self._say(self._state.told(event))
             case CellFinished():
-                self._say(f"{end_text(event)} ({self._state.n_ended} of {self._n_cells})")
+                self._say(f"{self._state.end(event)} ({self._state.n_ended} of {self._n_cells})")
             case _:
                 return
 
@@ -217,7 +228,7 @@ class NotebookProgress:
             case CellWarned() if self._state.is_new(event):
                 self._lines.append(self._state.told(event))
             case CellFinished():
-                self._lines.append(end_text(event))
+                self._lines.append(self._state.end(event))
             case _:
                 return
 

@@ -186,6 +186,11 @@ class ComparedMetric:
         )
 
 
+def rounded(pair: Pair[ComparedMetric]) -> bool:
+    """Whether the two values of a metric differ, and by no more than libraries round."""
+    return not pair.is_same and pair.left is not None and pair.left.is_near(pair.right)
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
     """Two runs side by side; rows that say the same on both sides are among them.
@@ -224,8 +229,10 @@ class RunComparison:
             "parameters": Difference.of(self.shared(self.parameters)),
             "metrics": Difference.of(self.measured),
         }
+        n_rounded = {"metrics": sum(map(rounded, self.measured))}
         differing = [
-            f"{one.n_different} of {one.n_shared} {name}"
+            f"{one.n_different - n_rounded.get(name, 0)} of {one.n_shared} {name}"
+            + (f" ({n_rounded[name]} more by rounding)" if n_rounded.get(name) else "")
             for name, one in counted.items()
             if one.n_shared
         ]
@@ -252,8 +259,11 @@ class RunComparison:
 
     def _repr_html_(self) -> str:
         table = self.metric_table()
-        is_cost = np.array([row.either.is_cost for row in self.metrics], dtype=np.bool_)
-        moved = table[~is_cost & table.left.notna() & table.right.notna() & (table.difference != 0)]
+        is_moved = [
+            row.is_shared and not row.is_same and not row.either.is_cost and not rounded(row)
+            for row in self.metrics
+        ]
+        moved = table[np.array(is_moved, dtype=np.bool_)]
         # How good it is stands first, where only the first rows are shown.
         kinds = {row.cell: row.either.method.partition(".")[0] for row in self.cells}
         moved = moved.sort_values(
@@ -264,7 +274,8 @@ class RunComparison:
             return f"{said}<p>They have no number in common, time and memory left aside.</p>"
         if moved.empty:
             return (
-                f"{said}<p>No number that both runs have differs, time and memory left aside.</p>"
+                f"{said}<p>No number that both runs have differs, time and memory, and rounding, "
+                "left aside.</p>"
             )
         return said + str(moved.to_html(index=False, max_rows=_ROWS_MOST))
 

@@ -8,10 +8,16 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from orthoflow.records import RecordedFile
-from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
+from orthoflow.records.comparison import (
+    ComparedMetric,
+    Pair,
+    ParameterValue,
+    RunComparison,
+    rounded,
+)
 from orthoflow.records.comparison import Difference as DifferenceCounts
 from orthoflow.records.distances import ProductDistance
-from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one, rounded
+from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one
 from orthoflow.report.numbers import number, number_with_unit
 
 Side = TypeVar("Side")

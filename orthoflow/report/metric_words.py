@@ -47,7 +47,7 @@ WORDS: Final[Mapping[str, str]] = {
     "patch_mean_v_mm": "shift along v as patches show it",
     "n_patches": "patches compared with the truth",
     "displaced_share": "cells displaced by more than one",
-    "completeness": "painted, of the surface that is seen at all",
+    "completeness": "completeness of the surface that is seen at all",
     "completeness_filled": "painted or filled, of the surface that is seen at all",
     "completeness_seen_by_both": "painted, of what a station and a photo see",
     "unseen_painted_share": "painted cells that no photo sees",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
-from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.records.comparison import ComparedMetric, Pair, rounded
 from orthoflow.report.comparisons import FOUND
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
@@ -72,11 +72,6 @@ def alike_texts(
         return (step, pair.name, *(None if side is None else text(side) for side in sides))
 
     return alike_rows(pairs, key)
-
-
-def rounded(pair: Pair[ComparedMetric]) -> bool:
-    """Whether the two values of a metric differ, and by no more than libraries round."""
-    return not pair.is_same and pair.left is not None and pair.left.is_near(pair.right)
 
 
 def moved_first(

@@ -126,8 +126,13 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     assert "<td>0.5</td>" in html
     still = compared(*rows[1:], alone=("wall",))._repr_html_()
     assert still.endswith(
-        "<p>No number that both runs have differs, time and memory left aside.</p>"
+        "<p>No number that both runs have differs, time and memory, and rounding, left aside.</p>"
     )
+    # What differs by rounding is counted, not shown, as on the command line.
+    near = Pair(cell="plane", name="offset_mm", left=number(1.0), right=number(1.0 + 1e-12))
+    both = compared(*rows, near, alone=("wall",))
+    assert "1 of 3 metrics (1 more by rounding)" in repr(both)
+    assert "offset_mm" not in both._repr_html_()
     # What says how good it is stands first.
     check = Pair(cell="check", name="rms_mm", left=number(2.0), right=number(3.0))
     html = compared(*rows, check, alone=("wall",))._repr_html_()

@@ -45,7 +45,7 @@ def test_cards_and_tables_say_the_same() -> None:
     [
         ("rmse_u_mm", "error along u (right), RMS"),
         ("all_rmse_u_mm", "error along u (right), RMS; all walls"),
-        ("wall_12_completeness", "painted, of the surface that is seen at all; wall 12"),
+        ("wall_12_completeness", "completeness of the surface that is seen at all; wall 12"),
         ("raw_omega_deg", "direction of the first normal (omega); as voted, before the fit"),
         ("flat_rms_after_once_mm", "RMS without outliers, rule applied once; flat"),
         ("a_stranger_s", "a_stranger_s"),

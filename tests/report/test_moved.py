@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from orthoflow.records.comparison import ComparedMetric, Pair
-from orthoflow.report.moved import alike_texts, moved_first, rounded
+from orthoflow.records.comparison import ComparedMetric, Pair, rounded
+from orthoflow.report.moved import alike_texts, moved_first
 
 
 def metric(value: float, unit: str = "mm") -> ComparedMetric:
