@@ -165,7 +165,9 @@ class PointcloudDirect(Method):
         )
         names = tuple(wall.name for wall in inputs.walls.walls)
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
-        return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
+        product = Layers(layers=tuple(layers), names=names, plane_indices=places)
+        _report_void(ctx, product)
+        return self.Out(layers=product)
 
 
 def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
@@ -281,3 +283,15 @@ def _report(ctx: StepContext, layers: list[Layer], seconds: NDArray[np.float64])
     ctx.metric("painted_share", (n_shown - n_filled) / n_cells, "1")
     ctx.metric("filled_share", n_filled / n_cells, "1")
     ctx.metric("void_share", 1.0 - n_shown / n_cells, "1")
+
+
+def _report_void(ctx: StepContext, layers: Layers) -> None:
+    """Say of each wall how much of it has no colour, and what would fill more."""
+    for layer in layers.layers:
+        void_share = 1.0 - count_cells(layer.mask, LayerMask.PAINTED) / layer.mask.size
+        if void_share > 0.0:
+            ctx.log(
+                f"{layers.name(layer.wall)}: {void_share:.1%} of its cells have no point of the "
+                "cloud within the buffer and lie in no small gap; larger void_limits and "
+                "inpaint_radius_px fill larger ones, whatever recover_gap_cells does to the depth"
+            )

@@ -145,7 +145,7 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
         (
             empty.sparse_share,
             "lie beside scanned cells: gaps between points, shadows of relief, rims",
-            f"{closing} narrow gaps",
+            f"{closing} narrow gaps of the depth",
         ),
         (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees", ""),
     ]

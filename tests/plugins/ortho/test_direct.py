@@ -209,7 +209,12 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
     cloud, walls = holey_wall(is_void)
     # A clock that goes on by a second when it is asked.
     clock = count()
-    ctx = dataclasses.replace(scenes.context(tmp_path), clock_s=lambda: float(next(clock)))
+    lines: list[str] = []
+    ctx = dataclasses.replace(
+        scenes.context(tmp_path),
+        clock_s=lambda: float(next(clock)),
+        listen=lambda event: lines.append(event.text) if event.kind == "log" else None,
+    )
     inputs = PointcloudDirect.In(walls=walls, cloud=cloud)
     PointcloudDirect().run(inputs, PointcloudDirect.Params(void_limits=(1, 25, 49)), ctx)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
@@ -218,3 +223,5 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
     assert metrics["void_share"] == pytest.approx(100 / 200)
     assert (metrics["projection_s"], metrics["filling_s"]) == (1.0, 1.0)
     assert [figure.name for figure in ctx.figures] == ["filling"]
+    (said,) = (line for line in lines if "no point of the cloud" in line)
+    assert said.startswith("wall 0: 50.0% of its cells have no point of the cloud within the")

@@ -126,7 +126,7 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     shares, said = causes(cloud, tmp_path, gsd_m=0.005, recover_gap_cells=0)
     assert shares["sparse"] > 0.9
     assert shares["unseen"] < SHARE
-    assert "rims (larger gsd_m or recover_gap_cells close narrow gaps)" in said[0]
+    assert "rims (larger gsd_m or recover_gap_cells close narrow gaps of the depth)" in said[0]
 
 
 # A wall of 40 x 40 cells of 2 cm, void in the middle: four by four tiles of three cells each.

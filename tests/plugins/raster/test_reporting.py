@@ -185,9 +185,10 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
     [said] = listener.warnings
     assert said == (
         "wall 0: 59.5% of its cells are empty: 31.0% lie beside scanned cells: gaps between "
-        "points, shadows of relief, rims (larger gsd_m or recover_gap_cells close narrow gaps); "
-        "20.0% lie behind the buffer, about 0.43 m behind the plane (raise buffer_behind_m if "
-        "that is the wall); 6.0% show nothing that was scanned: glass, or what no station sees; "
+        "points, shadows of relief, rims (larger gsd_m or recover_gap_cells close narrow gaps of "
+        "the depth); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
+        "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
+        "no station sees; "
         "2.5% are hidden by what stands before the wall"
     )
 
