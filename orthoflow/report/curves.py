@@ -172,7 +172,8 @@ def _unswept(
         cell.assignment[step]: cell
         for cell in cells
         if cell.step == step
-        and cell.assignment.get(step, next(iter(swept))) not in swept
+        and step in cell.assignment
+        and cell.assignment[step] not in swept
         and cell.status != "skipped"
     }
     counts = Counter(cell.method for cell in alone.values())

@@ -50,6 +50,7 @@ OF_PLANE: Final = "rms_mm"
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
     CHECKING: "mean of both axes of the photo; along one of the wall it may be more",
+    "depth_rmse_mm": "cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
 }
 
 

@@ -139,7 +139,7 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
         ),
         (
             empty.hidden_share,
-            "are hidden by what stands before the wall",
+            "are hidden by what stands between them and the scanner",
             "scan from another station, or raise buffer_front_m if it is relief",
         ),
         (

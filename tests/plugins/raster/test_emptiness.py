@@ -116,7 +116,7 @@ def test_the_shadow_of_a_thing_before_the_wall_is_hidden(tmp_path: Path) -> None
     # A voxel of 10 cm before the station is as wide as 20 cm on the wall.
     assert shares["hidden"] > 0.8 * 1.44 / 12.0
     assert shares["hidden"] + shares["unseen"] == pytest.approx(1.44 / 12.0, abs=SHARE)
-    assert "are hidden by what stands before the wall" in said[0]
+    assert "are hidden by what stands between them and the scanner" in said[0]
     nowhere, _ = causes(cloud, tmp_path)
     assert nowhere == only("unseen", 1.44 / 12.0)
 

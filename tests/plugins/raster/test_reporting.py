@@ -189,7 +189,7 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
         "the depth); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
         "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
         "no station sees; "
-        "2.5% are hidden by what stands before the wall"
+        "2.5% are hidden by what stands between them and the scanner"
     )
 
 
