@@ -36,6 +36,8 @@ from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours
 # Larger walls are painted in bands of so many cells: some 600 MB.
 _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
+# Pure black points are told of from this share on; of real colours hardly any is.
+_BLACK_WORTH_WORDS: Final = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +175,7 @@ class PointcloudDirect(Method):
 def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
     """Colours (n, 3) of the points, or their intensity as grey (n, 1)."""
     if cloud.rgb is not None:
+        _warn_of_black(ctx, cloud.rgb)
         return np.asarray(cloud.rgb)
     if cloud.intensity is None:
         raise MethodError(
@@ -186,6 +189,20 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
         part = slice(first, first + _POINTS_AT_ONCE)
         grey[part, 0] = np.rint(255.0 * np.clip(cloud.intensity[part], 0, 1))
     return grey
+
+
+def _warn_of_black(ctx: StepContext, rgb: NDArray[np.uint8]) -> None:
+    """Tell of points that are pure black, as many files have those that no camera saw."""
+    n_points, n_black = len(rgb), 0
+    for first in range(0, n_points, _POINTS_AT_ONCE):
+        red, green, blue = rgb[first : first + _POINTS_AT_ONCE].T
+        n_black += int(np.count_nonzero((red | green | blue) == 0))
+    if n_black >= _BLACK_WORTH_WORDS * n_points > 0:
+        ctx.warn(
+            f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
+            "without a colour are in many files; they are painted as they are: take them out of "
+            "the scan if black specks in the image are none of the wall's"
+        )
 
 
 def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:

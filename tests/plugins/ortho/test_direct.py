@@ -191,6 +191,21 @@ def test_without_colours_the_intensity_is_painted_as_grey(tmp_path: Path) -> Non
     assert ctx.warnings == ["the cloud has no colours: its intensity is painted as grey"]
 
 
+@pytest.mark.parametrize(("n_black", "is_told"), [(0, False), (1, True), (9, True)])
+def test_points_of_pure_black_are_told(tmp_path: Path, *, n_black: int, is_told: bool) -> None:
+    cloud, walls = holey_wall(np.zeros((10, 20), dtype=bool))
+    assert cloud.rgb is not None
+    rgb = np.full_like(cloud.rgb, 7)
+    rgb[0] = (0, 0, 1)
+    rgb[len(rgb) - n_black :] = 0
+    ctx = scenes.context(tmp_path)
+    inputs = PointcloudDirect.In(walls=walls, cloud=dataclasses.replace(cloud, rgb=rgb))
+    PointcloudDirect().run(inputs, PointcloudDirect.Params(), ctx)
+    told = [text for text in ctx.warnings if f"{n_black} points of the cloud" in text]
+    assert bool(told) == is_told
+    assert len(ctx.warnings) == len(told)
+
+
 def test_a_cloud_that_cannot_paint_is_refused(tmp_path: Path) -> None:
     cloud, walls = holey_wall(np.zeros((10, 12), dtype=bool))
     with pytest.raises(MethodError, match="neither colours nor intensity"):
