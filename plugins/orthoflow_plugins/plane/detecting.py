@@ -37,9 +37,9 @@ _PLANE_FOUND: Final = "plane"
 _REJECTED_MOST: Final = 30
 
 _NO_PLANE: Final = (
-    "no plane holds {share:.2%} of the {count} points within {tolerance} m; the cloud is {size}: "
-    "raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower min_share for small "
-    "ones, or raise max_tilt_deg{small} ({method})"
+    "no plane was found that holds {share:.2%} of the {count} points within {tolerance} m; "
+    "the cloud is {size}: raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower "
+    "min_share for small ones, or raise max_tilt_deg{small} ({method})"
 )
 # Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
