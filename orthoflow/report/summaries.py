@@ -117,7 +117,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
     found += [
         Answer(what=row.words, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
         for row in rows
-        if row.words and row.good and row.metric not in QUALITY
+        if row.words and row.good
     ][:_DECLARED_MOST]
     for wanted in QUALITY:
         stated = [row for row in rows if row.metric == wanted and is_quality(row)]

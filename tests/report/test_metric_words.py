@@ -45,7 +45,7 @@ def test_cards_and_tables_say_the_same() -> None:
     [
         ("rmse_u_mm", "error along u (right), RMS"),
         ("all_rmse_u_mm", "error along u (right), RMS; all walls"),
-        ("wall_12_completeness", "completeness of the surface that is seen at all; wall 12"),
+        ("wall_12_completeness", "painted or filled, of the scanned surface; wall 12"),
         ("raw_omega_deg", "direction of the first normal (omega); as voted, before the fit"),
         ("flat_rms_after_once_mm", "RMS without outliers, rule applied once; flat"),
         ("a_stranger_s", "a_stranger_s"),
@@ -111,6 +111,10 @@ def test_a_stranger_names_metrics_and_their_good_side(tmp_path: Path) -> None:
     # Of a kind of a stranger's, what ours of the same name are called would be false.
     assert words_of("n_patches", "moisture.simple") == "n_patches"
     assert words_of("n_patches", "inspect.truth") == "patches compared with the truth"
+    # It counts painted cells only, on all walls.
+    assert words_of("completeness", "inspect.surf") == "painted or filled, of the scanned surface"
+    truth = "painted, not filled, of the surface that is seen at all; wall 3"
+    assert words_of("wall_3_completeness", "inspect.truth") == truth
 
 
 def test_a_good_side_that_nobody_knows_is_none() -> None:

@@ -250,7 +250,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
         ("plane", "rms_mm", "points to the first plane, RMS / mm", Sense.LESS),
         ("plane", "omega_deg", "direction of the first normal (omega) / deg", Sense.NEITHER),
         ("check", "rmse_u_mm", "error along u (right), RMS / mm", Sense.LESS),
-        ("check", "completeness", "completeness of the surface that is seen at all", Sense.MORE),
+        ("check", "completeness", "painted or filled, of the scanned surface", Sense.MORE),
         ("check", "wall_s", "time / s", Sense.LESS),
         ("check", "cpu_s", "processor time / s", Sense.LESS),
         ("check", "peak_rss_mib", "memory / MiB", Sense.LESS),

@@ -247,7 +247,13 @@ def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
             not_held="against the scan; errors of depth and scan add to it",
             metric="sigma_wall_mm_worst",
         ),
-        Answer(what="error of the depth, RMS", value="2 mm", cell="other", metric="depth_rmse_mm"),
+        Answer(
+            what="error of the depth, RMS",
+            value="2 mm",
+            cell="other",
+            not_held="cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
+            metric="depth_rmse_mm",
+        ),
         Answer(
             what="points to the first plane, RMS", value="1.25 mm", cell="plane", metric="rms_mm"
         ),

@@ -24,14 +24,13 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricLabel, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     CAPPED,
     CHECK_TABLE,
     DISPLACEMENTS,
     IMAGE_QUALITY,
-    IMAGE_QUALITY_LABELS,
     LENGTHS,
     check_findings,
     length_findings,
@@ -78,7 +77,6 @@ class InspectCheckpoints(Method):
         *(f"*_{name}" for name in (*CHECK_TABLE, *DISPLACEMENTS)),
         *of_walls(IMAGE_QUALITY),
     )
-    metric_labels: ClassVar[Mapping[str, MetricLabel]] = IMAGE_QUALITY_LABELS
     citations: ClassVar[tuple[str, ...]] = (
         (
             "Skarlatos, Kiparissi, Theodoridou 2012, Direct orthophoto generation from color "

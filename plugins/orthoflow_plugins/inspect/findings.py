@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Finding
-from orthoflow.sdk import MetricLabel, StepContext
+from orthoflow.sdk import StepContext
 
 _AXES: Final = ("x", "y")
 # Never are more than so many of the points called outliers.
@@ -43,9 +43,6 @@ IMAGE_QUALITY: Final = (
     *("completeness", "n_edges", "edge_width_cells", "mtf50_per_cell"),
     *("filled_share", "stretch_share", "smear_share"),
 )
-IMAGE_QUALITY_LABELS: Final = {
-    "completeness": MetricLabel(words="painted or filled, of the scanned surface", good="more"),
-}
 # What a comparison asks of every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final, Literal
 
@@ -20,12 +20,11 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricLabel, Part, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, Part, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
-    IMAGE_QUALITY_LABELS,
     displacement_findings,
     of_walls,
     report,
@@ -99,7 +98,6 @@ class InspectSurf(Method):
             )
         ),
     )
-    metric_labels: ClassVar[Mapping[str, MetricLabel]] = IMAGE_QUALITY_LABELS
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
         "Bay, Ess, Tuytelaars, Van Gool 2008, SURF: Speeded-Up Robust Features",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -25,7 +25,7 @@ from orthoflow.products import (
     Truth,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricLabel, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
@@ -131,11 +131,6 @@ class InspectTruth(Method):
         *("label_precision", "label_recall", "label_f1", "label_iou"),
         *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
     )
-    metric_labels: ClassVar[Mapping[str, MetricLabel]] = {
-        "completeness": MetricLabel(
-            words="painted, not filled, of the surface that is seen at all", good="more"
-        ),
-    }
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
         "Hoehle and Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003 (NMAD)",

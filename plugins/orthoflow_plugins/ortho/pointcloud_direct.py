@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final
 
@@ -158,18 +159,16 @@ class PointcloudDirect(Method):
             if n_filled > most_filled:
                 most_filled, preview = n_filled, filling_preview(layers[-1])
         _require_paint(layers)
-        _report(ctx, layers, seconds)
+        names = tuple(wall.name for wall in inputs.walls.walls)
+        _report(ctx, layers, names, seconds)
         ctx.figure(
             "filling",
             preview,
             "Before and after filling; magenta is void. Fine magenta dots fill well; what was "
             "a large area of it is invented from its rim.",
         )
-        names = tuple(wall.name for wall in inputs.walls.walls)
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
-        product = Layers(layers=tuple(layers), names=names, plane_indices=places)
-        _report_void(ctx, product)
-        return self.Out(layers=product)
+        return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
 
 
 def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
@@ -291,24 +290,23 @@ def _require_paint(layers: list[Layer]) -> None:
         )
 
 
-def _report(ctx: StepContext, layers: list[Layer], seconds: NDArray[np.float64]) -> None:
+def _report(
+    ctx: StepContext, layers: list[Layer], names: Sequence[str], seconds: NDArray[np.float64]
+) -> None:
+    """Tell how much is painted, filled and void, and of each wall what would fill more."""
     n_cells = sum(layer.mask.size for layer in layers)
-    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in layers)
+    n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     n_filled = sum(_n_filled(layer) for layer in layers)
     ctx.metric("projection_s", seconds[0], "s")
     ctx.metric("filling_s", seconds[1], "s")
-    ctx.metric("painted_share", (n_shown - n_filled) / n_cells, "1")
+    ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")
     ctx.metric("filled_share", n_filled / n_cells, "1")
-    ctx.metric("void_share", 1.0 - n_shown / n_cells, "1")
-
-
-def _report_void(ctx: StepContext, layers: Layers) -> None:
-    """Say of each wall how much of it has no colour, and what would fill more."""
-    for layer in layers.layers:
-        void_share = 1.0 - count_cells(layer.mask, LayerMask.PAINTED) / layer.mask.size
-        if void_share > 0.0:
+    ctx.metric("void_share", 1.0 - sum(n_shown) / n_cells, "1")
+    for layer, n_shown_here in zip(layers, n_shown, strict=True):
+        n_void = layer.mask.size - n_shown_here
+        if n_void:
             ctx.log(
-                f"{layers.name(layer.wall)}: {void_share:.1%} of its cells have no point of the "
-                "cloud within the buffer and lie in no small gap; larger void_limits and "
+                f"{names[layer.wall]}: {n_void / layer.mask.size:.1%} of its cells have no point "
+                "of the cloud within the buffer and lie in no small gap; larger void_limits and "
                 "inpaint_radius_px fill larger ones, whatever recover_gap_cells does to the depth"
             )

@@ -46,9 +46,9 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
             continue
         step_m = raster.scan_step_m
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
-        measured = np.count_nonzero(wall.count) / wall.count.size
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
+            measured = np.count_nonzero(wall.count) / wall.count.size
             finer = (
                 "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
             )

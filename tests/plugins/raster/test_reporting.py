@@ -188,8 +188,7 @@ def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener:
         "points, shadows of relief, rims (larger gsd_m or recover_gap_cells close narrow gaps of "
         "the depth); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
         "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
-        "no station sees; "
-        "2.5% are hidden by what stands between them and the scanner"
+        "no station sees; 2.5% are hidden by what stands between them and the scanner"
     )
 
 
