@@ -38,8 +38,16 @@ _REJECTED_MOST: Final = 30
 
 _NO_PLANE: Final = (
     "no plane was found that holds {share:.2%} of the {count} points within {tolerance} m; "
-    "the cloud is {size}: raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower "
-    "min_share for small ones, or raise max_tilt_deg{small} ({method})"
+    "the cloud is {size}: {advice}{small} ({method})"
+)
+_ADVICE: Final = (
+    "raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower min_share for small "
+    "ones, or raise max_tilt_deg"
+)
+# Points are seen to crowd about a plane only within a tolerance well above their noise.
+_ADVICE_WIDER: Final = (
+    "with tolerance_m {wider:g} one is found; it should be at least three times the noise of the "
+    "points"
 )
 # Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
@@ -258,6 +266,7 @@ def _found(
                 share=params.min_share,
                 count=len(cloud),
                 tolerance=params.tolerance_m,
+                advice=_advice(whole, detector.proposer_of, rules),
                 **_said_of_size(cloud),
                 method=detector.method,
             )
@@ -273,6 +282,19 @@ def _found(
     moments_s.append(_now(ctx))
     _report_times(ctx, np.diff(moments_s, axis=0))
     return whole, found
+
+
+def _advice(cloud: PreparedCloud, proposer_of: ProposerOf, rules: Rules) -> str:
+    """Say what would find a plane where none was found: up to its default, a wider tolerance."""
+    usual_m: float = DetectorParams.model_fields["tolerance_m"].default
+    wider = replace(rules, n_planes_most=1)
+    while wider.find_m < usual_m:
+        wider = replace(wider, find_m=min(2.0 * wider.find_m, usual_m))
+        unassigned = Unassigned.of(cloud)
+        proposer = proposer_of(cloud, unassigned, wider)
+        if greedy_search(unassigned, proposer, wider, lambda _part, _text: None):
+            return _ADVICE_WIDER.format(wider=wider.find_m)
+    return _ADVICE
 
 
 def _said_of_size(cloud: PointCloud) -> dict[str, str]:

@@ -438,6 +438,18 @@ def test_clutter_alone_is_no_plane(detector: str, tmp_path: Path) -> None:
 
 
 @every_detector
+def test_a_tolerance_below_the_noise_is_answered_with_one_that_does(
+    detector: str, tmp_path: Path
+) -> None:
+    cloud = cloud_of(sampled(noise_m=0.006)[FEW], stations=STATION)
+    with pytest.raises(MethodError, match="no plane was found") as refusal:
+        detect(detector, cloud, tmp_path, tolerance_m=0.005)
+    advice = re.search(r"with tolerance_m ([\d.]+) one is found", str(refusal.value))
+    assert advice is not None, refusal.value
+    assert detect(detector, cloud, tmp_path, tolerance_m=float(advice[1]))[0].planes
+
+
+@every_detector
 def test_an_unknown_scan_of_a_point_does_not_matter(detector: str, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(ROOM[:1]), stations=np.array([[0.0, -4.0, 0.0]]))
     cloud = dataclasses.replace(cloud, scan=np.zeros(len(cloud), dtype=np.uint16))
