@@ -104,10 +104,29 @@ def project_points(
             points = entries.points[slot:after]
             for k in range(points.size):
                 points[k] = first + lane + k
-            if n_inside < stop - lane:
-                _close_up(entries, slot, after)
-            slot += n_inside
+            slot = after if n_inside == stop - lane else _close_up(entries, slot, after)
         entries.n_inside[block] = slot - begin
+
+
+@compiled
+def leave_out(
+    is_left_out: NDArray[np.bool_], entries: Entries, first_block: int, end_block: int
+) -> None:
+    """Drop the entries of some points from blocks of `entries`; what stays keeps its order.
+
+    Args:
+        is_left_out: (n,) of the points of the cloud.
+        entries: changed.
+        first_block: first block to go through.
+        end_block: the block after the last one.
+    """
+    for block in range(first_block, end_block):
+        begin = block * BLOCK
+        after = begin + entries.n_inside[block]
+        for k in range(begin, after):
+            if is_left_out[entries.points[k]]:
+                entries.cells[k] = -1
+        entries.n_inside[block] = _close_up(entries, begin, after) - begin
 
 
 # Each of the loops below writes one array and has no branches, so that the processor takes several
@@ -164,8 +183,8 @@ def _set_squares(part: Offsets, m: NDArray[np.float64], squares: NDArray[np.floa
 
 
 @kernel_part
-def _close_up(entries: Entries, slot: int, after: int) -> None:
-    """Move the entries of a lane that are inside to its front, in their order."""
+def _close_up(entries: Entries, slot: int, after: int) -> int:
+    """Move entries with a cell to the front, in their order, and give the slot after the last."""
     for k in range(slot, after):
         cell = entries.cells[k]
         entries.cells[slot] = cell
@@ -173,6 +192,7 @@ def _close_up(entries: Entries, slot: int, after: int) -> None:
         entries.squares[slot] = entries.squares[k]
         entries.points[slot] = entries.points[k]
         slot += cell >= 0
+    return slot
 
 
 @inlined

@@ -41,7 +41,12 @@ def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[n
 
 
 def entries_inside(
-    points: OffsetPoints, slab: Slab, *, threads: int, rows: slice | None = None
+    points: OffsetPoints,
+    slab: Slab,
+    *,
+    threads: int,
+    rows: slice | None = None,
+    is_left_out: NDArray[np.bool_] | None = None,
 ) -> Iterator[Entries]:
     """Give the points inside a slab, chunk by chunk, in their order.
 
@@ -53,6 +58,7 @@ def entries_inside(
         slab: of the wall.
         threads: how many threads work.
         rows: of the raster that are asked for; points in others may be left out. None for all.
+        is_left_out: (n,) points that do not count; None where all do.
     """
     frame = slab.frame
     target = Target(
@@ -70,6 +76,8 @@ def entries_inside(
         entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
         chunk = Offsets(x[part], y[part], z[part])
         in_parts(partial(project_points, chunk, first, target, entries), n_blocks, threads=threads)
+        if is_left_out is not None:
+            in_parts(partial(kernels.leave_out, is_left_out, entries), n_blocks, threads=threads)
         yield entries
 
 
@@ -122,16 +130,28 @@ def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
     in_threads([partial(visit, owner) for owner in range(owners)])
 
 
-def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray[np.void]:
+def topmost_points(
+    points: OffsetPoints,
+    slab: Slab,
+    *,
+    threads: int,
+    is_left_out: NDArray[np.bool_] | None = None,
+) -> NDArray[np.void]:
     """The point nearest to the viewer in each cell: the rule of skarlatos2012.
 
     Ties go to the point nearer the centre of its cell, then to the lower index.
+
+    Args:
+        points: of the cloud.
+        slab: of the wall.
+        threads: how many threads work.
+        is_left_out: (n,) points that do not count; None where all do.
 
     Returns:
         (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
     """
     winners = empty_winners(slab.n_cells, threads=threads)
-    for entries in entries_inside(points, slab, threads=threads):
+    for entries in entries_inside(points, slab, threads=threads, is_left_out=is_left_out):
         share_cells(threads, partial(kernels.keep_topmost, entries, winners))
     return winners
 

@@ -48,6 +48,29 @@ class ColourRule:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Painters:
+    """The points that paint.
+
+    Attributes:
+        cloud: all points.
+        values: (n, 3) uint8 their colours, or (n, 1) their greys.
+        is_left_out: (n,) points without a colour; None where all have one.
+    """
+
+    cloud: PointCloud
+    values: NDArray[np.uint8]
+    is_left_out: NDArray[np.bool_] | None = None
+
+    def entries(self, slab: Slab, *, threads: int, rows: slice | None = None) -> Iterator[Entries]:
+        """Give those inside a slab, chunk by chunk (`entries_inside`)."""
+        from orthoflow.geometry.rastering import entries_inside
+
+        return entries_inside(
+            self.cloud, slab, threads=threads, rows=rows, is_left_out=self.is_left_out
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class CellColours:
     """Colours of the cells of a wall, flat.
 
@@ -68,14 +91,11 @@ class CellColours:
     depth_m: NDArray[np.float32]
 
 
-def colours_of(
-    cloud: PointCloud, values: NDArray[np.uint8], slab: Slab, rule: ColourRule
-) -> CellColours:
+def colours_of(painters: Painters, slab: Slab, rule: ColourRule) -> CellColours:
     """Colour the cells of a wall.
 
     Args:
-        cloud: the points.
-        values: (n, 3) colours, or (n, 1) greys, of the points.
+        painters: the points.
         slab: the wall, and which points count.
         rule: how.
     """
@@ -86,19 +106,20 @@ def colours_of(
         values_of_winners,
     )
 
-    winners = topmost_points(cloud, slab, threads=rule.threads)
+    cloud = painters.cloud
+    winners = topmost_points(cloud, slab, threads=rule.threads, is_left_out=painters.is_left_out)
     has_point = winners["point"] != NO_POINT
     floors_m = winners["depth_m"] - np.float32(rule.layer_m)
     if rule.colouring == "centre":
-        winners = _most_central(cloud, slab, floors_m, threads=rule.threads)
+        winners = _most_central(painters, slab, floors_m, threads=rule.threads)
     rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
     if rule.colouring == "gaussian":
-        rgb[has_point] = _weighted_means(cloud, values, slab, floors_m, rule)[has_point]
+        rgb[has_point] = _weighted_means(painters, slab, floors_m, rule)[has_point]
     elif rule.colouring == "median":
         for cells in _in_parts(winners["n_points"]):
-            _lay_medians(rgb, cells, cloud, values, slab, floors_m, rule)
+            _lay_medians(rgb, cells, painters, slab, floors_m, rule)
     else:
-        rgb[:] = values_of_winners(winners, values, 0, threads=rule.threads)
+        rgb[:] = values_of_winners(winners, painters.values, 0, threads=rule.threads)
     places = places_of_winners(cloud, slab, winners, threads=rule.threads)
     if rule.colouring in {"gaussian", "median"}:
         places[has_point] = 0.0
@@ -112,14 +133,14 @@ def colours_of(
 
 
 def _most_central(
-    cloud: PointCloud, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
+    painters: Painters, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
 ) -> NDArray[np.void]:
     """The points on the topmost surface that lie nearest to the centres of their cells."""
     from orthoflow.geometry.raster_kernels import keep_nearest
-    from orthoflow.geometry.rastering import empty_winners, entries_inside, share_cells
+    from orthoflow.geometry.rastering import empty_winners, share_cells
 
     winners = empty_winners(slab.n_cells, threads=threads)
-    for entries in entries_inside(cloud, slab, threads=threads):
+    for entries in painters.entries(slab, threads=threads):
         slots = _slots(entries)
         is_below = entries.depths_m[slots] < floors_m[entries.cells[slots]]
         entries.squares[slots[is_below]] = np.inf
@@ -138,7 +159,7 @@ class _TopPoints:
 
 
 def _on_top(
-    cloud: PointCloud,
+    painters: Painters,
     slab: Slab,
     floors_m: NDArray[np.float32],
     *,
@@ -146,12 +167,10 @@ def _on_top(
     wanted: slice | None = None,
 ) -> Iterator[_TopPoints]:
     """Give the points on the topmost surface, of all cells or of those that are wanted."""
-    from orthoflow.geometry.rastering import entries_inside
-
     width = slab.frame.width
     wanted = wanted or slice(0, slab.n_cells)
     rows = slice(wanted.start // width, -(-wanted.stop // width))
-    for entries in entries_inside(cloud, slab, threads=threads, rows=rows):
+    for entries in painters.entries(slab, threads=threads, rows=rows):
         slots = _slots(entries)
         cells = entries.cells[slots]
         is_wanted = (cells >= wanted.start) & (cells < wanted.stop)
@@ -173,14 +192,14 @@ def _slots(entries: Entries) -> NDArray[np.int64]:
 
 
 def _weighted_means(
-    cloud: PointCloud,
-    values: NDArray[np.uint8],
+    painters: Painters,
     slab: Slab,
     floors_m: NDArray[np.float32],
     rule: ColourRule,
 ) -> NDArray[np.uint8]:
+    values = painters.values
     totals = np.zeros((slab.n_cells, values.shape[1] + 1))
-    for top in _on_top(cloud, slab, floors_m, threads=rule.threads):
+    for top in _on_top(painters, slab, floors_m, threads=rule.threads):
         weights = np.exp(top.squares.astype(np.float64) / (-2.0 * _SIGMA_CELLS**2))
         np.add.at(totals[:, -1], top.cells, weights)
         for channel in range(values.shape[1]):
@@ -204,14 +223,13 @@ def _in_parts(n_points: NDArray[np.uint32]) -> Iterator[slice]:
 def _lay_medians(
     rgb: NDArray[np.uint8],
     wanted: slice,
-    cloud: PointCloud,
-    values: NDArray[np.uint8],
+    painters: Painters,
     slab: Slab,
     floors_m: NDArray[np.float32],
     rule: ColourRule,
 ) -> None:
     """Write the median colour, channel by channel, of the highest points of cells into `rgb`."""
-    chunks = list(_on_top(cloud, slab, floors_m, threads=rule.threads, wanted=wanted))
+    chunks = list(_on_top(painters, slab, floors_m, threads=rule.threads, wanted=wanted))
     if not chunks:
         return
     cells = np.concatenate([chunk.cells for chunk in chunks])
@@ -219,6 +237,7 @@ def _lay_medians(
     points = np.concatenate([chunk.points for chunk in chunks])
     order = np.lexsort((points, -depths_m, cells))
     cells, points = cells[order], points[order]
+    values = painters.values
     is_first = np.append(True, cells[1:] != cells[:-1])
     first = np.flatnonzero(is_first)
     sizes = np.minimum(np.diff(np.append(first, cells.size)), rule.n_top)

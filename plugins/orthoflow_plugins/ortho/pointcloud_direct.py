@@ -32,7 +32,7 @@ from orthoflow_plugins.ortho.filling import (
     painted_between,
     reach_rows,
 )
-from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
+from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, Painters, colours_of
 
 # Larger walls are painted in bands of so many cells: some 600 MB.
 _BAND_CELLS: Final = 1 << 22
@@ -94,6 +94,11 @@ class PointcloudDirect(Method):
             "on the topmost surface; gaussian mean of that surface by distance to the centre; "
             "median of its n_top highest points.",
         )
+        skip_black: bool = Field(
+            default=False,
+            description="Points of pure black have no colour, as in many files those that no "
+            "camera saw: they paint no cell, and keep their depth.",
+        )
         layer_m: float = Field(
             default=0.02,
             gt=0,
@@ -131,7 +136,7 @@ class PointcloudDirect(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Project the cloud onto each wall, then fill its gaps."""
         inputs.cloud.require_points(3)
-        colours = _colours(inputs.cloud, ctx)
+        painters = _painters(inputs.cloud, params, ctx)
         rule = ColourRule(
             colouring=params.colouring,
             layer_m=params.layer_m,
@@ -149,7 +154,7 @@ class PointcloudDirect(Method):
                 wall.frame.shape, cells_most=_BAND_CELLS, reach_rows=reach
             ):
                 started = ctx.clock_s()
-                projection = _project(inputs.cloud, colours, slab.over(band.around), rule)
+                projection = _project(painters, slab.over(band.around), rule)
                 projected = ctx.clock_s()
                 _fill(projection, layers[-1], band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
@@ -171,11 +176,11 @@ class PointcloudDirect(Method):
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
 
 
-def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
-    """Colours (n, 3) of the points, or their intensity as grey (n, 1)."""
+def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepContext) -> Painters:
+    """The points with their colours, or their intensity as grey."""
     if cloud.rgb is not None:
-        _warn_of_black(ctx, cloud.rgb)
-        return np.asarray(cloud.rgb)
+        rgb = np.asarray(cloud.rgb)
+        return Painters(cloud=cloud, values=rgb, is_left_out=_black_points(rgb, params, ctx))
     if cloud.intensity is None:
         raise MethodError(
             "the cloud has neither colours nor intensity, so no orthoimage can be painted from it: "
@@ -187,21 +192,34 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
     for first in range(0, n_points, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         grey[part, 0] = np.rint(255.0 * np.clip(cloud.intensity[part], 0, 1))
-    return grey
+    return Painters(cloud=cloud, values=grey)
 
 
-def _warn_of_black(ctx: StepContext, rgb: NDArray[np.uint8]) -> None:
-    """Tell of points that are pure black, as many files have those that no camera saw."""
+def _black_points(
+    rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
+) -> NDArray[np.bool_] | None:
+    """Which points (n,) are pure black if these are skipped, else None; many are told of."""
     n_points, n_black = len(rgb), 0
+    is_black = None
+    if params.skip_black:
+        is_black = np.asarray(ctx.allocate("layers", "black", (n_points,), np.bool_), np.bool_)
     for first in range(0, n_points, _POINTS_AT_ONCE):
-        red, green, blue = rgb[first : first + _POINTS_AT_ONCE].T
-        n_black += int(np.count_nonzero((red | green | blue) == 0))
-    if n_black >= _BLACK_WORTH_WORDS * n_points > 0:
+        part = slice(first, first + _POINTS_AT_ONCE)
+        red, green, blue = rgb[part].T
+        is_black_here = (red | green | blue) == 0
+        n_black += int(np.count_nonzero(is_black_here))
+        if is_black is not None:
+            is_black[part] = is_black_here
+    share = f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black"
+    if params.skip_black:
+        ctx.log(f"{share} and paint no cell")
+    elif n_black >= _BLACK_WORTH_WORDS * n_points:
         ctx.warn(
-            f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
-            "without a colour are in many files; they are painted as they are: take them out of "
-            "the scan if black specks in the image are none of the wall's"
+            f"{share}, as points without a colour are in many files; they are painted as they "
+            "are: if black specks in the image are none of the wall's, set skip_black: true "
+            "(ortho.pointcloud-direct), with which they keep their depth and paint no cell"
         )
+    return is_black
 
 
 def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:
@@ -223,10 +241,8 @@ def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:
     )
 
 
-def _project(
-    cloud: PointCloud, colours: NDArray[np.uint8], slab: Slab, rule: ColourRule
-) -> _Projection:
-    found = colours_of(cloud, colours, slab, rule)
+def _project(painters: Painters, slab: Slab, rule: ColourRule) -> _Projection:
+    found = colours_of(painters, slab, rule)
     shape = slab.frame.shape
     return _Projection(
         rgb=found.rgb.reshape(*shape, 3),

@@ -175,7 +175,8 @@ class RasterGrid(Method):
         ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
             default=(),
             description="Raster exactly these planes, by their place in planes.json, where 0 has "
-            "the most support; empty: as constraint, min_area_m2, n_walls_max, skip_covered say.",
+            "the most support: other planes where a tolerance, detector or scan finds others (near "
+            "stays with one); empty: as constraint, min_area_m2, n_walls_max, skip_covered say.",
         )
         near: tuple[Place, ...] = Field(
             default=(),

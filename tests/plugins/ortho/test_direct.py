@@ -201,9 +201,46 @@ def test_points_of_pure_black_are_told(tmp_path: Path, *, n_black: int, is_told:
     ctx = scenes.context(tmp_path)
     inputs = PointcloudDirect.In(walls=walls, cloud=dataclasses.replace(cloud, rgb=rgb))
     PointcloudDirect().run(inputs, PointcloudDirect.Params(), ctx)
-    told = [text for text in ctx.warnings if f"{n_black} points of the cloud" in text]
+    told = [
+        text
+        for text in ctx.warnings
+        if f"{n_black} points of the cloud" in text and "set skip_black: true" in text
+    ]
     assert bool(told) == is_told
     assert len(ctx.warnings) == len(told)
+
+
+@pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
+def test_points_of_pure_black_are_skipped_where_that_is_asked_for(
+    tmp_path: Path, colouring: str
+) -> None:
+    known = scenes.leaning_wall(shape=(12, 15))
+    columns, rows = scenes.cell_centres(known.shape)
+    rgb = scenes.checker(columns, rows) // 2 + 100
+    rgb[7] = (0, 0, 1)
+    # Over every other cell, and alone in the last one, lies a black point.
+    flat = np.zeros(columns.size)
+    points = np.vstack(
+        [
+            known.world(columns, rows, flat)[:-1],
+            known.world(columns, rows, flat + 0.002)[::2],
+            known.world(columns, rows, flat)[-1:],
+        ]
+    )
+    black = np.zeros((len(points) - len(rgb) + 1, 3), dtype=np.uint8)
+    cloud = scenes.cloud_of(points, rgb=np.vstack([rgb[:-1], black]))
+    walls = bare_walls(known)
+    options = {"colouring": colouring, "inpaint": "none"}
+    spotted = painted(cloud, walls, tmp_path, **options)
+    layer = painted(cloud, walls, tmp_path, skip_black=True, **options)
+    if colouring == "topmost":
+        assert not spotted.rgb.reshape(-1, 3)[::2].any()
+    np.testing.assert_array_equal(layer.rgb.reshape(-1, 3)[:-1], rgb[:-1])
+    assert (layer.mask.ravel()[:-1] == LayerMask.PAINTED).all()
+    assert (spotted.mask.ravel()[-1], layer.mask.ravel()[-1]) == (
+        LayerMask.PAINTED,
+        LayerMask.NO_SURFACE,
+    )
 
 
 def test_a_cloud_that_cannot_paint_is_refused(tmp_path: Path) -> None:
