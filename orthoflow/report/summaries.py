@@ -47,6 +47,7 @@ _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 CHECKING: Final = "check_rmse_mm_worst"
 OF_PLANE: Final = "rms_mm"
 # What a reader may take such a number for, and it is not.
+_RELIEF_COUNTS: Final = "relief of the wall counts in full: it is no error of the image"
 _NOT_HELD: Final[Mapping[str, str]] = {
     "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
     CHECKING: "mean of both axes of the photo; along one of the wall it may be more",
@@ -133,6 +134,8 @@ def answers(run: Run) -> tuple[Answer, ...]:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
             what = words_of(wanted, row.method, row.words)
             not_held = _NOT_HELD.get(wanted, "")
+            if wanted == OF_PLANE and row.method.startswith("plane."):
+                not_held = _RELIEF_COUNTS
             n_found = int(values.get((row.cell, "n_found"), 0.0))
             if wanted == "rms_mm" and n_found and row.method.startswith("inspect."):
                 # Of one point it is no RMS, and of few it says little.

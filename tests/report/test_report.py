@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from markupsafe import Markup
-from orthoflow_provenance.model import Metric, PublishedFile, RecordedCell
+from orthoflow_provenance.model import Metric, PublishedFile, RecordedCell, RecordedInput
 
 from orthoflow.errors import StoreError
 from orthoflow.products import CheckPoints
@@ -268,7 +268,9 @@ def test_ties_that_check_are_told_along_the_wall_beside_them() -> None:
 
 
 def test_points_are_told_to_the_plane_of_the_wall_beside_them() -> None:
-    told = answers(run(cell("plane", metrics=metrics(rms_mm=9.871)), cell("mosaic")))
+    found = cell("plane", method="plane.ransac", metrics=metrics(rms_mm=9.871))
+    told = answers(run(found, cell("mosaic")))
+    assert "no error of the image" in told[0].not_held
     wall, other = (
         PlaneRow(
             name=name,
@@ -390,7 +392,14 @@ def test_given_check_points_of_which_none_counts_are_not_asked_for_again(tmp_pat
     assert "<li>Failed: none of the check points counts, as said above" in page
     without = replace(asked, record=record(cells[:1]))
     write_report([without], tmp_path / "report.html")
-    assert "surveyed check points would tell" in (tmp_path / "report.html").read_text()
+    told = "surveyed check points would tell (<code>--input checkpoints=FILE</code>{})."
+    elsewhere = " in workflows that have this input, as <code>direct.yaml</code>"
+    assert told.format(elsewhere) in (tmp_path / "report.html").read_text()
+    taken = RecordedInput(name="checkpoints", files=())
+    write_report(
+        [replace(asked, record=record(cells[:1], inputs=(taken,)))], tmp_path / "report.html"
+    )
+    assert told.format("") in (tmp_path / "report.html").read_text()
 
 
 def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:

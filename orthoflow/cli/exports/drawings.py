@@ -26,6 +26,7 @@ from orthoflow.files.drawings.papers import (
     View,
     fitting_scale,
     nice_step,
+    paper_for_one,
     paper_of,
     placed_views,
 )
@@ -59,7 +60,14 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
         _write_wall(folder, drawing, wall, paper)
         for drawing, wall in zip(drawings, walls, strict=True)
     ]
-    return f"{counted(sum(counts), 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
+    said = f"{counted(sum(counts), 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
+    if sum(counts) > len(walls):
+        sizes = [
+            (tuple(one.rasters), _size_m(wall)) for one, wall in zip(drawings, walls, strict=True)
+        ]
+        larger = paper_for_one(sizes, scale)
+        said += f" (on {larger} each wall takes one)" if larger else ""
+    return said
 
 
 def _chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:

@@ -149,9 +149,37 @@ def _fits(size_m: tuple[float, float], scale: int, area_mm: tuple[float, float])
     )
 
 
+def paper_for_one(walls: Sequence[tuple[Sequence[str], tuple[float, float]]], scale: int) -> str:
+    """Name the smallest usual paper that takes each wall on one sheet; empty where none does.
+
+    Args:
+        walls: the pictures of each, and width and height of its raster.
+        scale: n of 1 : n.
+    """
+    for name in reversed(SIZES_MM):
+        paper = paper_of(name)
+        if all(
+            any(_on_one(kinds, size_m, way, scale) for way in (paper, paper.turned))
+            for kinds, size_m in walls
+        ):
+            return name
+    return ""
+
+
 def _sheets(
     kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int, grid_m: float
 ) -> tuple[tuple[View, ...], ...]:
+    together = _on_one(kinds, size_m, paper, scale)
+    if together:
+        return (together,)
+    parts = _parts(size_m, paper.area_mm, scale, grid_m)
+    return tuple((_alone(kind, part, paper, scale),) for kind in kinds for part in parts)
+
+
+def _on_one(
+    kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int
+) -> tuple[View, ...]:
+    """The pictures of a wall beside or below each other on one sheet; none if they do not fit."""
     area = paper.area_mm
     whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
     wide, high = (1e3 * edge / scale for edge in size_m)
@@ -161,21 +189,18 @@ def _sheets(
         if needed[0] <= area[0] + 1e-3 and needed[1] <= area[1] + 1e-3:
             left = MARGIN_MM + LABELS_MM + 0.5 * (area[0] - needed[0])
             top = paper.height_mm - MARGIN_MM - LABELS_MM - 0.5 * (area[1] - needed[1])
-            return (
-                tuple(
-                    View(
-                        kind=kind,
-                        part=whole,
-                        corner_mm=(
-                            left + (place * (wide + gap) if rows == 1 else 0.0),
-                            top - high - (place * (high + gap) if rows > 1 else 0.0),
-                        ),
-                    )
-                    for place, kind in enumerate(kinds)
-                ),
+            return tuple(
+                View(
+                    kind=kind,
+                    part=whole,
+                    corner_mm=(
+                        left + (place * (wide + gap) if rows == 1 else 0.0),
+                        top - high - (place * (high + gap) if rows > 1 else 0.0),
+                    ),
+                )
+                for place, kind in enumerate(kinds)
             )
-    parts = _parts(size_m, area, scale, grid_m)
-    return tuple((_alone(kind, part, paper, scale),) for kind in kinds for part in parts)
+    return ()
 
 
 def _parts(

@@ -254,7 +254,7 @@ def test_sheets_are_counted_and_have_one_scale(
     written.clear()
     more = replace(Choices(), scale=20, wall=7, paper="A4")
     said = module.export_sheets(run, tmp_path / "out", more)
-    assert said == f"{len(written) - 1} sheets of 1 wall at 1:20"
+    assert said == f"{len(written) - 1} sheets of 1 wall at 1:20 (on A3 each wall takes one)"
     assert {entry[1].number for entry in written} == {7}
 
 

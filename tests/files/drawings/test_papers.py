@@ -11,6 +11,7 @@ from orthoflow.files.drawings.papers import (
     MARGIN_MM,
     fitting_scale,
     nice_step,
+    paper_for_one,
     paper_of,
     placed_views,
 )
@@ -21,6 +22,27 @@ A3 = paper_of("A3")
 def test_papers_are_those_of_the_standard_or_given() -> None:
     assert (paper_of("a1").width_mm, paper_of("A1").height_mm) == (841.0, 594.0)
     assert (paper_of("700x500.5").width_mm, paper_of("700x500.5").height_mm) == (700.0, 500.5)
+
+
+@pytest.mark.parametrize(
+    ("size_m", "kinds", "name"),
+    [
+        ((1.0, 1.0), ("ortho",), "A4"),
+        ((9.4, 7.0), ("ortho",), "A3"),
+        ((7.0, 14.0), ("ortho",), "A3"),
+        ((9.4, 7.0), ("ortho", "depth"), "A2"),
+        ((40.0, 40.0), ("ortho",), "A0"),
+        ((41.0, 41.0), ("ortho",), ""),
+    ],
+)
+def test_the_smallest_paper_that_takes_each_wall_on_one_sheet_is_named(
+    size_m: tuple[float, float], kinds: tuple[str, ...], name: str
+) -> None:
+    walls = [(kinds, size_m), (("ortho",), (0.5, 0.5))]
+    assert paper_for_one(walls, 50) == name
+    for tried in ("A0", "A1", "A2", "A3", "A4"):
+        _, sheets = placed_views(kinds, size_m, paper_of(tried), scale=50, grid_m=0.0)
+        assert (len(sheets) == 1) == (name != "" and tried <= name)
 
 
 @pytest.mark.parametrize("text", ["A9", "letter", "70x500", "700x50000", "700", "1e3x500", ""])
