@@ -24,7 +24,13 @@ IntensitySource = Literal["laser", "luminance", "none"]
 
 
 class SurfaceMask(IntEnum):
-    """Where a wall's depth comes from."""
+    """Where a wall's depth comes from.
+
+    Attributes:
+        VOID: from nowhere; it is NaN.
+        MEASURED: from points in the cell.
+        RECOVERED: from cells beside it, over a small gap.
+    """
 
     VOID = 0
     MEASURED = 1
@@ -32,7 +38,14 @@ class SurfaceMask(IntEnum):
 
 
 class LayerMask(IntEnum):
-    """What one source could paint."""
+    """What one source could paint.
+
+    Attributes:
+        OUTSIDE: the source does not show the cell.
+        PAINTED: it has a colour.
+        OCCLUDED: something stands between the cell and the camera.
+        NO_SURFACE: no depth is known there.
+    """
 
     OUTSIDE = 0
     PAINTED = 1
@@ -41,7 +54,15 @@ class LayerMask(IntEnum):
 
 
 class OrthoMask(IntEnum):
-    """What became of a cell of an orthoimage."""
+    """What became of a cell of an orthoimage.
+
+    Attributes:
+        NONE: no source shows it.
+        PAINTED: its colour is a source's.
+        FILLED: its colour is that of cells beside it.
+        OCCLUDED: hidden from every source that could show it.
+        NO_SURFACE: no depth is known there.
+    """
 
     NONE = 0
     PAINTED = 1
