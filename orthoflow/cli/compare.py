@@ -180,16 +180,16 @@ def _print_pairs(
 
 
 # Any: rows of all kinds.
-def _counts(rows: Sequence[Pair[Any]], n_rounded: int = 0) -> str:
-    """Say in how many rows the runs differ, those aside that differ by rounding."""
+def _counts(rows: Sequence[Pair[Any]]) -> str:
+    """Say in how many rows the runs differ, and in how many by rounding."""
     from orthoflow.records.comparison import Difference
 
     found = Difference.of(rows)
-    counts = (
-        [f"{found.n_different - n_rounded} of {found.n_shared} differ"] if found.n_shared else []
-    )
+    counts = [f"{found.n_different} of {found.n_shared} differ"] if found.n_shared else []
     alone = ((found.n_left, "only in A"), (found.n_right, "only in B"))
     counts += [f"{n} {where}" for n, where in alone if n]
+    if found.n_rounded:
+        counts.append(f"another {found.n_rounded} differ by less than a millionth")
     return ", ".join(counts) or "none"
 
 
@@ -207,18 +207,15 @@ def _print_metrics(
     rows: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str], most: int | None
 ) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.records.comparison import rounded
     from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one
 
     measured = [row for row in rows if not row.either.is_cost]
-    n_rounded = sum(map(rounded, measured))
-    more = f", another {n_rounded} differ by less than a millionth" if n_rounded else ""
-    echo("", f"metrics: {_counts(measured, n_rounded)}{more}")
+    echo("", f"metrics: {_counts(measured)}")
     different = moved_first([row for row in measured if not row.is_same], step_of)
     if most is None:
         _print_numbers(alike_rows(different, id))
     else:
-        told = repeats_as_one(row for row in different if not rounded(row))
+        told = repeats_as_one(row for row in different if not row.is_rounded)
         _print_numbers(told[:most])
         say_more(len(told), most)
     costs = [row for row in rows if row.either.is_cost]

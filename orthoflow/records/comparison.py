@@ -70,6 +70,17 @@ class Pair(Generic[Side]):
         return self.left is not None and self.right is not None
 
     @property
+    def is_rounded(self) -> bool:
+        """Whether both are values of a metric that differ by no more than libraries round."""
+        left, right = self.left, self.right
+        return (
+            isinstance(left, ComparedMetric)
+            and isinstance(right, ComparedMetric)
+            and left != right
+            and left.is_near(right)
+        )
+
+    @property
     def either(self) -> Side:
         """What one of them says, the first where it does."""
         side = self.right if self.left is None else self.left
@@ -83,27 +94,31 @@ class Difference:
     """In how many of some rows two runs differ.
 
     Attributes:
-        n_different: rows of which both say something, and not the same.
+        n_different: rows of which both say something, and not the same, but for rounding.
         n_shared: rows of which both say something.
         n_left: rows of which only the first does.
         n_right: rows of which only the second does.
+        n_rounded: rows that differ by no more than libraries round.
     """
 
     n_different: int
     n_shared: int
     n_left: int
     n_right: int
+    n_rounded: int = 0
 
     @classmethod
     def of(cls, rows: Iterable[Pair[Any]]) -> Difference:
         """Count rows."""
         rows = tuple(rows)
         shared = [row for row in rows if row.is_shared]
+        n_rounded = sum(row.is_rounded for row in shared)
         return cls(
-            n_different=sum(not row.is_same for row in shared),
+            n_different=sum(not row.is_same for row in shared) - n_rounded,
             n_shared=len(shared),
             n_left=sum(row.right is None and row.left is not None for row in rows),
             n_right=sum(row.left is None and row.right is not None for row in rows),
+            n_rounded=n_rounded,
         )
 
 
@@ -186,11 +201,6 @@ class ComparedMetric:
         )
 
 
-def rounded(pair: Pair[ComparedMetric]) -> bool:
-    """Whether the two values of a metric differ, and by no more than libraries round."""
-    return not pair.is_same and pair.left is not None and pair.left.is_near(pair.right)
-
-
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
     """Two runs side by side; rows that say the same on both sides are among them.
@@ -229,10 +239,9 @@ class RunComparison:
             "parameters": Difference.of(self.shared(self.parameters)),
             "metrics": Difference.of(self.measured),
         }
-        n_rounded = {"metrics": sum(map(rounded, self.measured))}
         differing = [
-            f"{one.n_different - n_rounded.get(name, 0)} of {one.n_shared} {name}"
-            + (f" ({n_rounded[name]} more by rounding)" if n_rounded.get(name) else "")
+            f"{one.n_different} of {one.n_shared} {name}"
+            + (f" ({one.n_rounded} more by rounding)" if one.n_rounded else "")
             for name, one in counted.items()
             if one.n_shared
         ]
@@ -260,7 +269,7 @@ class RunComparison:
     def _repr_html_(self) -> str:
         table = self.metric_table()
         is_moved = [
-            row.is_shared and not row.is_same and not row.either.is_cost and not rounded(row)
+            row.is_shared and not row.is_same and not row.either.is_cost and not row.is_rounded
             for row in self.metrics
         ]
         moved = table[np.array(is_moved, dtype=np.bool_)]

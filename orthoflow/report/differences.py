@@ -13,7 +13,6 @@ from orthoflow.records.comparison import (
     Pair,
     ParameterValue,
     RunComparison,
-    rounded,
 )
 from orthoflow.records.comparison import Difference as DifferenceCounts
 from orthoflow.records.distances import ProductDistance
@@ -150,8 +149,7 @@ def _metric_table(
     """
     measured = [pair for pair in pairs if not pair.either.is_cost]
     counts = DifferenceCounts.of(measured)
-    n_rounded = sum(map(rounded, measured))
-    moved = [pair for pair in measured if not pair.is_same and not rounded(pair)]
+    moved = [pair for pair in measured if not (pair.is_same or pair.is_rounded)]
     rows = []
     for one in repeats_as_one(moved_first(moved, step_of)):
         left, right = one.pair.left, one.pair.right
@@ -167,9 +165,9 @@ def _metric_table(
     return DifferenceTable(
         title="Metrics, time and memory left aside",
         n_compared=counts.n_shared,
-        n_different=counts.n_different - n_rounded,
+        n_different=counts.n_different,
         n_alone=counts.n_left + counts.n_right,
-        n_rounded=n_rounded,
+        n_rounded=counts.n_rounded,
         rows=tuple(rows),
     )
 

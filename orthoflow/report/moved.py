@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
-from orthoflow.records.comparison import ComparedMetric, Pair, rounded
+from orthoflow.records.comparison import ComparedMetric, Pair
 from orthoflow.report.comparisons import FOUND
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
@@ -88,14 +88,13 @@ def moved_first(
     placed = []
     for pair in sorted(pairs, key=lambda pair: -_relative_change(pair)):
         step = step_of.get(pair.cell, pair.cell)
-        is_rounded = rounded(pair)
         place = quality_place(pair.name)
         group = 0 if place < len(_ORDER) else 1 if sense_of(pair.name) is not Sense.NEITHER else 2
         turn = turns[step, pair.name]
         turns[step, pair.name] += 1
         # A later step takes further what an earlier one has begun, as orientations do.
         later = -places.get(step, 0) if group == 0 else 0
-        placed.append(((is_rounded, group, turn, place, later), pair))
+        placed.append(((pair.is_rounded, group, turn, place, later), pair))
     return [pair for _, pair in sorted(placed, key=lambda one: one[0])]
 
 

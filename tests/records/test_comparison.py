@@ -90,6 +90,11 @@ def test_rows_are_counted_by_who_says_something() -> None:
     sides = [(1, 1), (1, 2), (3, 4), (1, None), (None, 1), (None, 2), (None, 3), (None, None)]
     rows = [Pair(name="x", left=left, right=right) for left, right in sides]
     assert Difference.of(rows) == Difference(n_different=2, n_shared=3, n_left=1, n_right=3)
+    values = [(1.0, 1.0), (1.0, 1.0 + 1e-9), (1.0, 1.1)]
+    numbers = [Pair(name="x", left=number(one), right=number(two)) for one, two in values]
+    assert Difference.of(numbers) == Difference(
+        n_different=1, n_shared=3, n_left=0, n_right=0, n_rounded=1
+    )
 
 
 def test_a_number_is_the_same_whatever_machine_measured_it() -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from orthoflow.records.comparison import ComparedMetric, Pair, rounded
+from orthoflow.records.comparison import ComparedMetric, Pair
 from orthoflow.report.moved import alike_texts, moved_first
 
 
@@ -33,7 +33,7 @@ def moved(cell: str, name: str, left: float, right: float) -> Pair[ComparedMetri
 def test_rounding_is_a_difference_of_a_millionth_and_none_of_counts(
     left: ComparedMetric, right: ComparedMetric | None, is_rounded: bool
 ) -> None:
-    assert rounded(Pair(name="x", left=left, right=right)) is is_rounded
+    assert Pair(name="x", left=left, right=right).is_rounded is is_rounded
 
 
 def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> None:
