@@ -39,6 +39,8 @@ _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
 # Pure black points are told of from this share on; of real colours hardly any is.
 _BLACK_WORTH_WORDS: Final = 0.001
+# Files with black points have some that are almost black, too.
+_ALMOST_BLACK_GREY: Final = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,10 +96,13 @@ class PointcloudDirect(Method):
             "on the topmost surface; gaussian mean of that surface by distance to the centre; "
             "median of its n_top highest points.",
         )
-        skip_black: bool = Field(
-            default=False,
-            description="Points of pure black have no colour, as in many files those that no "
-            "camera saw: they paint no cell, and keep their depth.",
+        skip_below_grey: int = Field(
+            default=0,
+            ge=0,
+            le=255,
+            description="Points no channel of which reaches this have no colour, as in many files "
+            "those that no camera saw: they paint no cell, and keep their depth. 1: those of pure "
+            "black; 10: almost black ones, too; 0: none.",
         )
         layer_m: float = Field(
             default=0.02,
@@ -180,7 +185,7 @@ def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepConte
     """The points with their colours, or their intensity as grey."""
     if cloud.rgb is not None:
         rgb = np.asarray(cloud.rgb)
-        return Painters(cloud=cloud, values=rgb, is_left_out=_black_points(rgb, params, ctx))
+        return Painters(cloud=cloud, values=rgb, is_left_out=_dark_points(rgb, params, ctx))
     if cloud.intensity is None:
         raise MethodError(
             "the cloud has neither colours nor intensity, so no orthoimage can be painted from it: "
@@ -195,31 +200,37 @@ def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepConte
     return Painters(cloud=cloud, values=grey)
 
 
-def _black_points(
+def _dark_points(
     rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Which points (n,) are pure black if these are skipped, else None; many are told of."""
-    n_points, n_black = len(rgb), 0
-    is_black = None
-    if params.skip_black:
-        is_black = np.asarray(ctx.allocate("layers", "black", (n_points,), np.bool_), np.bool_)
+    """Which points (n,) are too dark to have a colour; None where none is. Black ones are told."""
+    n_points, least = len(rgb), params.skip_below_grey
+    is_dark = None
+    if least > 0:
+        is_dark = np.asarray(ctx.allocate("layers", "dark", (n_points,), np.bool_), np.bool_)
+    n_black, n_dark, n_almost = 0, 0, 0
     for first in range(0, n_points, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
-        red, green, blue = rgb[part].T
-        is_black_here = (red | green | blue) == 0
-        n_black += int(np.count_nonzero(is_black_here))
-        if is_black is not None:
-            is_black[part] = is_black_here
-    share = f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black"
-    if params.skip_black:
-        ctx.log(f"{share} and paint no cell")
+        brightest = rgb[part].max(axis=1)
+        n_black += int(np.count_nonzero(brightest == 0))
+        n_almost += int(np.count_nonzero(brightest < _ALMOST_BLACK_GREY))
+        if is_dark is not None:
+            is_dark[part] = brightest < least
+            n_dark += int(np.count_nonzero(is_dark[part]))
+    if is_dark is not None:
+        ctx.log(
+            f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) are darker than "
+            f"skip_below_grey = {least} and paint no cell"
+        )
     elif n_black >= _BLACK_WORTH_WORDS * n_points:
         ctx.warn(
-            f"{share}, as points without a colour are in many files; they are painted as they "
-            "are: if black specks in the image are none of the wall's, set skip_black: true "
-            "(ortho.pointcloud-direct), with which they keep their depth and paint no cell"
+            f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
+            f"without a colour are in many files, and {n_almost - n_black} almost; they are "
+            "painted as they are: if black specks in the image are none of the wall's, set "
+            f"skip_below_grey to {_ALMOST_BLACK_GREY} (ortho.pointcloud-direct; 1 for pure black "
+            "alone), with which they keep their depth and paint no cell"
         )
-    return is_black
+    return is_dark
 
 
 def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:

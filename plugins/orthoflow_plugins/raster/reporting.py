@@ -48,6 +48,7 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
+            least_m = step_m / _STEP_MOST_CELLS
             measured = np.count_nonzero(wall.count) / wall.count.size
             finer = (
                 "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
@@ -55,7 +56,7 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
             ctx.warn(
                 f"{wall.name}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
                 f"{measured:.0%} of the cells have a point, {filled:.0%} are interpolated"
-                + (" (a larger gsd_m leaves fewer)" if is_close else "")
+                + (f" (gsd_m = {least_m:.2g} m or more leaves fewer)" if is_close else "")
             )
 
 

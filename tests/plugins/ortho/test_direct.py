@@ -204,21 +204,22 @@ def test_points_of_pure_black_are_told(tmp_path: Path, *, n_black: int, is_told:
     told = [
         text
         for text in ctx.warnings
-        if f"{n_black} points of the cloud" in text and "set skip_black: true" in text
+        if f"{n_black} points of the cloud" in text and "set skip_below_grey to 10" in text
     ]
     assert bool(told) == is_told
     assert len(ctx.warnings) == len(told)
 
 
 @pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
-def test_points_of_pure_black_are_skipped_where_that_is_asked_for(
-    tmp_path: Path, colouring: str
+@pytest.mark.parametrize("least", [1, 10])
+def test_points_without_a_colour_are_skipped_where_that_is_asked_for(
+    tmp_path: Path, colouring: str, least: int
 ) -> None:
     known = scenes.leaning_wall(shape=(12, 15))
     columns, rows = scenes.cell_centres(known.shape)
     rgb = scenes.checker(columns, rows) // 2 + 100
-    rgb[7] = (0, 0, 1)
-    # Over every other cell, and alone in the last one, lies a black point.
+    rgb[7] = (0, 0, least)
+    # Over every other cell, and alone in the last one, lies a point that is too dark.
     flat = np.zeros(columns.size)
     points = np.vstack(
         [
@@ -227,14 +228,14 @@ def test_points_of_pure_black_are_skipped_where_that_is_asked_for(
             known.world(columns, rows, flat)[-1:],
         ]
     )
-    black = np.zeros((len(points) - len(rgb) + 1, 3), dtype=np.uint8)
-    cloud = scenes.cloud_of(points, rgb=np.vstack([rgb[:-1], black]))
+    dark = np.full((len(points) - len(rgb) + 1, 3), least - 1, dtype=np.uint8)
+    cloud = scenes.cloud_of(points, rgb=np.vstack([rgb[:-1], dark]))
     walls = bare_walls(known)
     options = {"colouring": colouring, "inpaint": "none"}
     spotted = painted(cloud, walls, tmp_path, **options)
-    layer = painted(cloud, walls, tmp_path, skip_black=True, **options)
+    layer = painted(cloud, walls, tmp_path, skip_below_grey=least, **options)
     if colouring == "topmost":
-        assert not spotted.rgb.reshape(-1, 3)[::2].any()
+        assert (spotted.rgb.reshape(-1, 3)[::2] == least - 1).all()
     np.testing.assert_array_equal(layer.rgb.reshape(-1, 3)[:-1], rgb[:-1])
     assert (layer.mask.ravel()[:-1] == LayerMask.PAINTED).all()
     assert (spotted.mask.ravel()[-1], layer.mask.ravel()[-1]) == (

@@ -123,12 +123,13 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
     assert empty == "empty: no point lies within its buffer"
     assert coarse == (
         "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
-        "apart; 33% of the cells have a point, 0% are interpolated (a larger gsd_m leaves "
-        "fewer)"
+        "apart; 33% of the cells have a point, 0% are interpolated (gsd_m = 0.018 m or "
+        "more leaves fewer)"
     )
     assert close == (
         "close: cells of gsd_m = 0.005 m lie on points about 0.0034 m apart; "
-        "33% of the cells have a point, 33% are interpolated (a larger gsd_m leaves fewer)"
+        "33% of the cells have a point, 33% are interpolated (gsd_m = 0.0051 m or more leaves "
+        "fewer)"
     )
     # An uneven scan leaves many cells to be interpolated, however close its points lie elsewhere.
     assert gaps.startswith("gaps: cells of gsd_m = 0.005 m lie on points about 0.003 m")
