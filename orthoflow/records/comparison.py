@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
-import numpy as np
 from orthoflow_provenance.digests import canonical_json
 from orthoflow_provenance.model import (
     COSTS,
@@ -21,9 +18,7 @@ from orthoflow_provenance.model import (
     shared_fields,
 )
 
-from orthoflow.alike import first_few
 from orthoflow.engine.keys import read_preimage, stated_versions
-from orthoflow.foreign_text import shown
 from orthoflow.products.product import JsonValue
 from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
 from orthoflow.records.metrics import cell_metrics, is_rounding
@@ -38,9 +33,6 @@ if TYPE_CHECKING:
 Side = TypeVar("Side")
 # Seconds and memory that methods measured themselves hang on the machine, too.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
-_ROWS_MOST: Final = 60  # of a table in a notebook
-_FEW: Final = 8
-_SAY_HOW_GOOD: Final = ("inspect", "orient")  # kinds of methods
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,38 +257,6 @@ class RunComparison:
         )
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
         return f"<RunComparison of {runs}: {'; '.join(filter(None, said))}>"
-
-    def _repr_html_(self) -> str:
-        table = self.metric_table()
-        is_moved = [
-            row.is_shared and not row.is_same and not row.either.is_cost and not row.is_rounded
-            for row in self.metrics
-        ]
-        moved = table[np.array(is_moved, dtype=np.bool_)]
-        # How good it is stands first, where only the first rows are shown.
-        kinds = {row.cell: row.either.method.partition(".")[0] for row in self.cells}
-        moved = moved.sort_values(
-            "cell", key=lambda cells: ~cells.map(kinds).isin(_SAY_HOW_GOOD), kind="stable"
-        )
-        said = f"<p>{escape(shown(repr(self)))}</p>{self._parameters_html()}"
-        if not Difference.of(self.measured).n_shared:
-            return f"{said}<p>They have no number in common, time and memory left aside.</p>"
-        if moved.empty:
-            return (
-                f"{said}<p>No number that both runs have differs, time and memory, and rounding, "
-                "left aside.</p>"
-            )
-        return said + str(moved.to_html(index=False, max_rows=_ROWS_MOST))
-
-    def _parameters_html(self) -> str:
-        """The parameters in which both differ, the first few."""
-        rows = [row for row in self.shared(self.parameters) if row.is_shared and not row.is_same]
-        told = [
-            f"{row.cell}.{row.name}: {' -> '.join(json.dumps(side.value) for side in sides)}"
-            for row in rows
-            if (sides := [one for one in (row.left, row.right) if one is not None])
-        ]
-        return f"<p>{escape(shown(first_few(told, most=_FEW)))}</p>" if told else ""
 
     @property
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -24,13 +25,14 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product
 from orthoflow.records import RecordedFigure
-from orthoflow.records.comparison import RunComparison, compare_runs
+from orthoflow.records.comparison import Difference, RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.runs import open_run as open_plain_run
 from orthoflow.records.verification import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.moved import moved_first
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
 from orthoflow.report.tidy_tables import Varied
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 
 _THUMBNAIL_PX: Final = 640
 _FIGURES_MOST: Final = 24  # shown at once: a notebook keeps them all in its file
+_ROWS_MOST: Final = 60  # of a table of what differs
+_PARAMETERS_MOST: Final = 8
 _SHOWN: Final = (OrthoMask.PAINTED, OrthoMask.FILLED)
 
 
@@ -130,7 +134,8 @@ class OpenedRun(Run):
 
         Args:
             number: of the wall, as in the names of its files; None for the first one.
-            cell: address of the cell that made it; None for that of the baseline.
+            cell: address of the cell that made it; None for that of the baseline, or, with a
+                warning, of another combination where it has none.
             data: name of the dataset, where the run has several; None for the first one.
 
         Raises:
@@ -145,6 +150,8 @@ class OpenedRun(Run):
             if places:
                 raise ArgumentError(f"{lacks} of {cell}; steps with some: {', '.join(places)}")
             raise ArgumentError(f"{self.with_failure(lacks)}{self._way_to_logs()}")
+        if not (cell or baseline):
+            warnings.warn(f"the baseline has no orthoimages; this is of {chosen}", stacklevel=2)
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
         found = [image for image in images if number is None or image.number == number]
         if not found:
@@ -167,7 +174,7 @@ class OpenedRun(Run):
 
     def compare(
         self, other: str | Path | Run, *, store: str | Path = ".orthoflow"
-    ) -> RunComparison:
+    ) -> ShownComparison:
         """Lay this run beside another one, see `RunComparison`.
 
         Args:
@@ -181,12 +188,14 @@ class OpenedRun(Run):
         from orthoflow.engine.store import stores_at  # noqa: PLC0415 - few ask
 
         opened = other if isinstance(other, Run) else open_run(other)
-        return compare_runs(self, opened, stores=stores_at(store))
+        return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
         """How to read what the steps said that failed; empty where none did."""
-        failed = [cell.address for cell in self.record.cells if cell.status == "failed"]
-        return f"; run.cell({failed[0]!r}).log has its log" if failed else ""
+        failed = [cell for cell in self.record.cells if cell.status == "failed"]
+        if not failed or not failed[0].log:
+            return ""
+        return f"; run.cell({failed[0].address!r}).log has its log"
 
     def _repr_html_(self) -> str:
         record = self.record
@@ -227,6 +236,40 @@ def open_run(path: str | Path) -> OpenedRun:
     if doubt := broken_seal(plain):
         warnings.warn(f"{doubt}; rely on nothing that is said of it here", stacklevel=2)
     return OpenedRun(path=plain.path, record=plain.record)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ShownComparison(RunComparison):
+    """Two runs side by side, as a notebook shows them."""
+
+    def _repr_html_(self) -> str:
+        said = f"<p>{_html(repr(self))}</p>{self._parameters_html()}"
+        if not Difference.of(self.measured).n_shared:
+            return f"{said}<p>They have no number in common, time and memory left aside.</p>"
+        differing = [
+            row for row in self.measured if row.is_shared and not (row.is_same or row.is_rounded)
+        ]
+        moved = [(row.cell, row.name) for row in moved_first(differing, self.step_of)]
+        if not moved:
+            return (
+                f"{said}<p>No number that both runs have differs, time and memory, and rounding, "
+                "left aside.</p>"
+            )
+        table = self.metric_table().set_index(["cell", "metric"])
+        first = table.loc[moved[:_ROWS_MOST]].reset_index()
+        n_more = len(moved) - len(first)
+        more = f"<p>{n_more} more, which <code>metric_table()</code> has.</p>" if n_more else ""
+        return f"{said}{first.to_html(index=False)}{more}"
+
+    def _parameters_html(self) -> str:
+        """The parameters in which both differ, the first few."""
+        rows = [row for row in self.shared(self.parameters) if row.is_shared and not row.is_same]
+        told = [
+            f"{row.cell}.{row.name}: {' -> '.join(json.dumps(side.value) for side in sides)}"
+            for row in rows
+            if (sides := [one for one in (row.left, row.right) if one is not None])
+        ]
+        return f"<p>{_html(first_few(told, most=_PARAMETERS_MOST))}</p>" if told else ""
 
 
 class NoFigureError(ArgumentError, KeyError):
@@ -330,8 +373,8 @@ class WallImage:
             self.rgb,
             dims=("y", "x", "band"),
             coords={
-                "y": top - frame.gsd_m * (np.arange(frame.height) + 0.5),
-                "x": left + frame.gsd_m * (np.arange(frame.width) + 0.5),
+                "y": ("y", top - frame.gsd_m * (np.arange(frame.height) + 0.5), {"units": "m"}),
+                "x": ("x", left + frame.gsd_m * (np.arange(frame.width) + 0.5), {"units": "m"}),
                 "band": ["red", "green", "blue"],
                 "is_shown": (("y", "x"), self.is_shown),
             },

@@ -66,7 +66,11 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     # What is embedded once can be embedded again, with neither store nor files.
     shutil.rmtree(studio.folder / ".orthoflow")
     (studio.folder / "n.txt").unlink()
-    assert studio("export", "whole", "--embed", "-o", "twice").exit_code == 0
+    assert "sealed anew: sha256:" in done.output
+    again = studio("export", "whole", "--embed", "-o", "twice")
+    assert again.exit_code == 0
+    seal = done.output.rpartition("sha256:")[2]
+    assert again.output.endswith(f"all of it embedded before, the same seal: sha256:{seal}")
     first, second = (studio.folder / name / "run.h5" for name in ("whole", "twice"))
     assert first.read_bytes() == second.read_bytes()
     assert_record_alone_is_enough(studio, second)

@@ -19,8 +19,10 @@ import orthoflow
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError, WorkflowError
 from orthoflow.products import Orthoimages, PointCloud
-from orthoflow.report.notebooks import Figures, OpenedRun
+from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.report.notebooks import Figures, OpenedRun, ShownComparison
 from orthoflow.report.tidy_tables import combination_rows
+from tests.compared_runs import compared, number
 from tests.provenance_records import write_sample
 from tests.report_runs import cell, compared_resolved, given, metrics, record
 from tests.report_runs import orthoimages_product as images_of
@@ -78,6 +80,7 @@ def test_a_run_that_failed_names_the_step_its_reason_and_where_the_log_is(tmp_pa
         cell("plane@data=yard", status="failed", error_message="another"),
         cell("mosaic", status="skipped", error_message="needs plane, which failed"),
     ]
+    cells[1] = replace(cells[1], log="read 3 points")
     run = OpenedRun(path=tmp_path / "run.h5", record=record(cells, name="hall"))
     said = f"plane@data=hall failed (1 more failed): {reason} \\x1b[2J"
     assert repr(run) == f"<Run hall in {tmp_path}: 1 ok, 2 failed, 1 skipped; {said}>"
@@ -87,6 +90,11 @@ def test_a_run_that_failed_names_the_step_its_reason_and_where_the_log_is(tmp_pa
             call()
         assert str(error.value) == f"the run r1 has no orthoimages; {said}; {way}"
     assert escape(f"steps: 1 ok, 2 failed, 1 skipped; {said}; {way}") in run._repr_html_()
+    # Nobody is sent to a log that is empty.
+    cells[1] = replace(cells[1], log="")
+    silent = OpenedRun(path=tmp_path / "run.h5", record=record(cells, name="hall"))
+    assert f"{escape(said)}</p>" in silent._repr_html_()
+    assert "has its log" not in silent._repr_html_()
 
 
 def test_the_reason_of_a_failure_is_cut_where_it_is_endless(tmp_path: Path) -> None:
@@ -224,7 +232,8 @@ def test_an_orthoimage_is_handed_on_with_metres_along_its_wall(
     left, top = image.frame.raster_corner_m
     # The middles of the cells, the first row on top.
     step = image.frame.gsd_m
-    x, y = array.coords["x"], array.coords["y"]
+    (_, x, told), (_, y, _) = array.coords["x"], array.coords["y"]
+    assert told == {"units": "m"}
     np.testing.assert_allclose(x, np.linspace(left, left + columns * step, 2 * columns + 1)[1::2])
     np.testing.assert_allclose(y, np.linspace(top, top - rows * step, 2 * rows + 1)[1::2])
     assert array.attrs == {"unit_of_x_and_y": "m", "gsd_m": step}
@@ -242,6 +251,20 @@ def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
     run = Painted(path=tmp_path / "run.h5", record=record(made, workflow_resolved=resolved))
     assert run.orthoimage(8).cell == "mosaic@data=calm"
     assert run.orthoimage(8, data="noisy").cell == "mosaic@data=noisy"
+    # Where the first of a dataset has none, it is said that another's is given.
+    varied = [
+        replace(one, address=f"{one.address},plane=b", assignment={**one.assignment, "plane": "b"})
+        for one in made
+    ]
+    failed = [
+        cell(f"plane@data={name},plane=a", status="failed", error_message="none")
+        for name in ("calm", "noisy")
+    ]
+    run = Painted(path=run.path, record=record([*failed, *varied], workflow_resolved=resolved))
+    with pytest.warns(
+        UserWarning, match="the baseline has no orthoimages; this is of mosaic@data=noisy,plane=b"
+    ):
+        assert run.orthoimage(8, data="noisy").cell == "mosaic@data=noisy,plane=b"
     with pytest.raises(ArgumentError, match=r"no dataset noise \(did you mean noisy\?\)"):
         run.orthoimage(8, data="noise")
 
@@ -260,6 +283,39 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     assert "<td>n_points</td>" in html
     assert "rms_mm" not in html
     assert np.isnan(table.loc[("plane@plane=coarse", "rms_mm")].difference)
+
+
+def shown(*rows: Pair[ComparedMetric]) -> str:
+    return ShownComparison(**vars(compared(*rows, alone=("wall",))))._repr_html_()
+
+
+def test_a_comparison_shows_what_moved() -> None:
+    moved = Pair(cell="first", name="n_ties", left=number(1.0), right=number(1.5))
+    still = Pair(cell="plane", name="n", left=number(4.0), right=number(4.0))
+    near = Pair(cell="plane", name="offset_mm", left=number(1.0), right=number(1.0 + 1e-12))
+    alone = Pair(cell="wall", name="rms_mm", left=number(2.0), right=None)
+    html = shown(still, moved, near, alone)
+    assert html.count("<tr") == 2
+    assert "<td>0.5</td>" in html
+    assert "plane.a: 1 -&gt; 2" in html
+    assert shown(still, near, alone).endswith(
+        "<p>No number that both runs have differs, time and memory, and rounding, left aside.</p>"
+    )
+    assert shown(alone).endswith(
+        "<p>They have no number in common, time and memory left aside.</p>"
+    )
+
+
+def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:
+    counts = [
+        Pair(cell="first", name=f"n_{index}", left=number(1.0), right=number(2.0 + index))
+        for index in range(70)
+    ]
+    check = Pair(cell="check", name="rmse_u_mm", left=number(2.0), right=number(2.1))
+    html = shown(*counts, check)
+    assert html.index("<td>check</td>") < html.index("<td>first</td>")
+    assert html.count("<tr") == 61
+    assert html.endswith("<p>11 more, which <code>metric_table()</code> has.</p>")
 
 
 def test_records_of_the_command_line_open_too(tmp_path: Path) -> None:

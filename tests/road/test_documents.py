@@ -120,7 +120,7 @@ def test_the_archive(finished: Path, shell: Shell) -> None:
     told = Story().follow("docs/archiving.md", shell)
     replayed = told["orthoflow replay first-embedded -o repeated"].out
     assert "identical" in replayed
-    assert (shell.folder / "first" / "export" / "ro-crate").is_dir()
+    assert (shell.folder / "crate").is_dir()
 
 
 def test_the_signature(finished: Path, shell: Shell) -> None:
