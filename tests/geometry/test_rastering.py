@@ -80,6 +80,21 @@ def test_no_bit_depends_on_the_number_of_threads(threads: int) -> None:
     np.testing.assert_array_equal(alone, shared)
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_points_that_are_left_out_win_nothing(threads: int) -> None:
+    wall = scenes.upright_wall(shape=(60, 80))
+    cloud, slab = random_cloud(wall, n_points=60_000, seed=2), slab_of(wall)
+    is_left_out = np.random.default_rng(2).random(len(cloud)) < 0.4
+    winners = topmost_points(cloud, slab, threads=threads, is_left_out=is_left_out)
+    kept = np.flatnonzero(~is_left_out)
+    some = replace(cloud, **{axis: getattr(cloud, axis)[kept] for axis in "xyz"})
+    expected = topmost_points(some, slab, threads=1)
+    has_point = expected["point"] != NO_POINT
+    np.testing.assert_array_equal(winners["point"] != NO_POINT, has_point)
+    np.testing.assert_array_equal(winners["point"][has_point], kept[expected["point"][has_point]])
+    np.testing.assert_array_equal(winners["n_points"], expected["n_points"])
+
+
 def test_of_equal_points_the_first_wins() -> None:
     wall = scenes.upright_wall()
     twins = wall.world(np.full(5, 3.5), np.full(5, 4.5), np.zeros(5))
