@@ -219,8 +219,8 @@ def _dark_points(
             n_dark += int(np.count_nonzero(is_dark[part]))
     if is_dark is not None:
         ctx.log(
-            f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) are darker than "
-            f"skip_below_grey = {least} and paint no cell"
+            f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
+            f"skip_below_grey = {least}; they paint no cell"
         )
     elif n_black >= _BLACK_WORTH_WORDS * n_points:
         ctx.warn(
