@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
+from orthoflow.alike import first_few
 from orthoflow.files.json_texts import parse_json
 from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
@@ -15,6 +18,12 @@ from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report.rankings import Sense, count_of_photos, sense_of
 from orthoflow.workflow.cells import variants_text
+from orthoflow.workflow.format import DATA
+
+# Walls that differ by more are two.
+_TURNED_DEG: Final = 10.0
+_LARGER: Final = 1.5
+_ROOMS_MOST: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +126,66 @@ class Combination:
         name = count_of_photos(metric)
         count = self.measured(step, name) if name else None
         return math.nan if count is None else count.value
+
+
+def unequal_walls(combinations: Iterable[Combination]) -> str:
+    """Say where the first walls of combinations are not one, room by room; empty where they are.
+
+    What was found decides which wall is the first, so that numbers of it may be of different ones.
+    """
+    by_room: dict[tuple[Path, str], list[tuple[Combination, _Wall]]] = {}
+    for one in combinations:
+        wall = _Wall.of(one)
+        if wall is not None:
+            room = (one.run.path, one.assignment.get(DATA, ""))
+            by_room.setdefault(room, []).append((one, wall))
+    told = []
+    for found in by_room.values():
+        one, first = found[0]
+        others = [(other, wall) for other, wall in found if not wall.is_like(first)]
+        if others:
+            (other, wall), n_more = others[0], len(others) - 1
+            more = f" (and {n_more} more that differ)" if n_more else ""
+            told.append(f"{one.name} shows {first}, {other.name} {wall}{more}")
+    if not told:
+        return ""
+    return (
+        "not all combinations show the same wall first, so numbers of it speak of different ones: "
+        f"{first_few(told, most=_ROOMS_MOST)}"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Wall:
+    """Which wall a step of the kind `raster` reports on."""
+
+    omega_deg: float
+    phi_deg: float
+    area_m2: float
+
+    @classmethod
+    def of(cls, one: Combination) -> _Wall | None:
+        """The first wall of the last such step; None where none says which it is."""
+        steps = [cell.step for cell in one.cells if cell.method.startswith("raster.")]
+        values = {
+            name: found.value
+            for name in ("omega_deg", "phi_deg", "area_m2")
+            if steps and (found := one.measured(steps[-1], name)) is not None
+        }
+        return cls(**values) if len(values) == len(fields(cls)) else None
+
+    def is_like(self, other: _Wall) -> bool:
+        """Whether it can be the same wall, its edges a little elsewhere."""
+        angles = (self.omega_deg, self.phi_deg, other.omega_deg, other.phi_deg)
+        omega, phi, omega_2, phi_2 = (math.radians(angle) for angle in angles)
+        cosine = math.sin(phi) * math.sin(phi_2) + math.cos(phi) * math.cos(phi_2) * math.cos(
+            omega - omega_2
+        )
+        larger, smaller = max(self.area_m2, other.area_m2), min(self.area_m2, other.area_m2)
+        return cosine > math.cos(math.radians(_TURNED_DEG)) and larger <= _LARGER * smaller
+
+    def __str__(self) -> str:
+        return f"{self.area_m2:.3g} m2 at omega {self.omega_deg:.0f}, phi {self.phi_deg:.0f} deg"
 
 
 def is_missing(cell: RecordedCell) -> bool:

@@ -19,7 +19,12 @@ from orthoflow.foreign_text import shown
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import Combination, combinations_of, wanted_metrics
+from orthoflow.report.combinations import (
+    Combination,
+    combinations_of,
+    unequal_walls,
+    wanted_metrics,
+)
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
@@ -32,6 +37,7 @@ _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
+_OF_WALLS: Final = ("raster.", "ortho.", "mosaic.", "inspect.")  # what measures them
 _SHARES: Final = ("main_found", "label_*", "*completeness*", "*_iou*", "*_share*")
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
@@ -239,6 +245,15 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     for sweep in found:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
+    of_walls = (
+        {
+            cell.step: " Not all are of the same wall."
+            for cell in cells
+            if cell.method.startswith(_OF_WALLS)
+        }
+        if unequal_walls(combinations)
+        else {}
+    )
     unswept = {place: _unswept(cells, *place, found) for place in swept}
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for (step, parameter), alike in swept.items():
@@ -255,7 +270,8 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
                 shown_lines = _levelled(dict(list(lines.items())[:_MOST_LINES]))
                 curve = _curve(alike[0], column, shown_lines, n_datasets=len(parts))
-                yield replace(curve, caption=curve.caption + _unequal_photos(combinations, column))
+                caveats = _unequal_photos(combinations, column) + of_walls.get(column.step, "")
+                yield replace(curve, caption=curve.caption + caveats)
 
 
 def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:

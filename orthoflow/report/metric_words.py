@@ -199,6 +199,7 @@ WORDS: Final[Mapping[str, str]] = {
     "main_wall_points": "points on the main wall",
     "outlier_share": "points that were spoilt on purpose",
     "n_walls": "walls",
+    "area_m2": "area of the first wall's raster",
     "gsd_mm": "side of a cell",
     "n_points_inside": "points within the walls",
     "points_per_cell": "points per cell",

@@ -31,7 +31,7 @@ from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.runs import open_run as open_plain_run
 from orthoflow.records.verification import Verification, broken_seal, verify_run
-from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.moved import moved_first
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
@@ -205,11 +205,13 @@ class OpenedRun(Run):
             f"<tr><td>{_html(one.what)}</td><td>{_html(one.value)}</td><td>{_html(one.cell)}</td></tr>"
             for one in answers(self)
         )
+        apart = unequal_walls(combinations_of(self))
         counts = Counter(cell.status for cell in record.cells)
         told = ", ".join(f"{count} {status}" for status, count in counts.items()) or "none"
         steps = f"{self.with_failure(f'steps: {told}')}{self._way_to_logs()}"
         return (
             f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{_html(steps)}</p>"
+            + (f"<p>{_html(apart)}</p>" if apart else "")
             + (
                 f'<img alt="first orthoimage" src="{picture}" style="max-width:100%">'
                 if picture

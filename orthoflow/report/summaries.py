@@ -12,7 +12,7 @@ from orthoflow.products import Orthoimages
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.warnings import standing_warnings
-from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.ways import improved_on
@@ -229,8 +229,11 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
             measuring.isdisjoint(item.places),
         ),
     )
+    apart = unequal_walls(combinations_of(run))
+    rastered = tuple(one.address for one in by_baseline if one.method.startswith("raster."))
     return (
         *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
+        *([Limit(text=apart, cells=rastered)] if apart else []),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),
     )
 

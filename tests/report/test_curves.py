@@ -654,6 +654,27 @@ def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
     assert list(said.values()) == [False, is_said]
 
 
+@pytest.mark.parametrize(("area_m2", "is_said"), [(16.5, False), (1.2, True)])
+def test_a_curve_over_different_walls_is_drawn_with_a_word_of_that(
+    tmp_path: Path, area_m2: float, is_said: bool
+) -> None:
+    cells = []
+    for value, area in ((1.0, 16.0), (2.0, area_m2)):
+        variant = f"plane=limit-{value:g}"
+        told = metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area)
+        found = metrics(rms_mm=value)
+        cells += [
+            cell(f"plane@{variant}", params={"limit": value}, metrics=found),
+            cell(f"wall@{variant}", method="raster.grid", metrics=told),
+            cell(f"check@{variant}", method="inspect.toy", metrics=metrics(rmse_u_mm=value)),
+        ]
+    said = {
+        curve.name.partition(".")[0]: "Not all are of the same wall" in curve.caption
+        for curve in curves(held(tmp_path, cells))
+    }
+    assert (said["plane"], said["check"]) == (False, is_said)
+
+
 @pytest.mark.parametrize(("is_error", "y"), [(True, 3.0), (False, -2.0)])
 def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
     found = [module._Value(value, math.nan, False) for value in (-4.0, 3.0, -2.0)]

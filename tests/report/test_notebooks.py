@@ -285,6 +285,18 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     assert np.isnan(table.loc[("plane@plane=coarse", "rms_mm")].difference)
 
 
+def test_a_run_whose_variants_show_different_walls_says_so(tmp_path: Path) -> None:
+    told = [metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area) for area in (16.0, 1.2)]
+    cells = [
+        cell(f"wall@plane={index}", method="raster.grid", metrics=one)
+        for index, one in enumerate(told)
+    ]
+    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells))
+    assert "<p>not all combinations show the same wall first" in run._repr_html_()
+    alone = OpenedRun(path=tmp_path / "run.h5", record=record(cells[:1]))
+    assert "not all combinations" not in alone._repr_html_()
+
+
 def shown(*rows: Pair[ComparedMetric]) -> str:
     return ShownComparison(**vars(compared(*rows, alone=("wall",))))._repr_html_()
 

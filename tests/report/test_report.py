@@ -297,6 +297,47 @@ def test_points_are_told_to_the_plane_of_the_wall_beside_them() -> None:
         assert (answer.what, answer.value) == ("points to the first plane, RMS", "9.87 mm")
 
 
+def rastered(omega_deg: float, area_m2: float, place: str) -> RecordedCell:
+    """A raster of a wall, upright but for its last millidegrees."""
+    told = metrics(omega_deg=omega_deg, phi_deg=0.001, area_m2=area_m2)
+    return cell(f"wall@{place}", method="raster.grid", metrics=told)
+
+
+@pytest.mark.parametrize(
+    ("walls", "said"),
+    [
+        # The same wall with another rim, also across north.
+        ([(359.0, 16.0), (1.0, 18.0)], ""),
+        ([(359.0, 16.0), (180.0, 16.0)], "plane=1 16 m2 at omega 180, phi 0 deg"),
+        ([(10.0, 16.0), (10.0, 1.2)], "plane=1 1.2 m2 at omega 10, phi 0 deg"),
+        (
+            [(10.0, 1.2), (10.0, 16.0), (10.0, 16.5)],
+            "plane=1 16 m2 at omega 10, phi 0 deg (and 1 more that differ)",
+        ),
+    ],
+)
+def test_combinations_that_show_different_walls_are_a_limit(
+    walls: list[tuple[float, float]], said: str
+) -> None:
+    cells = [rastered(*wall, f"plane={index}") for index, wall in enumerate(walls)]
+    found = limits(run(*cells))
+    if not said:
+        assert found == ()
+        return
+    assert found[0].text.startswith("not all combinations show the same wall first, so ")
+    assert found[0].text.endswith(said)
+    assert found[0].cells == tuple(one.address for one in cells)
+
+
+def test_walls_of_different_rooms_may_differ() -> None:
+    cells = [
+        rastered(10.0, area, f"data={room},plane=a") for room, area in (("x", 2.0), ("y", 9.0))
+    ]
+    assert limits(run(*cells)) == ()
+    moved = rastered(90.0, 9.0, "data=y,plane=b")
+    assert limits(run(*cells, moved))[0].text.count("m2 at omega") == 2
+
+
 def test_advice_on_what_was_measured_is_the_first_limit() -> None:
     scan = cell("scan", method="read.scan", warnings=("set view_from of it: a guess",))
     check = cell(

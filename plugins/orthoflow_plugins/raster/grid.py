@@ -74,6 +74,10 @@ class RasterGrid(Method):
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_walls",
+        # Which wall the first one is.
+        "omega_deg",
+        "phi_deg",
+        "area_m2",
         "gsd_mm",
         "n_points_inside",
         "points_per_cell",
@@ -268,7 +272,7 @@ class RasterGrid(Method):
         warn(ctx, rasters, source)
         if params.surface == "tin":
             warn_of_wide_gaps(ctx, walls)
-        report(ctx, rasters)
+        report(ctx, rasters, planes.up)
         report_empty(ctx, walls, empty)
         return self.Out(
             walls=Walls(

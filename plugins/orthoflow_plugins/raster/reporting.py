@@ -8,6 +8,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import SurfaceMask, Wall
@@ -91,9 +92,20 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
             )
 
 
-def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
-    """Tell in numbers what the walls hold."""
+def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float64]) -> None:
+    """Tell in numbers what the walls hold.
+
+    Args:
+        ctx: of the step.
+        rasters: of the walls.
+        up: (3,) unit vector.
+    """
     walls = [raster.wall for raster in rasters]
+    frame = walls[0].frame
+    omega_deg, phi_deg = omega_phi_deg(frame.normal_world, up)
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("area_m2", frame.height * frame.width * frame.gsd_m**2, "m2")
     n_cells = sum(wall.mask.size for wall in walls)
     counts = [_sampled(wall.count) for wall in walls]
     per_cell = np.concatenate([count[count > 0] for count in counts])

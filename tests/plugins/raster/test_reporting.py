@@ -17,6 +17,8 @@ from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext, StepEvent
 from tests import samples
 
+UP = np.array([0.0, 0.0, 1.0])
+
 
 def wall(
     count: list[list[int]], *, name: str = "wall 0", mask: list[list[int]] | None = None
@@ -65,9 +67,14 @@ def test_walls_are_told_in_numbers(listener: Listener) -> None:
     reporting.report(
         listener.context,
         [WallRaster(wall=first, scan_step_m=0.0042), WallRaster(wall=second, scan_step_m=0.1)],
+        UP,
     )
     assert listener.metrics == {
         "n_walls": 2.0,
+        # The first one looks south.
+        "omega_deg": pytest.approx(270.0),
+        "phi_deg": pytest.approx(0.0),
+        "area_m2": pytest.approx(6 * 0.005**2),
         "n_points_inside": 19.0,
         # Of 1, 1, 2, 3, 5, 7 points; cells with a spread have 2, 3, 5 and 7 mm.
         "points_per_cell": 2.5,
@@ -82,7 +89,7 @@ def test_walls_are_told_in_numbers(listener: Listener) -> None:
 
 
 def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
-    reporting.report(listener.context, [WallRaster(wall=wall([[1, 1, 0]]), scan_step_m=0.01)])
+    reporting.report(listener.context, [WallRaster(wall=wall([[1, 1, 0]]), scan_step_m=0.01)], UP)
     assert "sigma_median_mm" not in listener.metrics
     assert listener.metrics["points_per_cell"] == 1.0
 
