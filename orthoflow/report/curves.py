@@ -419,8 +419,10 @@ def _curve(
         good += ", of signed errors their sizes"
     if any(point.is_level for points in lines.values() for point in points):
         good += "; level lines are of what was not swept"
-    if any(map(_has_baseline, lines.values())):
-        good += "; the filled point is the baseline"
+    base = [one for points in lines.values() for one in points if one.is_baseline]
+    if base:
+        what = "level line with filled points" if base[0].is_level else "filled point"
+        good += f"; the {what} is the baseline"
     shape = (
         "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
         "decides the result."

@@ -281,6 +281,12 @@ def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
     (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
     assert re.findall(r'class="dot line-0 base"[^>]*><title>([^<]*)', curve.svg) == ["0.05: 0.005"]
     assert "the filled point is the baseline" in curve.caption
+    region = cell("plane@plane=region", method="plane.region", metrics=metrics(rms_mm=0.004))
+    resolved = json.dumps({"compare": {"baseline": {"plane": "region"}}})
+    told = record([*swept(0.02, 0.05, 0.1), region], workflow_resolved=resolved)  # type: ignore[list-item]
+    (level,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    assert level.svg.count(" base") == 2
+    assert "the level line with filled points is the baseline" in level.caption
     (plain,) = curves(held(tmp_path, swept(0.02, 0.05, 0.1)))
     assert "base" not in plain.svg
     assert "baseline" not in plain.caption
