@@ -327,7 +327,7 @@ def _wall_result(
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         said.append(
             f"plane with {int(planes.n_points[plane_index]):,} points, which lie {rms_mm:.1f} mm "
-            "from it (RMS)"
+            "from it (RMS, relief included)"
         )
     return WallResult(
         number=number,

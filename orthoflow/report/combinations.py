@@ -24,6 +24,7 @@ from orthoflow.workflow.format import DATA
 _TURNED_DEG: Final = 10.0
 _LARGER: Final = 1.5
 _ROOMS_MOST: Final = 3
+_ODD_MOST: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,16 +142,19 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             by_room.setdefault(room, []).append((one, wall))
     told = []
     for found in by_room.values():
-        one, first = found[0]
-        others = [(other, wall) for other, wall in found if not wall.is_like(first)]
-        if others:
-            (other, wall), n_more = others[0], len(others) - 1
-            more = f" (and {n_more} more that differ)" if n_more else ""
-            told.append(f"{one.name} shows {first}, {other.name} {wall}{more}")
+        walls = [wall for _, wall in found]
+        # What most of them show is what the odd ones do not.
+        usual = max(walls, key=lambda wall: sum(map(wall.is_like, walls)))
+        odd = [f"{one.name} shows {wall}" for one, wall in found if not wall.is_like(usual)]
+        if odd:
+            n_others = len(found) - len(odd)
+            others = "the other shows" if n_others == 1 else f"the {n_others} others show"
+            told.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {usual}")
     if not told:
         return ""
     return (
-        "not all combinations show the same wall first, so numbers of it speak of different ones: "
+        "not all combinations show the same wall first, so numbers of it speak of different ones "
+        "(near of the wall takes the one at a point, where it was found): "
         f"{first_few(told, most=_ROOMS_MOST)}"
     )
 

@@ -308,11 +308,14 @@ def rastered(omega_deg: float, area_m2: float, place: str) -> RecordedCell:
     [
         # The same wall with another rim, also across north.
         ([(359.0, 16.0), (1.0, 18.0)], ""),
-        ([(359.0, 16.0), (180.0, 16.0)], "plane=1 16 m2 at omega 180, phi 0 deg"),
-        ([(10.0, 16.0), (10.0, 1.2)], "plane=1 1.2 m2 at omega 10, phi 0 deg"),
+        (
+            [(359.0, 16.0), (180.0, 16.0)],
+            "shows 16 m2 at omega 180, phi 0 deg, the other shows 16 m2 at omega 359, phi 0 deg",
+        ),
+        # The odd one is named, wherever it stands.
         (
             [(10.0, 1.2), (10.0, 16.0), (10.0, 16.5)],
-            "plane=1 16 m2 at omega 10, phi 0 deg (and 1 more that differ)",
+            "plane=0 shows 1.2 m2 at omega 10, phi 0 deg, the 2 others show 16 m2 at omega 10, phi",
         ),
     ],
 )
@@ -325,7 +328,7 @@ def test_combinations_that_show_different_walls_are_a_limit(
         assert found == ()
         return
     assert found[0].text.startswith("not all combinations show the same wall first, so ")
-    assert found[0].text.endswith(said)
+    assert said in found[0].text
     assert found[0].cells == tuple(one.address for one in cells)
 
 

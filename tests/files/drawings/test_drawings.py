@@ -105,7 +105,7 @@ def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Pag
     for said in (
         *("Sala Łukowa", "scale 1:50", "21-017", "wall 2", "sheet 1 of 1"),
         "check: RMSE sideways 0.7 mm, up and down 1.4 mm",
-        "plane with 4,000 points, which lie 2.0 mm from it (RMS)",
+        "plane with 4,000 points, which lie 2.0 mm from it (RMS, relief included)",
         "colours as the scan has them",
         "grid 0.5 m",
         # Letters that stand upright come from below.
