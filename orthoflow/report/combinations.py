@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.alike import first_few
 from orthoflow.files.json_texts import parse_json
+from orthoflow.geometry import angle_between_deg
 from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
@@ -142,9 +145,11 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             by_room.setdefault(room, []).append((one, wall))
     told = []
     for found in by_room.values():
-        walls = [wall for _, wall in found]
         # What most of them show is what the odd ones do not.
-        usual = max(walls, key=lambda wall: sum(map(wall.is_like, walls)))
+        counts = Counter(wall for _, wall in found)
+        usual = max(
+            counts, key=lambda wall: sum(counts[one] for one in counts if wall.is_like(one))
+        )
         odd = [f"{one.name} shows {wall}" for one, wall in found if not wall.is_like(usual)]
         if odd:
             n_others = len(found) - len(odd)
@@ -180,13 +185,16 @@ class _Wall:
 
     def is_like(self, other: _Wall) -> bool:
         """Whether it can be the same wall, its edges a little elsewhere."""
-        angles = (self.omega_deg, self.phi_deg, other.omega_deg, other.phi_deg)
-        omega, phi, omega_2, phi_2 = (math.radians(angle) for angle in angles)
-        cosine = math.sin(phi) * math.sin(phi_2) + math.cos(phi) * math.cos(phi_2) * math.cos(
-            omega - omega_2
-        )
         larger, smaller = max(self.area_m2, other.area_m2), min(self.area_m2, other.area_m2)
-        return cosine > math.cos(math.radians(_TURNED_DEG)) and larger <= _LARGER * smaller
+        is_turned = angle_between_deg(self._normal, other._normal) >= _TURNED_DEG
+        return not is_turned and larger <= _LARGER * smaller
+
+    @property
+    def _normal(self) -> NDArray[np.float64]:
+        """(3,) unit vector; markiewicz2015 equation 3, as `omega_phi_deg`."""
+        omega, phi = math.radians(self.omega_deg), math.radians(self.phi_deg)
+        across = math.cos(phi)
+        return np.array([across * math.cos(omega), across * math.sin(omega), math.sin(phi)])
 
     def __str__(self) -> str:
         return f"{self.area_m2:.3g} m2 at omega {self.omega_deg:.0f}, phi {self.phi_deg:.0f} deg"

@@ -190,7 +190,7 @@ def _is_of_others(run: Run, address: str) -> bool:
 
 
 def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
-    """What limits the results: failures, then warnings, those of one sense together.
+    """What limits the results: failures, combinations of different walls, then warnings by sense.
 
     Of the warnings that no later step has settled what turns every picture over stands first; then
     those that help, of them those of what was measured on the results, then the frequent ones, then

@@ -208,15 +208,15 @@ def _dark_points(
     is_dark = None
     if least > 0:
         is_dark = np.asarray(ctx.allocate("layers", "dark", (n_points,), np.bool_), np.bool_)
-    n_black, n_dark, n_almost = 0, 0, 0
+    counts = np.zeros(256, dtype=np.int64)
     for first in range(0, n_points, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         brightest = rgb[part].max(axis=1)
-        n_black += int(np.count_nonzero(brightest == 0))
-        n_almost += int(np.count_nonzero(brightest < _ALMOST_BLACK_GREY))
+        counts += np.bincount(brightest, minlength=256)
         if is_dark is not None:
             is_dark[part] = brightest < least
-            n_dark += int(np.count_nonzero(is_dark[part]))
+    n_black, n_dark = counts[0], counts[:least].sum()
+    n_almost = counts[1:_ALMOST_BLACK_GREY].sum()
     if is_dark is not None:
         ctx.log(
             f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
@@ -225,7 +225,7 @@ def _dark_points(
     elif n_black >= _BLACK_WORTH_WORDS * n_points:
         ctx.warn(
             f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
-            f"without a colour are in many files, and {n_almost - n_black} almost; they are "
+            f"without a colour are in many files, and {n_almost} almost; they are "
             "painted as they are: if black specks in the image are none of the wall's, set "
             f"skip_below_grey to {_ALMOST_BLACK_GREY} (ortho.pointcloud-direct; 1 for pure black "
             "alone), with which they keep their depth and paint no cell"

@@ -180,7 +180,8 @@ class RasterGrid(Method):
             default=(),
             description="Raster exactly these planes, by their place in planes.json, where 0 has "
             "the most support: other planes where a tolerance, detector or scan finds others (near "
-            "stays with one); empty: as constraint, min_area_m2, n_walls_max, skip_covered say.",
+            "takes the one at a point); empty: as constraint, min_area_m2, n_walls_max and "
+            "skip_covered say.",
         )
         near: tuple[Place, ...] = Field(
             default=(),
