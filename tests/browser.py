@@ -60,7 +60,11 @@ class Page:
 
     def open(self, path: Path) -> None:
         """Open a file and wait until all of it is there."""
-        self.ask("Page.navigate", url=path.as_uri())
+        self.visit(path.as_uri())
+
+    def visit(self, address: str) -> None:
+        """Open an address and wait until all of it is there."""
+        self.ask("Page.navigate", url=address)
         self.evaluate(
             "new Promise(done => document.readyState === 'complete' ? done()"
             " : addEventListener('load', () => done()))"

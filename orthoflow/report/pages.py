@@ -330,12 +330,13 @@ def environment() -> jinja2.Environment:
     environment.globals["version"] = __version__
     environment.globals["depth_gradient"] = Markup(depth_gradient(DIVERGING.tolist()))
     # Ours, and no template: braces in them mean nothing.
-    css, script = _packaged("page.css"), _packaged("page.js")
+    css, early, script = (_packaged(name) for name in ("page.css", "early.js", "page.js"))
     environment.globals["css"] = Markup(css)
+    environment.globals["early_script"] = Markup(early)
     environment.globals["script"] = Markup(script)
     environment.globals["policy"] = (
         "default-src 'none'; img-src data:; "
-        f"style-src {_hash_source(css)}; script-src {_hash_source(script)}; "
+        f"style-src {_hash_source(css)}; script-src {_hash_source(early)} {_hash_source(script)}; "
         "base-uri 'none'; form-action 'none'"
     )
     return environment

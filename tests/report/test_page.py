@@ -649,9 +649,9 @@ def test_what_strangers_write_is_no_script_and_the_page_still_works(
     page.evaluate("new Promise(done => setTimeout(done, 200))")
     assert page.evaluate("document.title").startswith("<script>")
     assert page.complaints == []
-    # The page's own one, and blocks of data, which nobody runs.
+    # The page's own two, and blocks of data, which nobody runs.
     kinds = page.evaluate("[...document.scripts].map(script => script.type)")
-    assert sorted(kinds) == ["", "application/json", "application/json"]
+    assert sorted(kinds) == ["", "", "application/json", "application/json"]
     assert page.evaluate("document.querySelectorAll('[onerror], [onload]').length") == 0
     assert "turned \\u202eround" in page.evaluate("document.body.innerText")
     # The picture with a script in it is shown as a picture.

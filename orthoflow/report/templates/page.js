@@ -1,7 +1,6 @@
 "use strict";
 (() => {
   const root = document.documentElement;
-  root.classList.add("scripted");
 
   // Colours: as the system, light, dark. What was chosen is remembered where the browser allows it.
   const themes = { auto: "as the system", light: "light", dark: "dark" };
@@ -382,11 +381,7 @@
     for (const place of places) {
       const figure = document.getElementById(place.id);
       const image = figure.querySelector("img");
-      const readout = document.createElement("output");
-      readout.className = "readout";
-      readout.textContent = "move over the picture for coordinates";
-      // Directly below the picture: a long caption would push it out of sight.
-      figure.querySelector("figcaption").before(readout);
+      const readout = figure.querySelector(".readout");
       const marks = document.createElement("div");
       marks.className = "marks";
       marks.dataset.marks = place.id;
@@ -537,9 +532,7 @@
   // Contents: a column that stays, folded on narrow screens; where the reader is stands out.
   const contents = document.querySelector(".contents details");
   const wide = matchMedia("(min-width: 72rem)");
-  const unfold = () => { contents.open = wide.matches; };
-  wide.addEventListener("change", unfold);
-  unfold();
+  wide.addEventListener("change", () => { contents.open = wide.matches; });
   const anchors = [...contents.querySelectorAll("a")].map((link) => ({ link, target: document.getElementById(link.hash.slice(1)) }))
     .filter(({ target }) => target);
   const mark = () => {
