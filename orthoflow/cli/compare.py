@@ -215,7 +215,7 @@ def _print_metrics(
     if most is None:
         _print_numbers(alike_rows(different, id))
     else:
-        told = repeats_as_one(row for row in different if not row.is_rounded)
+        told = repeats_as_one(row for row in different if row.is_moved)
         _print_numbers(told[:most])
         say_more(len(told), most)
     costs = [row for row in rows if row.either.is_cost]

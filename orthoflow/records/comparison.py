@@ -73,6 +73,11 @@ class Pair(Generic[Side]):
         )
 
     @property
+    def is_moved(self) -> bool:
+        """Whether they differ, and by more than libraries round."""
+        return not (self.is_same or self.is_rounded)
+
+    @property
     def either(self) -> Side:
         """What one of them says, the first where it does."""
         side = self.right if self.left is None else self.left
@@ -104,13 +109,12 @@ class Difference:
         """Count rows."""
         rows = tuple(rows)
         shared = [row for row in rows if row.is_shared]
-        n_rounded = sum(row.is_rounded for row in shared)
         return cls(
-            n_different=sum(not row.is_same for row in shared) - n_rounded,
+            n_different=sum(row.is_moved for row in shared),
             n_shared=len(shared),
             n_left=sum(row.right is None and row.left is not None for row in rows),
             n_right=sum(row.left is None and row.right is not None for row in rows),
-            n_rounded=n_rounded,
+            n_rounded=sum(row.is_rounded for row in shared),
         )
 
 

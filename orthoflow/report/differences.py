@@ -149,7 +149,7 @@ def _metric_table(
     """
     measured = [pair for pair in pairs if not pair.either.is_cost]
     counts = DifferenceCounts.of(measured)
-    moved = [pair for pair in measured if not (pair.is_same or pair.is_rounded)]
+    moved = [pair for pair in measured if pair.is_moved]
     rows = []
     for one in repeats_as_one(moved_first(moved, step_of)):
         left, right = one.pair.left, one.pair.right

@@ -248,9 +248,7 @@ class ShownComparison(RunComparison):
         said = f"<p>{_html(repr(self))}</p>{self._parameters_html()}"
         if not Difference.of(self.measured).n_shared:
             return f"{said}<p>They have no number in common, time and memory left aside.</p>"
-        differing = [
-            row for row in self.measured if row.is_shared and not (row.is_same or row.is_rounded)
-        ]
+        differing = [row for row in self.measured if row.is_shared and row.is_moved]
         moved = [(row.cell, row.name) for row in moved_first(differing, self.step_of)]
         if not moved:
             return (
