@@ -336,6 +336,14 @@ def test_every_block_of_python_is_python(path: Path) -> None:
         assert name in PYTHON_RUN_BY, f"nothing runs the Python of {name}"
 
 
+def test_authors_of_plugins_are_told_every_unit() -> None:
+    from orthoflow.testing.checks import UNIT_SUFFIXES
+
+    text = (ROOT / "docs" / "plugin-authors.md").read_text(encoding="utf-8")
+    (told,) = re.findall(r"its unit in its name: (.*?)\. Counts", text, re.DOTALL)
+    assert set(re.findall(r"`_(\w+)`", told)) == set(UNIT_SUFFIXES)
+
+
 def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:
     """The blocks of docs/plugin-authors.md, about a method that is there."""
     import numpy as np

@@ -392,11 +392,15 @@ def _photo_accuracy(run: Run, upstream: tuple[str, ...]) -> Iterator[str]:
 
 
 def _colours(run: Run, address: str) -> str:
-    """What the record says was done to the photos' colours."""
+    """What the record says was done to the colours of photos or of points."""
     cell = run.cells[address]
-    given = (one for before in run.upstream(address) for one in before.inputs.values())
+    whence = tuple(run.upstream(address))
+    given = (one for before in whence for one in before.inputs.values())
     if all(one.type_name != "photos" for one in given):
-        return "colours as the scan has them"
+        greys = (before.params.get("skip_below_grey") for before in whence)
+        least = next((grey for grey in greys if grey), None)
+        without = f", without points darker than {least} of 255" if least else ""
+        return f"colours as the scan has them{without}"
     gains = cell.params.get("gains")
     if gains is None:
         return f"colours as {cell.method} gave them"

@@ -196,6 +196,15 @@ def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) 
     assert module._colours(run, "mosaic") == "colours as the scan has them"
 
 
+@pytest.mark.parametrize(
+    ("least", "said"), [(0, ""), (10, ", without points darker than 10 of 255")]
+)
+def test_points_that_paint_nothing_for_their_colour_are_said(least: int, said: str) -> None:
+    ortho = cell(inputs={"cloud": output("cloud")}, params={"skip_below_grey": least})
+    run: Any = ToyRun(ortho=ortho, mosaic=cell())
+    assert module._colours(run, "mosaic") == f"colours as the scan has them{said}"
+
+
 def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
     walls, images = {"walls": output("walls")}, {"images": output("orthoimages")}
     run: Any = ToyRun(
