@@ -107,6 +107,8 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
             f"seed {record.seed}, {counted(len(record.cells), 'step')}"
         )
+    from orthoflow.report.moved import without_seeds
+
     step_of = comparison.step_of
     if comparison.inputs:
         _print_pairs("inputs", comparison.inputs, _files_text, most)
@@ -119,20 +121,21 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
-    _print_pairs("steps", comparison.cells, str, most, step_of)
+    _print_pairs("steps", without_seeds(comparison.cells), str, most, step_of)
     if comparison.readdressed:
-        pairs = [f"{ours} (A) is {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
+        pairs = [f"{ours} (A) and {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
         named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
-        echo(f"the same, though called otherwise: {named}")
+        echo(f"compared, though called otherwise: {named}")
     _print_pairs(
         "parameters (* set, others are defaults)",
         comparison.shared(comparison.parameters),
         _parameter_text,
         most,
         step_of,
+        comparison.of_shared_steps,
     )
     _print_pairs("environment", comparison.environment, str, most)
-    _print_metrics(comparison.shared(comparison.metrics), step_of, most)
+    _print_metrics(comparison, most)
     echo("", "products")
     echo_distances(comparison.products, most)
 
@@ -143,6 +146,7 @@ def _print_pairs(
     text: Callable[[Value], str],
     most: int | None,
     step_of: Mapping[str, str] | None = None,
+    whose: str = "",
 ) -> None:
     """Print the rows that differ under a title, what both have first, or that none does.
 
@@ -152,14 +156,15 @@ def _print_pairs(
         text: how a side is said.
         most: rows that are printed, what is said alike of a step as one; all of them without it.
         step_of: the step of each cell.
+        whose: of which steps the rows are, if not of all.
     """
     from orthoflow.report.moved import alike_rows, alike_texts
 
     different = [row for row in rows if not row.is_same]
     if not different:
-        echo("", f"{title}: same")
+        echo("", f"{title}: same{whose}")
         return
-    echo("", f"{title}: {_counts(rows)}")
+    echo("", f"{title}: {_counts(rows)}{whose}")
     told = (
         alike_rows(different, id) if most is None else alike_texts(different, text, step_of or {})
     )
@@ -203,14 +208,12 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text}*" if parameter.is_set else text
 
 
-def _print_metrics(
-    rows: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str], most: int | None
-) -> None:
+def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
     from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one
 
-    measured = [row for row in rows if not row.either.is_cost]
-    echo("", f"metrics: {_counts(measured)}")
+    measured, step_of = comparison.measured, comparison.step_of
+    echo("", f"metrics: {_counts(measured)}{comparison.of_shared_steps}")
     different = moved_first([row for row in measured if not row.is_same], step_of)
     if most is None:
         _print_numbers(alike_rows(different, id))
@@ -218,7 +221,7 @@ def _print_metrics(
         told = repeats_as_one(row for row in different if row.is_moved)
         _print_numbers(told[:most])
         say_more(len(told), most)
-    costs = [row for row in rows if row.either.is_cost]
+    costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")
     _print_numbers(alike_rows(different, id)[:most])

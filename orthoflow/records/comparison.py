@@ -209,8 +209,8 @@ class RunComparison:
         inputs: files of every input, without folders.
         cells: method, version, seed and status of every cell, named as in the first run that has
             it.
-        readdressed: address in the second run -> that of the same cell in the first, where the two
-            differ: a step alone, say, and a variant that sets what its defaults are.
+        readdressed: address in the second run -> that of its counterpart in the first, where the
+            two differ: a step alone, say, and a variant that sets what its defaults are.
         parameters: resolved parameters of every cell.
         environment: Python, system, processor and packages; several values are joined by commas.
         metrics: numbers of every cell.
@@ -272,6 +272,14 @@ class RunComparison:
         """The step of each cell of either run."""
         return {cell.address: cell.step for side in (self.left, self.right) for cell in side.cells}
 
+    @property
+    def of_shared_steps(self) -> str:
+        """Say of which steps rows that `shared` leaves are; nothing where both runs have all."""
+        n_shared = sum(row.is_shared for row in self.cells)
+        all_shared = n_shared == len(self.cells)
+        counted = "step" if n_shared == 1 else f"{n_shared} steps"
+        return "" if all_shared else f", of the {counted} that both have"
+
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
         """Leave out what belongs to cells that only one of the runs has: it cannot differ."""
         alone = {row.cell for row in self.cells if not row.is_shared}
@@ -300,7 +308,8 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     """Lay two runs side by side.
 
     Cells are the same when their addresses are; else when they are of one step and dataset, and
-    each step that varies on their way has one method with the same parameters.
+    each step that varies on their way has one method with the same parameters; else when it has
+    one method, and the same values of those of its parameters that vary in either run.
 
     Args:
         left: the first run.
@@ -379,21 +388,48 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
-    free: dict[tuple[object, ...], list[str]] = {}
-    for address, cell in left.cells.items():
-        if address not in right.cells and cell.status != "skipped":
-            free.setdefault(_way(left, cell, varied), []).append(address)
+    telling = _telling_parameters((left, right), varied)
+    # What was skipped has no inputs, so that nobody knows what it would have come from.
+    ours, theirs = (
+        [at for at, cell in run.cells.items() if at not in other.cells and cell.status != "skipped"]
+        for run, other in ((left, right), (right, left))
+    )
     found: dict[str, str] = {}
-    for address, cell in right.cells.items():
-        # What was skipped has no inputs, so that nobody knows what it would have come from.
-        if address not in left.cells and cell.status != "skipped":
-            same = free.get(_way(right, cell, varied))
-            if same:
+    for names in (None, telling):
+        free: dict[tuple[object, ...], list[str]] = {}
+        for address in sorted(set(ours) - set(found.values()), key=ours.index):
+            free.setdefault(_way(left, left.cells[address], varied, names), []).append(address)
+        for address in theirs:
+            same = free.get(_way(right, right.cells[address], varied, names))
+            if address not in found and same:
                 found[address] = same.pop(0)
     return found
 
 
-def _way(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[object, ...]:
+def _telling_parameters(
+    runs: Sequence[Run], varied: Collection[str]
+) -> dict[tuple[str, str], frozenset[str]]:
+    """Find the parameters that tell variants of a step and method apart, within one of the runs."""
+    found: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        values: dict[tuple[str, str, str], set[str]] = {}
+        for cell in run.cells.values():
+            if cell.step in varied:
+                for name, value in cell.params.items():
+                    told = values.setdefault((cell.step, cell.method, name), set())
+                    told.add(canonical_json(value))
+        for (step, method, name), told in values.items():
+            if len(told) > 1:
+                found.setdefault((step, method), set()).add(name)
+    return {key: frozenset(names) for key, names in found.items()}
+
+
+def _way(
+    run: Run,
+    cell: RecordedCell,
+    varied: Collection[str],
+    telling: Mapping[tuple[str, str], Collection[str]] | None,
+) -> tuple[object, ...]:
     """Say what a cell stands for without the names of its variants.
 
     Args:
@@ -401,12 +437,14 @@ def _way(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[object,
         cell: the cell.
         varied: steps that vary in either run; they count with what they call, as a step without
             variants is the one variant that it has.
+        telling: by step and method the parameters that count; None for all.
     """
-    called = {
-        one.step: (one.method, canonical_json(dict(one.params)))
-        for one in run.upstream(cell.address)
-        if one.step in varied
-    }
+    called = {}
+    for one in run.upstream(cell.address):
+        if one.step in varied:
+            names = one.params if telling is None else telling.get((one.step, one.method), ())
+            params = {name: value for name, value in one.params.items() if name in names}
+            called[one.step] = (one.method, canonical_json(params))
     return cell.step, cell.repeat, cell.assignment.get(DATA), tuple(sorted(called.items()))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 from orthoflow.records import RecordedFile
@@ -16,7 +16,7 @@ from orthoflow.records.comparison import (
 )
 from orthoflow.records.comparison import Difference as DifferenceCounts
 from orthoflow.records.distances import ProductDistance
-from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one
+from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one, without_seeds
 from orthoflow.report.numbers import number, number_with_unit
 
 Side = TypeVar("Side")
@@ -46,6 +46,7 @@ class DifferenceTable:
         rows: those that differ, and those that only one run has; what is said alike is one.
         n_alone: how many things only one run has.
         n_rounded: how many things differ by rounding only; they have no row.
+        whose: of which steps they are, if not of all.
     """
 
     title: str
@@ -54,6 +55,7 @@ class DifferenceTable:
     rows: tuple[Difference, ...]
     n_alone: int = 0
     n_rounded: int = 0
+    whose: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +89,8 @@ class Differences:
 
 def differences(comparison: RunComparison) -> Differences:
     """Put a comparison of two runs into tables of what differs."""
-    step_of = comparison.step_of
+    step_of, of_shared = comparison.step_of, comparison.of_shared_steps
+    parameters = comparison.shared(comparison.parameters)
     return Differences(
         left=comparison.left.run_id,
         right=comparison.right.run_id,
@@ -95,12 +98,10 @@ def differences(comparison: RunComparison) -> Differences:
         tables=(
             _table("Inputs", comparison.inputs, _files_text),
             _table("Options", [comparison.overrides], " ".join),
-            _table("Steps", comparison.cells, str, step_of),
-            _table(
-                "Parameters", comparison.shared(comparison.parameters), _parameter_text, step_of
-            ),
+            _table("Steps", without_seeds(comparison.cells), str, step_of),
+            replace(_table("Parameters", parameters, _parameter_text, step_of), whose=of_shared),
             _table("Environment", comparison.environment, str),
-            _metric_table(comparison.shared(comparison.metrics), step_of),
+            replace(_metric_table(comparison.measured, step_of), whose=of_shared),
         ),
         products=tuple(
             sorted(
@@ -141,13 +142,12 @@ def _table(
 
 
 def _metric_table(
-    pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
+    measured: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
 ) -> DifferenceTable:
     """Metrics that differ by more than rounding, how good results are first.
 
     Time and memory always differ, and stand in the comparison table.
     """
-    measured = [pair for pair in pairs if not pair.either.is_cost]
     counts = DifferenceCounts.of(measured)
     moved = [pair for pair in measured if pair.is_moved]
     rows = []

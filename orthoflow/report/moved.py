@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Generic, TypeVar
 
-from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.records.comparison import CellFacts, ComparedMetric, Pair
 from orthoflow.report.comparisons import FOUND
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
@@ -62,16 +62,27 @@ def alike_rows(
 def alike_texts(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
 ) -> list[Alike[Side]]:
-    """Put pairs together that say the same of one step; of a step itself, who alone has it."""
+    """Put pairs together that say the same of one step."""
 
     def key(pair: Pair[Side]) -> Hashable:
-        step = step_of.get(pair.cell, pair.cell)
-        sides = pair.left, pair.right
-        if pair.name == step and not pair.is_shared:
-            return (step, pair.name, *(side is None for side in sides))
-        return (step, pair.name, *(None if side is None else text(side) for side in sides))
+        sides = (None if side is None else text(side) for side in (pair.left, pair.right))
+        return (step_of.get(pair.cell, pair.cell), pair.name, *sides)
 
     return alike_rows(pairs, key)
+
+
+def without_seeds(cells: Iterable[Pair[CellFacts]]) -> list[Pair[CellFacts]]:
+    """Leave out the seeds of steps that one run alone has: nothing is compared with them."""
+    return [
+        cell
+        if cell.is_shared
+        else replace(
+            cell,
+            left=cell.left and replace(cell.left, seed=None),
+            right=cell.right and replace(cell.right, seed=None),
+        )
+        for cell in cells
+    ]
 
 
 def moved_first(

@@ -197,7 +197,7 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
         f"a  {fine}  {failed}",
         f"b  {'-'.ljust(len(fine))}  {fine}",
         "",
-        "parameters (* set, others are defaults): 1 of 1 differ",
+        "parameters (* set, others are defaults): 1 of 1 differ, of the step that both have",
         "          A          B",
         'a.cell_m  0.123457*  "ä"',
         "",
@@ -205,7 +205,7 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
         "        A     B",
         "python  3.11  -",
         "",
-        "metrics: 1 of 2 differ, 1 only in B",
+        "metrics: 1 of 2 differ, 1 only in B, of the step that both have",
         "metric    A    B     B - A  unit",
         "a.rms_mm  1.5  1.25  -0.25  mm",
         "a.max_mm  -    2            mm",
@@ -229,7 +229,7 @@ def test_of_a_long_comparison_what_says_how_good_results_are_is_printed(
     ]
     _print(dataclasses.replace(few, metrics=tuple(numbers)), most=20)
     lines = printed(capsys)
-    start = lines.index("metrics: 32 of 32 differ")
+    start = lines.index("metrics: 32 of 32 differ, of the step that both have")
     assert [line.split()[0] for line in lines[start + 2 : start + 5]] == [
         *("a.rmse_u_mm", "a.rms_mm", "a.odd_0"),
     ]

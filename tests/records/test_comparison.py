@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,11 @@ def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
         opened.run("fine", "--set", "paint.gsd_m=0.25")
         (opened.folder / "n.txt").write_text("2.0")
         opened.run("file", "--input", "number=n.txt")
+        text = (opened.folder / "studio.yaml").read_text()
+        swept = "{use: paint.plain, params: {grey: {sweep: [100, 128, 140]}},"
+        (opened.folder / "swept.yaml").write_text(text.replace("{use: paint.plain,", swept))
+        done = opened("run", "swept.yaml", "-o", "swept")
+        assert done.exit_code == 0, done.output
         yield opened
 
 
@@ -169,11 +175,6 @@ def test_a_set_parameter_is_told_from_a_default(studio: Studio) -> None:
 
 
 def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Studio) -> None:
-    text = (studio.folder / "studio.yaml").read_text()
-    swept = "{use: paint.plain, params: {grey: {sweep: [100, 128, 140]}},"
-    (studio.folder / "swept.yaml").write_text(text.replace("{use: paint.plain,", swept))
-    done = studio("run", "swept.yaml", "-o", "swept")
-    assert done.exit_code == 0, done.output
     plain, variants = open_run("first"), open_run("swept")
     told = compare_runs(plain, variants)
     assert told.readdressed == {"paint@paint=grey-128": "paint"}
@@ -186,8 +187,26 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
     assert repr(told).endswith("differ; 2 steps in one of them only>")
     shown = studio("compare", "first", "swept").stdout
     assert "steps: 0 of 2 differ, 2 only in B" in shown
-    assert "the same, though called otherwise: paint (A) is paint@paint=grey-128 (B)" in shown
+    assert "compared, though called otherwise: paint (A) and paint@paint=grey-128 (B)" in shown
+    of_both = re.findall("^(.*): .*, of the 2 steps that both have$", shown, re.MULTILINE)
+    assert of_both == ["parameters (* set, others are defaults)", "metrics"]
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
+
+
+def test_of_a_changed_method_the_variant_with_the_same_swept_value_is_compared(
+    studio: Studio,
+) -> None:
+    variants, changed = open_run("swept"), open_run("fine")
+    told = compare_runs(changed, variants)
+    assert told.readdressed == {"paint@paint=grey-128": "paint"}
+    moved = {
+        row.name: (row.left.value, row.right.value)
+        for row in told.shared(told.parameters)
+        if row.left and row.right and row.left.value != row.right.value
+    }
+    assert moved == {"gsd_m": (0.25, 0.5)}
+    # 131 is no value of the sweep.
+    assert compare_runs(open_run("grey"), variants).readdressed == {}
 
 
 def test_distances_are_told_in_the_units_of_the_type(studio: Studio) -> None:
