@@ -112,6 +112,15 @@ def test_a_record_with_changed_arrays_is_not_handed_on(
         open_run("first").product("survey", "planes")
 
 
+def test_no_sheet_carries_the_seal_of_a_record_that_was_changed(studio: Studio) -> None:
+    with h5py.File(studio.folder / "first" / "run.h5", "r+") as file:
+        file["cells/survey"].attrs["wall_s"] = 99.0
+    refused = studio("export", "first", "--to", "sheet", "-o", "sheets")
+    assert refused.exit_code == 3, refused.output
+    assert "; what was changed is not handed on: take another copy of it" in refused.stderr
+    assert not (studio.folder / "sheets").exists()
+
+
 def test_every_figure_is_written_on_demand(studio: Studio) -> None:
     done = studio("export", "first", "--to", "figures")
     assert done.exit_code == 0, done.output
