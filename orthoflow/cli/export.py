@@ -172,11 +172,10 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These hand on the record itself, with arrays that nobody has read.
-    hands_on = chosen.embed or chosen.split or target == "ro-crate"
+    # These hand on the record itself, with arrays that nobody has read, or print its seal.
+    hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     doubt = broken_seal(opened, of_all=hands_on)
-    # A sheet carries the seal, which would be that of the record before it was changed.
-    if doubt and (hands_on or target == "sheet"):
+    if doubt and hands_on:
         raise RecordError(f"{doubt}; what was changed is not handed on: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
