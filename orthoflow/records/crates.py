@@ -456,8 +456,9 @@ def _how_to_read(record: RunRecord) -> str:
     """Say how somebody who has the crate alone looks at the record and checks the files."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
-    is_whole = bool(given) and all(given)
-    source = "the input files, which lie in it" if is_whole else "the input files"
+    source = "the input files" if given else "it alone"
+    if given and all(given):
+        source += ", which lie in it"
     return (
         f"With the Python package {DISTRIBUTION} {version} (of an index, or its wheel from those "
         f"who made this crate) `orthoflow verify {RECORD_FILE}` in "

@@ -276,6 +276,8 @@ def test_of_a_record_that_holds_its_input_files_nobody_looks_for_them_elsewhere(
         assert said in entities(graph, "Dataset")[0]["description"]
         (number,) = (entity for entity in graph["@graph"] if entity.get("name") == "n.txt")
         assert number.get("isPartOf") == ({"@id": "run.h5"} if is_embedded else None)
+    graph = crate_metadata(replace(run, inputs=()), [], license_text="CC0")
+    assert "computes it anew from it alone; " in entities(graph, "Dataset")[0]["description"]
 
 
 def test_products_that_the_record_holds_are_part_of_it(studio: Studio) -> None:
