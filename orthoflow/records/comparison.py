@@ -397,8 +397,11 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
     found: dict[str, str] = {}
     for names in (None, telling):
         free: dict[tuple[object, ...], list[str]] = {}
-        for address in sorted(set(ours) - set(found.values()), key=ours.index):
-            free.setdefault(_way(left, left.cells[address], varied, names), []).append(address)
+        taken = set(found.values())
+        for address in ours:
+            if address not in taken:
+                way = _way(left, left.cells[address], varied, names)
+                free.setdefault(way, []).append(address)
         for address in theirs:
             same = free.get(_way(right, right.cells[address], varied, names))
             if address not in found and same:
