@@ -102,13 +102,13 @@ def _row_json(row: Pair[Any]) -> dict[str, object]:
 
 
 def _print(comparison: RunComparison, *, most: int | None = None) -> None:
+    from orthoflow.report.moved import without_seeds
+
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
         echo(
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
             f"seed {record.seed}, {counted(len(record.cells), 'step')}"
         )
-    from orthoflow.report.moved import without_seeds
-
     step_of = comparison.step_of
     if comparison.inputs:
         _print_pairs("inputs", comparison.inputs, _files_text, most)

@@ -403,8 +403,10 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
                 way = _way(left, left.cells[address], varied, names)
                 free.setdefault(way, []).append(address)
         for address in theirs:
+            if address in found:
+                continue
             same = free.get(_way(right, right.cells[address], varied, names))
-            if address not in found and same:
+            if same:
                 found[address] = same.pop(0)
     return found
 

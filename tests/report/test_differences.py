@@ -9,6 +9,7 @@ from typing import Any
 from orthoflow.records.comparison import CellFacts, ComparedMetric, Pair
 from orthoflow.report import differences
 from orthoflow.report.differences import Difference
+from tests.compared_runs import compared
 
 
 def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
@@ -32,14 +33,15 @@ def metric(value: float, unit: str = "mm", *, is_cost: bool = False) -> Compared
     return ComparedMetric(value=value, unit=unit, is_cost=is_cost, is_cached=False, environment="e")
 
 
-def test_metrics_that_differ_say_by_how_much() -> None:
+def test_metrics_that_differ_say_by_how_much_and_costs_are_left_aside() -> None:
     pairs: list[Any] = [
         Pair(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
         Pair(cell="a", name="same_mm", left=metric(1.5), right=metric(1.5)),
+        Pair(cell="a", name="wall_s", left=metric(9.0, "s", is_cost=True), right=None),
         Pair(cell="b", name="new", left=None, right=metric(3.0, "1")),
         Pair(cell="c", name="old", left=metric(3.0, "1"), right=None),
     ]
-    table = differences._metric_table(pairs, {"a": "a", "b": "b", "c": "c"})
+    table = differences.differences(compared(*pairs)).tables[-1]
     assert (table.n_compared, table.n_different, table.n_alone) == (2, 1, 2)
     assert table.rows == (
         Difference(cell="a", name="rms_mm", left="1.5 mm", right="1.25 mm", change="-0.25"),
