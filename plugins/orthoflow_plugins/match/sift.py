@@ -135,7 +135,8 @@ class MatchSift(Method):
             "walls in many sizes and compared by where edges run, in colours, intensity and "
             "relief. confirmed: a place counts when another photo, at its own place, shows the "
             "same things there. alone: also when no photo says so, by which a photo of something "
-            "else with the same pattern may win: look at the overlays.",
+            "else with the same pattern may win: look at the overlays. Such ties err together, "
+            "more than an orientation by them states: match.guided measures anew.",
         )
         longest_side_max_px: int = Field(
             default=4000,
