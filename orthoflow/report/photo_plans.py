@@ -1,9 +1,10 @@
-"""Where photos were taken: walls and cameras from above, as a drawing for the page."""
+"""Where photos were taken: walls and cameras from above, as a drawing, and a row per photo."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Final
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.alike import first_few
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Camera, Cameras, Planes
+from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.legends import length_words, round_length_m
@@ -31,6 +32,27 @@ _LETTER: Final = 9.5  # width of one, at most
 
 
 @dataclass(frozen=True, kw_only=True)
+class PhotoRow:
+    """How well one photo is oriented.
+
+    Attributes:
+        name: of the photo.
+        status: `ok`, or why it is not oriented.
+        n_control: ties that determine its pose; None where the orientation hands on no ties.
+        n_check: ties that were withheld and agree, likewise.
+        check_mm: RMS of a coordinate of these on the wall; None without any.
+        sigma_wall_mm: expected error of a coordinate on the wall; None where none is stated.
+    """
+
+    name: str
+    status: str
+    n_control: int | None = None
+    n_check: int | None = None
+    check_mm: float | None = None
+    sigma_wall_mm: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class PhotoPlan:
     """The plan of one orientation.
 
@@ -38,11 +60,13 @@ class PhotoPlan:
         svg: an `<svg>` element.
         caption: what it shows, and which photos are missing, in words.
         cell: address of the orientation.
+        rows: a row per photo; none where nothing is known of any but its pose.
     """
 
     svg: str
     caption: str
     cell: str
+    rows: tuple[PhotoRow, ...] = ()
 
 
 def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
@@ -56,7 +80,8 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
     every = embedded_products(run, "cameras")
     places = [place for place in every if place[0] in baseline][-1:] or list(every[-1:])
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        cameras = Cameras.from_payload(payload).cameras
+        orientation = Cameras.from_payload(payload)
+        cameras = orientation.cameras
         oriented = [one for one in cameras if one.status == "ok"]
         if oriented:
             # Of one wall its intensity and its depth are shown.
@@ -70,8 +95,40 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
                 svg=plan.drawn(oriented, list(frames.values())),
                 caption=_caption(address, cameras, oriented),
                 cell=address,
+                rows=_rows(orientation),
             )
     return None
+
+
+def _rows(orientation: Cameras) -> tuple[PhotoRow, ...]:
+    squares: dict[str, list[float]] = {}
+    for residual in orientation.residual_table:
+        if (residual.role, residual.unit) == ("check", "mm"):
+            squares.setdefault(residual.photo, []).append(residual.rmse**2)
+    rows = []
+    for camera in orientation.cameras:
+        row = PhotoRow(name=camera.photo, status=camera.status)
+        if camera.status == "ok":
+            of_axes = squares.get(camera.photo)
+            row = replace(
+                row,
+                n_control=_count(orientation.ties, camera.photo, TieRole.CONTROL),
+                n_check=_count(orientation.ties, camera.photo, TieRole.CHECK),
+                check_mm=math.sqrt(sum(of_axes) / len(of_axes)) if of_axes else None,
+                sigma_wall_mm=None if camera.sigma_wall_m is None else 1000 * camera.sigma_wall_m,
+            )
+        rows.append(row)
+    is_told = any((row.n_control, row.check_mm, row.sigma_wall_mm) != (None,) * 3 for row in rows)
+    return tuple(rows) if is_told else ()
+
+
+def _count(ties: Ties | None, photo: str, role: TieRole) -> int | None:
+    if ties is None:
+        return None
+    if photo not in ties.photo_names:
+        return 0
+    mine = ties.photo == ties.photo_names.index(photo)
+    return int(np.count_nonzero(mine & (ties.role == role)))
 
 
 def _up(run: Run) -> NDArray[np.float64]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.orient.residuals import residual_rows
 
 from orthoflow.geometry.cameras import looking_at
-from orthoflow.products import Camera, Cameras
+from orthoflow.products import Camera, Cameras, ResidualRow
 from orthoflow.report import photo_plans as module
-from orthoflow.report.photo_plans import photo_plan
+from orthoflow.report.pages import write_page
+from orthoflow.report.photo_plans import PhotoRow, photo_plan
 from orthoflow.report.pictures import wall_pictures
 from tests import samples
 from tests.report_runs import HeldRun, camera, cell, compared_run, given
@@ -31,6 +34,16 @@ def ours(run: HeldRun) -> Camera:
     return next(
         product.cameras[0] for product in run.products.values() if isinstance(product, Cameras)
     )
+
+
+def with_table(run: HeldRun, table: Sequence[ResidualRow]) -> HeldRun:
+    products = {
+        place: replace(product, residual_table=tuple(table))
+        if isinstance(product, Cameras)
+        else product
+        for place, product in run.products.items()
+    }
+    return replace(run, products=products)
 
 
 def test_a_photo_stands_before_its_wall_and_looks_at_it(tmp_path: Path) -> None:
@@ -249,3 +262,51 @@ def test_maps_are_kept_where_z_is_up_and_walls_lie_across_elsewhere() -> None:
         along = frames[0].u_world if frames else np.array([1.0, 0.0, 0.0])
         if abs(along @ up) < 0.999:
             assert right @ along == pytest.approx(np.sqrt(1.0 - (along @ up) ** 2))
+
+
+def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None:
+    one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.0012)
+    refused = Camera(photo="gone.jpg", status="too few <ties>")
+    run = run_with(tmp_path, one, refused, replace(one, photo="untied.jpg", sigma_wall_m=None))
+    check_px, control_px = np.array([[3.0, -4.0]]), np.array([[50.0, 60.0]])
+    units = {"px": 1.0, "mm": 2.0}
+    check = residual_rows("a.jpg", "check", check_px, units)
+    run = with_table(run, [*check, *residual_rows("a.jpg", "control", control_px, units)])
+    plan = photo_plan(run, list(wall_pictures(run)))
+    assert plan is not None
+    first, missing, untied = plan.rows
+    # Of 30 ties a third each is control, check and rejected.
+    assert (first.name, first.status, first.n_control, first.n_check) == ("a.jpg", "ok", 10, 10)
+    assert first.sigma_wall_mm == pytest.approx(1.2)
+    # The mean of both axes, of check ties alone, in millimetres alone.
+    assert first.check_mm == pytest.approx(2.0 * np.sqrt((3.0**2 + 4.0**2) / 2))
+    assert missing == PhotoRow(name="gone.jpg", status="too few <ties>")
+    assert untied == PhotoRow(name="untied.jpg", status="ok", n_control=0, n_check=0)
+
+
+def test_photos_of_which_only_poses_are_known_have_no_rows(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    run = replace(
+        run,
+        products={
+            place: replace(product, ties=None) if isinstance(product, Cameras) else product
+            for place, product in run.products.items()
+        },
+    )
+    plan = photo_plan(run, list(wall_pictures(run)))
+    assert plan is not None
+    assert plan.rows == ()
+
+
+def test_the_page_has_a_table_of_photos(tmp_path: Path) -> None:
+    one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.001_234)
+    run = run_with(tmp_path, one, Camera(photo="gone.jpg", status="too few <ties>"))
+    write_page(run, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    [table] = re.findall(r'aria-label="photos of orient@plane=fine".*?</table>', page, re.DOTALL)
+    rows = re.findall(r"<tr>(.*?)</tr>", table.partition("<tbody>")[2], re.DOTALL)
+    cells = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL) for row in rows]
+    assert [[re.sub("<wbr>", "", cell) for cell in row] for row in cells] == [
+        ["a.jpg", "1.23", "-", "10", "10", "ok"],
+        ["gone.jpg", "-", "-", "-", "-", "too few &lt;ties&gt;"],
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Final, TypeVar
 
@@ -49,16 +50,29 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
-            least_m = step_m / _STEP_MOST_CELLS
             measured = np.count_nonzero(wall.count) / wall.count.size
+            empty = max(0.0, 1.0 - measured - filled)
             finer = (
                 "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
             )
             ctx.warn(
                 f"{wall.name}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
                 f"{measured:.0%} of the cells have a point, {filled:.0%} are interpolated"
-                + (f" (gsd_m = {least_m:.2g} m or more leaves fewer)" if is_close else "")
+                + (f", {empty:.0%} are empty" if empty >= _SHARE_WORTH_WORDS else "")
+                + (
+                    f" (gsd_m = {_least_gsd_m(step_m):g} m or more leaves fewer)"
+                    if is_close
+                    else ""
+                )
             )
+
+
+def _least_gsd_m(step_m: float) -> float:
+    """Smallest cells, of two digits, that are not too fine for points so far apart."""
+    least_m = step_m / _STEP_MOST_CELLS
+    digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
+    # Rounded up: the nearest number of two digits may be what is too fine.
+    return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:

@@ -130,17 +130,28 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
     assert empty == "empty: no point lies within its buffer"
     assert coarse == (
         "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
-        "apart; 33% of the cells have a point, 0% are interpolated (gsd_m = 0.018 m or "
-        "more leaves fewer)"
+        "apart; 33% of the cells have a point, 0% are interpolated, 67% are empty "
+        "(gsd_m = 0.019 m or more leaves fewer)"
     )
     assert close == (
         "close: cells of gsd_m = 0.005 m lie on points about 0.0034 m apart; "
-        "33% of the cells have a point, 33% are interpolated (gsd_m = 0.0051 m or more leaves "
-        "fewer)"
+        "33% of the cells have a point, 33% are interpolated, 33% are empty "
+        "(gsd_m = 0.0051 m or more leaves fewer)"
     )
     # An uneven scan leaves many cells to be interpolated, however close its points lie elsewhere.
     assert gaps.startswith("gaps: cells of gsd_m = 0.005 m lie on points about 0.003 m")
-    assert gaps.endswith("17% are interpolated")
+    assert gaps.endswith("17% are interpolated, 50% are empty")
+
+
+def test_cells_that_are_advised_are_no_longer_too_fine(listener: Listener) -> None:
+    step_m = 0.003_37  # asks for 0.005055 m, whose nearest number of two digits is what is given
+    reporting.warn(listener.context, [WallRaster(wall=wall([[1]]), scan_step_m=step_m)], "laser")
+    [said] = listener.warnings
+    [advised] = re.findall(r"\(gsd_m = ([0-9.]+) m", said)
+    assert float(advised) == 0.0051
+    assert step_m <= 2 / 3 * float(advised)
+    # Of cells that are not empty nothing is said of empty ones.
+    assert "empty" not in said
 
 
 def emptiness(
