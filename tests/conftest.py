@@ -141,7 +141,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     What takes longest else comes next, so that in the end no process waits for the other.
     """
     first = [
-        # Nearly an hour of faults and kills, all in one process.
+        # More than an hour of faults and kills, all in one process.
         *([("engine", "test_faults.py")] if IS_LONG else []),
         *(("road", "test_direct.py"), ("cli", "test_running.py")),
         *(("engine", "test_surroundings.py"), ("engine", "test_dask.py")),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from typing import Final
 
@@ -105,30 +105,36 @@ def _rows(orientation: Cameras) -> tuple[PhotoRow, ...]:
     for residual in orientation.residual_table:
         if (residual.role, residual.unit) == ("check", "mm"):
             squares.setdefault(residual.photo, []).append(residual.rmse**2)
-    rows = []
-    for camera in orientation.cameras:
-        row = PhotoRow(name=camera.photo, status=camera.status)
-        if camera.status == "ok":
-            of_axes = squares.get(camera.photo)
-            row = replace(
-                row,
-                n_control=_count(orientation.ties, camera.photo, TieRole.CONTROL),
-                n_check=_count(orientation.ties, camera.photo, TieRole.CHECK),
-                check_mm=math.sqrt(sum(of_axes) / len(of_axes)) if of_axes else None,
-                sigma_wall_mm=None if camera.sigma_wall_m is None else 1000 * camera.sigma_wall_m,
-            )
-        rows.append(row)
-    is_told = any((row.n_control, row.check_mm, row.sigma_wall_mm) != (None,) * 3 for row in rows)
-    return tuple(rows) if is_told else ()
+    cameras, ties = orientation.cameras, orientation.ties
+    is_stated = any(camera.sigma_wall_m is not None for camera in cameras)
+    if not (squares or is_stated or ties is not None):
+        return ()
+    control, check = (_counts(ties, role) for role in (TieRole.CONTROL, TieRole.CHECK))
+    return tuple(
+        PhotoRow(
+            name=camera.photo,
+            status=camera.status,
+            n_control=None if ties is None else control.get(camera.photo, 0),
+            n_check=None if ties is None else check.get(camera.photo, 0),
+            check_mm=_mean_root(squares.get(camera.photo, [])),
+            sigma_wall_mm=None if camera.sigma_wall_m is None else 1000 * camera.sigma_wall_m,
+        )
+        if camera.status == "ok"
+        else PhotoRow(name=camera.photo, status=camera.status)
+        for camera in cameras
+    )
 
 
-def _count(ties: Ties | None, photo: str, role: TieRole) -> int | None:
+def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
+    """How many ties of a role each photo has."""
     if ties is None:
-        return None
-    if photo not in ties.photo_names:
-        return 0
-    mine = ties.photo == ties.photo_names.index(photo)
-    return int(np.count_nonzero(mine & (ties.role == role)))
+        return {}
+    counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
+    return dict(zip(ties.photo_names, counts.tolist(), strict=True))
+
+
+def _mean_root(squares: Sequence[float]) -> float | None:
+    return math.sqrt(sum(squares) / len(squares)) if squares else None
 
 
 def _up(run: Run) -> NDArray[np.float64]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from orthoflow_plugins.orient.residuals import residual_rows
 
 from orthoflow.geometry.cameras import looking_at
-from orthoflow.products import Camera, Cameras, ResidualRow
+from orthoflow.products import Camera, Cameras
 from orthoflow.report import photo_plans as module
 from orthoflow.report.pages import write_page
 from orthoflow.report.photo_plans import PhotoRow, photo_plan
@@ -21,29 +21,23 @@ from tests import samples
 from tests.report_runs import HeldRun, camera, cell, compared_run, given
 
 
-def run_with(folder: Path, *cameras: Camera) -> HeldRun:
-    run = compared_run(folder)
+def oriented(run: HeldRun, **changes: Any) -> HeldRun:
+    """The run with other orientations."""
     products = {
-        place: replace(product, cameras=cameras) if isinstance(product, Cameras) else product
+        place: replace(product, **changes) if isinstance(product, Cameras) else product
         for place, product in run.products.items()
     }
     return replace(run, products=products)
+
+
+def run_with(folder: Path, *cameras: Camera) -> HeldRun:
+    return oriented(compared_run(folder), cameras=cameras)
 
 
 def ours(run: HeldRun) -> Camera:
     return next(
         product.cameras[0] for product in run.products.values() if isinstance(product, Cameras)
     )
-
-
-def with_table(run: HeldRun, table: Sequence[ResidualRow]) -> HeldRun:
-    products = {
-        place: replace(product, residual_table=tuple(table))
-        if isinstance(product, Cameras)
-        else product
-        for place, product in run.products.items()
-    }
-    return replace(run, products=products)
 
 
 def test_a_photo_stands_before_its_wall_and_looks_at_it(tmp_path: Path) -> None:
@@ -271,7 +265,8 @@ def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None
     check_px, control_px = np.array([[3.0, -4.0]]), np.array([[50.0, 60.0]])
     units = {"px": 1.0, "mm": 2.0}
     check = residual_rows("a.jpg", "check", check_px, units)
-    run = with_table(run, [*check, *residual_rows("a.jpg", "control", control_px, units)])
+    control = residual_rows("a.jpg", "control", control_px, units)
+    run = oriented(run, residual_table=(*check, *control))
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
     first, missing, untied = plan.rows
@@ -285,14 +280,7 @@ def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None
 
 
 def test_photos_of_which_only_poses_are_known_have_no_rows(tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    run = replace(
-        run,
-        products={
-            place: replace(product, ties=None) if isinstance(product, Cameras) else product
-            for place, product in run.products.items()
-        },
-    )
+    run = oriented(compared_run(tmp_path), ties=None)
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
     assert plan.rows == ()

@@ -51,7 +51,7 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
-            empty = max(0.0, 1.0 - measured - filled)
+            empty = 1.0 - measured - filled
             finer = (
                 "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
             )
