@@ -40,7 +40,7 @@ from pystac.validation import RegisteredValidator
 
 from orthoflow.cli.program import program
 from orthoflow.files.open3d_guard import load_open3d
-from tests.browser import PROGRAM, browser
+from tests.browser import IS_HERE, Page, started
 
 MM: Final = 25.4 / 72.0
 COLOURS: Final = ("photos", "rgb", "intensity", "plane", "deviation")
@@ -305,10 +305,11 @@ def walk_viewers(walk: Walk) -> None:
 
 def photographed(walk: Walk, path: Path, name: str) -> None:
     """A page as Chromium shows it, without complaints and without asking for anything else."""
-    if PROGRAM is None:
+    if not IS_HERE:
         walk.say("chromium", "not installed")
         return
-    with browser(walk.folder / "chromium") as page:
+    with started() as browser:
+        page = Page(browser)
         page.show_as(1200)
         page.open(path.resolve())
         time.sleep(5.0)

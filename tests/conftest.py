@@ -21,10 +21,12 @@ from orthoflow.sdk.context import Drawing
 from tests.kept_memory import KEPT_MEMORY
 from tests.long_loops import IS_LONG
 from tests.memory_folder import has_room, in_memory
+from tests.optional import REASONS, is_allowed, skip
 from tests.shared_bytecode import write_share
 from tests.undrawn_charts import FIGURE, keep_dot
 
 if TYPE_CHECKING:
+    from tests.browser import Page
     from tests.engine_world import World
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -80,6 +82,7 @@ settings.register_profile(
 )
 settings.load_profile("everywhere")
 
+_LACKING = "orthoflow/lacking-programs"
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -134,7 +137,7 @@ class _Examples:
         return collectors
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Start with the longest modules, and with what other processes can do meanwhile.
 
     The others need no kernels: they run while the first process compiles those for tests/road.
@@ -160,6 +163,48 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return len(first) + 1 + (soon.index(module) if module in soon else len(soon))
 
     items.sort(key=turn)
+    if config.getoption("--with-programs") and config.cache is not None:
+        lacking = set(config.cache.get(_LACKING, []))
+        items[:] = [item for item in items if item.nodeid in lacking]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--strict-skips", action="store_true", help="fail where a test skips for an unlisted reason"
+    )
+    parser.addoption(
+        "--with-programs",
+        action="store_true",
+        help="run those tests alone that the last run skipped for a program, and let none skip",
+    )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Keep which tests lacked a program, for `--with-programs`."""
+    config = terminalreporter.config
+    if config.getoption("--with-programs") or config.cache is None:
+        return
+    lacking = [
+        report.nodeid
+        for report in terminalreporter.stats.get("skipped", [])
+        if REASONS["program"] in str(report.longrepr)
+    ]
+    config.cache.set(_LACKING, lacking)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Turn a skip into a failure where its reason is not on the list of `tests.optional`."""
+    report = yield
+    if report.skipped and isinstance(report.longrepr, tuple) and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2].removeprefix("Skipped: ")
+        is_listed = is_allowed(reason) and not item.config.getoption("--with-programs")
+        if item.config.getoption("--strict-skips") and not is_listed:
+            report.outcome = "failed"
+            report.longrepr = f"skipped for a reason that tests/optional.py does not list: {reason}"
+    return report
 
 
 @pytest.hookimpl(wrapper=True)
@@ -181,8 +226,19 @@ def pytest_collection_finish() -> None:
 def shared_data() -> Path:
     """The folder of real scans and photos beside the checkout, which never ships with it."""
     if not _SHARED.is_dir():
-        pytest.skip("the real test data beside the checkout (../shared/data) are not here")
+        skip("data", str(_SHARED.name))
     return _SHARED
+
+
+@pytest.fixture(scope="session")
+def new_page() -> Iterator[Callable[[], Page]]:
+    """What opens a page in a browser; the one way to Chromium, for any test."""
+    from tests.browser import IS_HERE, Page, started
+
+    if not IS_HERE:
+        skip("program", "Chromium, and playwright (the extra `browser`)")
+    with started() as browser:
+        yield lambda: Page(browser)
 
 
 @pytest.fixture
@@ -202,7 +258,7 @@ def _open3d() -> None:
     try:
         load_open3d("this test")
     except PluginError as error:
-        pytest.skip(str(error))
+        skip("program", str(error))
 
 
 @pytest.fixture(scope="session", autouse=True)

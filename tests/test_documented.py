@@ -245,7 +245,6 @@ def _of_pytest(words: list[str]) -> str:
 
 def _of_dask(words: list[str]) -> str:
     """Let dask's own commands read their words."""
-    pytest.importorskip("distributed", reason="the extra `dask` has distributed")
     module = importlib.import_module(f"distributed.cli.dask_{words[0]}")
     try:
         module.main.make_parser(click.Context(module.main)).parse_args(words[1:])

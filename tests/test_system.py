@@ -14,6 +14,7 @@ import pytest
 
 from orthoflow import system
 from orthoflow.system import FileLock, file_lock, flags, read_at, take_room
+from tests.optional import skip
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -100,7 +101,7 @@ def test_many_share_a_lock_and_one_holds_it_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, twin: bool
 ) -> None:
     if not twin and system._fcntl is None:
-        pytest.skip("this system has no such locks")
+        skip("platform", "fcntl")
     path = tmp_path / "store"
     first, second, third = locks(path, 3, monkeypatch, twin=twin)
     assert first.take(is_shared=True, waits=False)

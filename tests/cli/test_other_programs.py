@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from PIL import Image
 
 from orthoflow.cli.program import program
 from tests.drawing_runs import SIZE_M, WALL, box_openings, write_drawing_run
+from tests.optional import need_programs, skip
 
 # QGIS comes with the system's Python, which need not be the one of the tests.
 PYTHONS = ("/usr/bin/python3", "python3")
@@ -76,7 +76,7 @@ def python_with_qgis() -> str:
 def test_qgis_opens_orthoimage_and_vectors_in_the_same_coordinates(exported: Path) -> None:
     python = python_with_qgis()
     if not python:
-        pytest.skip("QGIS is not installed (apt-get install python3-qgis)")
+        skip("program", "QGIS (Debian: python3-qgis)")
     ortho = exported / "run" / "products" / "mosaic" / f"wall_{WALL}_ortho.tif"
     vectors = [exported / "geojson" / name for name in (f"wall_{WALL}.geojson", "room.geojson")]
     done = subprocess.run(
@@ -108,9 +108,7 @@ def test_qgis_opens_orthoimage_and_vectors_in_the_same_coordinates(exported: Pat
 
 
 def test_librecad_draws_the_wall_with_its_picture_and_openings(exported: Path) -> None:
-    librecad, pdftoppm = shutil.which("librecad"), shutil.which("pdftoppm")
-    if librecad is None or pdftoppm is None:
-        pytest.skip("LibreCAD or poppler is not installed (apt-get install librecad poppler-utils)")
+    librecad, pdftoppm = need_programs("librecad", "pdftoppm")
     folder = exported / "dxf"
     name = f"wall_{WALL}"
     for words in (

@@ -28,6 +28,7 @@ from orthoflow.engine.memory import (
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import ArgumentError, StoreError
 from tests.engine_world import World, has_ended, toy_world
+from tests.optional import skip
 
 MIB = 1 << 20
 
@@ -333,7 +334,7 @@ def tiny_world(tmp_path: Path) -> Iterator[World]:
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "none", str(disk)]
     if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("a file system can be mounted by root only")
+        skip("right", "a file system is mounted by root only")
     with toy_world(tmp_path) as opened:
         yield opened
     subprocess.run(["umount", str(disk)], check=True)

@@ -23,6 +23,7 @@ from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.errors import OrthoflowError
 from tests.engine_world import World, digests
 from tests.long_loops import IS_LONG
+from tests.optional import skip
 
 pytestmark = [
     pytest.mark.long,
@@ -123,7 +124,7 @@ def cable() -> Iterator[Callable[[str], None]]:
             stack.callback(tell, "netns", "delete", name)
             tell("link", "add", link, "type", "veth", "peer", "name", far_link, "netns", name)
         except (FileNotFoundError, subprocess.CalledProcessError):
-            pytest.skip("this user may make no network of its own")
+            skip("right", "a network namespace")
         tell("addr", "add", f"{HERE}/30", "dev", link)
         tell("link", "set", link, "up")
         inside = ("netns", "exec", name, "ip")
@@ -188,7 +189,7 @@ def test_a_shared_folder_that_goes_away_for_a_while_loses_nothing(
     disk.mkdir()
     mount = ["mount", "--bind", str(disk), str(shared)]
     if subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("this user may mount nothing")
+        skip("right", "a bind mount")
 
     def unmount() -> None:
         time.sleep(1.0)

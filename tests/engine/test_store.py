@@ -36,6 +36,7 @@ from orthoflow.engine.store import Publisher, Store, digest_of
 from orthoflow.engine.stored_results import list_results
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
+from tests.optional import skip
 from tests.report_runs import environment
 
 PREIMAGE = '{"v":1}'
@@ -338,7 +339,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
     if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("a file system can be mounted by root only")
+        skip("right", "a file system is mounted by root only")
     yield folder
     subprocess.run(["umount", str(folder)], check=True)
 

@@ -24,6 +24,7 @@ from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command
 from tests.killed_runs import ROOT, run_here
+from tests.optional import skip_unless
 from tests.stored_runs import WORKFLOW
 
 IN_THIS_PROCESS = ("--executor", "inline")
@@ -228,7 +229,7 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
     check_finished(desk)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+@skip_unless(os.geteuid() == 0, "right", "only root can give files away")
 @pytest.mark.parametrize("is_open", [False, True], ids=["theirs", "shared"])
 def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     used_desk: Desk, *, is_open: bool

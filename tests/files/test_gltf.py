@@ -4,6 +4,7 @@ import json
 import re
 import struct
 from base64 import b64decode
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from PIL import Image
 from orthoflow.files import gltf
 from orthoflow.files.geotiff import write_raster
 from orthoflow.files.gltf import write_page, write_room
-from tests.browser import browser
+from tests.browser import Page
 from tests.ortho_file_scenes import CORNER, FLOOR_SHAPE, GSD_M, UP, WALL_SHAPE, colours, room
 
 
@@ -199,47 +200,41 @@ def test_accessors_stay_inside_their_views(request: pytest.FixtureRequest, model
 
 
 def test_a_page_shows_the_model_without_a_server(
-    written: Path, carved: Path, tmp_path: Path
+    new_page: Callable[[], Page], written: Path, carved: Path, tmp_path: Path
 ) -> None:
     page_file = tmp_path / "room.html"
     write_page(page_file, written)
     text = page_file.read_text()
     (inside,) = re.findall(r'const model = "([A-Za-z0-9+/=]*)"', text)
     assert b64decode(inside) == written.read_bytes()
-    with browser(tmp_path / "profile") as page:
-        page.show_as(320, 240)
-        page.open(page_file)
-        page.evaluate("new Promise(done => setTimeout(done, 1500))")
-        if not page.evaluate("gl !== null"):
-            assert "no WebGL" in page.evaluate("document.getElementById('said').textContent")
-            return
-        names = "[...document.querySelectorAll('option')].map(o => o.textContent)"
-        assert page.evaluate(names) == ["whole room", "wall </script> 0", "floor 1"]
-        # Looked at from its front, the middle of the wall is painted as the orthoimage has it.
-        page.evaluate("show(0)")
-        (tmp_path / "page.png").write_bytes(page.screenshot())
-        picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
-        box = page.evaluate(
-            "(b => [b.left, b.top, b.width, b.height])(canvas.getBoundingClientRect())"
-        )
-        pixel = picture[round(box[1] + box[3] / 2), round(box[0] + box[2] / 2)]
-        rows, columns = WALL_SHAPE
-        middle = colours(WALL_SHAPE)[
-            rows // 2 - 4 : rows // 2 + 4, columns // 2 - 4 : columns // 2 + 4
-        ]
-        assert np.abs(pixel - middle.mean(axis=(0, 1))).max() <= 12
-        write_page(tmp_path / "carved.html", carved)
-        page.open(tmp_path / "carved.html")
-        page.evaluate("new Promise(done => setTimeout(done, 1000))")
-        page.evaluate("show(0)")
-        drawn = "walls.map(w => [w.kind === gl.UNSIGNED_INT, w.count > 6, gl.getError()])"
-        assert page.evaluate(drawn) == [[True, True, 0]] * 2
-        # What the browser says of a machine without a graphics card.
-        of_machine = ("software WebGL", "ReadPixels")
-        assert not [
-            text for text in page.complaints if not any(part in text for part in of_machine)
-        ]
-        assert all(address.startswith(("file:", "data:", "blob:")) for address in page.requests)
+    page = new_page()
+    page.show_as(320, 240)
+    page.open(page_file)
+    page.evaluate("new Promise(done => setTimeout(done, 1500))")
+    if not page.evaluate("gl !== null"):
+        assert "no WebGL" in page.evaluate("document.getElementById('said').textContent")
+        return
+    names = "[...document.querySelectorAll('option')].map(o => o.textContent)"
+    assert page.evaluate(names) == ["whole room", "wall </script> 0", "floor 1"]
+    # Looked at from its front, the middle of the wall is painted as the orthoimage has it.
+    page.evaluate("show(0)")
+    (tmp_path / "page.png").write_bytes(page.screenshot())
+    picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+    box = page.evaluate("(b => [b.left, b.top, b.width, b.height])(canvas.getBoundingClientRect())")
+    pixel = picture[round(box[1] + box[3] / 2), round(box[0] + box[2] / 2)]
+    rows, columns = WALL_SHAPE
+    middle = colours(WALL_SHAPE)[rows // 2 - 4 : rows // 2 + 4, columns // 2 - 4 : columns // 2 + 4]
+    assert np.abs(pixel - middle.mean(axis=(0, 1))).max() <= 12
+    write_page(tmp_path / "carved.html", carved)
+    page.open(tmp_path / "carved.html")
+    page.evaluate("new Promise(done => setTimeout(done, 1000))")
+    page.evaluate("show(0)")
+    drawn = "walls.map(w => [w.kind === gl.UNSIGNED_INT, w.count > 6, gl.getError()])"
+    assert page.evaluate(drawn) == [[True, True, 0]] * 2
+    # What the browser says of a machine without a graphics card.
+    of_machine = ("software WebGL", "ReadPixels")
+    assert not [text for text in page.complaints if not any(part in text for part in of_machine)]
+    assert all(address.startswith(("file:", "data:", "blob:")) for address in page.requests)
 
 
 def test_of_a_large_model_the_page_asks_for_the_file(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import axe_core_python
 import pytest
@@ -15,10 +14,9 @@ from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.report import write_report
-from tests.browser import PROGRAM, BrowserError, Page, browser
+from tests.browser import Page
 from tests.report_runs import HeldRun, cell, compared_run, metrics, record
 
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
 # Few combinations stand beside each other where their row would be cut.
 AS_ROWS = (
     "if (document.querySelector('[data-chooser] .turned'))"
@@ -29,22 +27,15 @@ ROWS = "[...document.querySelectorAll('[data-chooser] tbody tr')]"
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def page(new_page: Callable[[], Page], tmp_path_factory: pytest.TempPathFactory) -> Page:
     """The page of a comparison, open in a browser."""
     folder = tmp_path_factory.mktemp("page")
     path = folder / "report.html"
     write_report([compared_run(folder)], path)
-    started = browser(folder / "profile")
-    try:
-        opened = started.__enter__()
-    except BrowserError as error:
-        pytest.skip(f"chromium does not start here: {error}")
-    try:
-        opened.show_as(1440)
-        opened.open(path)
-        yield opened
-    finally:
-        started.__exit__(None, None, None)
+    opened = new_page()
+    opened.show_as(1440)
+    opened.open(path)
+    return opened
 
 
 def test_the_console_stays_silent_and_nothing_is_fetched(page: Page) -> None:
@@ -388,24 +379,23 @@ def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
     )
     # The middle of cell (57, 43) of 120 x 80.
     at = {"x": left + width * 57.5 / 120, "y": top + height * 43.5 / 80}
-    hand: dict[str, Any] = {"button": "left", "clickCount": 1}
-    page.ask("Input.dispatchMouseEvent", type="mouseMoved", **at)
+    page.tab.mouse.move(**at)
     readout = page.evaluate(f"{VIEWER}.querySelector('[data-part=readout]').innerText")
     assert readout.startswith("u 57.5 px, v 43.5 px")
     assert page.evaluate(f"{rows}.length") == before
-    page.ask("Input.dispatchMouseEvent", type="mousePressed", **at, **hand)
-    page.ask("Input.dispatchMouseEvent", type="mouseReleased", **at, **hand)
+    page.tab.mouse.down()
+    page.tab.mouse.up()
     assert page.evaluate(f"{rows}.length") == before + 1
     assert f"wall 0, {readout}" in page.evaluate(f"[...{rows}].pop().innerText")
     marked = f"[...{VIEWER}.querySelectorAll('.marks > span')].pop().getBoundingClientRect()"
     assert page.evaluate(f"{marked}.left") == pytest.approx(at["x"], abs=1.5)
     assert page.evaluate(f"{marked}.top") == pytest.approx(at["y"], abs=1.5)
     # A drag moves the picture and collects nothing.
-    page.ask("Input.dispatchMouseEvent", type="mousePressed", **at, **hand)
+    page.tab.mouse.down()
     for _ in range(2):
         at["x"] += 20.0
-        page.ask("Input.dispatchMouseEvent", type="mouseMoved", **at, button="left", buttons=1)
-    page.ask("Input.dispatchMouseEvent", type="mouseReleased", **at, **hand)
+        page.tab.mouse.move(**at)
+    page.tab.mouse.up()
     assert page.evaluate(f"{image}.left") > left + 10.0
     assert page.evaluate(f"{rows}.length") == before + 1
     caption = page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText")
@@ -556,11 +546,11 @@ def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
 
 def test_no_method_is_printed_letter_below_letter(page: Page) -> None:
     page.show_as(700)
-    page.ask("Emulation.setEmulatedMedia", media="print")
+    page.tab.emulate_media(media="print")
     widths = page.evaluate(
         "[...document.querySelectorAll('.steps tbody td:nth-child(2)')].map(e => e.clientWidth)"
     )
-    page.ask("Emulation.setEmulatedMedia", media="")
+    page.tab.emulate_media(media="screen")
     page.show_as(1440)
     assert len(widths) > 2
     # Ten letters of 7.5 points.

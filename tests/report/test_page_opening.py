@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from pathlib import Path
 
 import pytest
 
 from orthoflow.report import write_report
-from tests.browser import PROGRAM, browser
+from tests.browser import Page
 from tests.report_runs import compared_run
 
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
 # Beyond it web.dev/articles/cls calls a page poor, up to 0.1 good. Pictures as small as those of
 # this run grow when the script has seen their size (0.13); pages of rooms shift by 0.01.
 POOR_SHIFT = 0.25
@@ -54,10 +52,10 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.mark.parametrize(("width", "height"), [(1350, 940), (412, 823)])
 def test_what_is_read_stays_where_it_is_when_the_script_comes(
-    address: str, tmp_path: Path, width: int, height: int
+    new_page: Callable[[], Page], address: str, width: int, height: int
 ) -> None:
-    with browser(tmp_path / "profile") as page:
-        page.show_as(width, height)
-        page.visit(address)
-        assert page.evaluate("document.documentElement.classList.contains('scripted')")
-        assert sum(page.evaluate(SHIFTS)) < POOR_SHIFT
+    page = new_page()
+    page.show_as(width, height)
+    page.visit(address)
+    assert page.evaluate("document.documentElement.classList.contains('scripted')")
+    assert sum(page.evaluate(SHIFTS)) < POOR_SHIFT

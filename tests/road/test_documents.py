@@ -24,6 +24,7 @@ from orthoflow.products import PointCloud
 from orthoflow.testing import example_room
 from tests.documented import ROOT, blocks, commands_of, documented_commands, written_files
 from tests.long_loops import IS_LONG
+from tests.optional import need_programs
 from tests.road.conftest import COARSE, Ended, Shell
 from tests.scan_files import write_las
 
@@ -124,9 +125,7 @@ def test_the_archive(finished: Path, shell: Shell) -> None:
 
 
 def test_the_signature(finished: Path, shell: Shell) -> None:
-    pytest.importorskip("cryptography", reason="the extra `sign` has cryptography")
-    if shutil.which("ssh-keygen") is None:
-        pytest.skip("OpenSSH is not installed")
+    need_programs("ssh-keygen")
     shutil.copytree(finished, shell.folder / "runs" / "palace")
     keygen = ["ssh-keygen", "-q", "-t", "ed25519", "-f", "jane", "-N", ""]
     subprocess.run(keygen, cwd=shell.folder, check=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import verify_run
-from tests.browser import PROGRAM, Page, browser
+from tests.browser import Page
 from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Shell
 
@@ -67,14 +67,12 @@ def test_every_combination_has_its_accuracy(run: Run, plane: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def page(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def page(new_page: Callable[[], Page], run: Run) -> Page:
     """The report of the run in a browser."""
-    if PROGRAM is None:
-        pytest.skip("no chromium is installed")
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
-        opened.show_as(1440)
-        opened.open(run.folder / "report.html")
-        yield opened
+    opened = new_page()
+    opened.show_as(1440)
+    opened.open(run.folder / "report.html")
+    return opened
 
 
 def test_the_whole_page_can_be_sent_by_mail(run: Run) -> None:

@@ -17,8 +17,7 @@ NOTEBOOK = ROOT / "examples" / "runs.ipynb"
 def test_the_notebook_runs_and_shows_what_it_promises(
     tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nbclient = pytest.importorskip("nbclient", reason="the extra `test` has nbclient")
-    pytest.importorskip("ipykernel", reason="the extra `test` has ipykernel")
+    import nbclient
     import nbformat
 
     monkeypatch.setenv("PYTHONPATH", ":".join(CHECKOUT))

@@ -81,7 +81,7 @@ def test_a_second_run_comes_from_the_cache(quick: Shell, again: Ended) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="the conformance suite does so on smaller pictures")
+@pytest.mark.skipif(not IS_LONG, reason="larger pictures: .ci/run --long")
 @pytest.mark.parametrize("how", [{"jobs": 2, "parts": 3}, {"executor": "dask", "jobs": 4}])
 def test_steps_in_parts_give_the_same_digests(quick: Shell, how: dict[str, Any]) -> None:
     whole = orthoflow.open_run(quick.folder / "run").cells

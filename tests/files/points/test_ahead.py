@@ -16,8 +16,9 @@ from orthoflow.files.points.ahead import read_ahead
 from orthoflow.files.points.columns import columns_of_text
 from orthoflow.files.points.decoders import can_share_memory
 from tests import scan_files
+from tests.optional import skip_unless
 
-READS_AHEAD = pytest.mark.skipif(not can_share_memory(), reason="reads in one process here")
+READS_AHEAD = skip_unless(can_share_memory(), "right", "shared memory")
 
 
 @pytest.fixture(autouse=True)

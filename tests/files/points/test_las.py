@@ -13,6 +13,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.points import las, open_scan
 from orthoflow.files.points.decoders import can_share_memory
 from tests import scan_files
+from tests.optional import skip_unless
 from tests.scan_files import read_all
 
 
@@ -83,7 +84,7 @@ def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
         np.testing.assert_array_equal(block.bounds[1], block.points.max(axis=0))
 
 
-@pytest.mark.skipif(not can_share_memory(), reason="decodes in one process here")
+@skip_unless(can_share_memory(), "right", "shared memory")
 @pytest.mark.parametrize(
     ("worker", "reason"),
     [

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image
 from orthoflow.files.ortho_files import OrthoFile
 from orthoflow.files.tiles import pyramid
 from orthoflow.files.tiles.pyramid import halved, write_tiles, write_viewer
-from tests.browser import PROGRAM, browser
+from tests.browser import Page
 from tests.ortho_file_scenes import CORNER, GSD_M, UP, WALL_SHAPE, colours, room
 
 
@@ -95,49 +96,48 @@ def test_halving_is_a_loop_over_squares(shape: tuple[int, int]) -> None:
             assert np.abs(half[row, column, :3] - mean).max() <= (len(shown) == 3)
 
 
-@pytest.mark.skipif(PROGRAM is None, reason="no chromium")
-def test_the_page_shows_and_measures_without_a_server(tiled: Path, tmp_path: Path) -> None:
-    with browser(tmp_path / "profile") as page:
-        page.show_as(1000, 700)
-        page.open(tiled / "index.html")
-        page.evaluate("new Promise(done => setTimeout(done, 1500))")
-        assert page.evaluate(
-            "[...document.querySelectorAll('option')].map(o => o.textContent)"
-        ) == [
-            "wall </script> 0",
-            "floor 1",
-        ]
-        page.evaluate("use('distance'); points = [[0, 100], [200, 100]]; finished = true; tell()")
-        assert page.evaluate("document.getElementById('result').textContent") == "1.0000 m"
-        page.evaluate(
-            "use('area'); points = [[0, 0], [200, 0], [200, 400], [0, 400]]; finished = true;tell()"
+def test_the_page_shows_and_measures_without_a_server(
+    new_page: Callable[[], Page], tiled: Path, tmp_path: Path
+) -> None:
+    page = new_page()
+    page.show_as(1000, 700)
+    page.open(tiled / "index.html")
+    page.evaluate("new Promise(done => setTimeout(done, 1500))")
+    assert page.evaluate("[...document.querySelectorAll('option')].map(o => o.textContent)") == [
+        "wall </script> 0",
+        "floor 1",
+    ]
+    page.evaluate("use('distance'); points = [[0, 100], [200, 100]]; finished = true; tell()")
+    assert page.evaluate("document.getElementById('result').textContent") == "1.0000 m"
+    page.evaluate(
+        "use('area'); points = [[0, 0], [200, 0], [200, 400], [0, 400]]; finished = true;tell()"
+    )
+    said = page.evaluate("document.getElementById('result').textContent")
+    assert said == "2.0000 m², around 6.0000 m"
+    page.evaluate("clear(); cursor = [400, 200]; tellCursor()")
+    x, y, z = CORNER + GSD_M * (400 * np.array([1.0, 0.0, 0.0]) - 200 * UP)
+    world = page.evaluate("document.getElementById('world').textContent")
+    assert f"{x:.3f}, {y:.3f}, {z:.3f} m" in world
+    wall = page.evaluate("document.getElementById('wall').textContent")
+    assert wall == "wall X, Y: 2.000, -1.000 m"
+    # What is painted in the middle is what the orthoimage has there.
+    page.evaluate("cursor = null; whole()")
+    page.evaluate("new Promise(done => setTimeout(done, 500))")
+    (tmp_path / "page.png").write_bytes(page.screenshot())
+    picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+
+    def shown(column: int, row: int) -> np.ndarray:
+        x, y = page.evaluate(
+            f"(() => {{ const [x, y] = onScreen([{column}, {row}]), box = "
+            "canvas.getBoundingClientRect(); return [x + box.left, y + box.top]; })()"
         )
-        said = page.evaluate("document.getElementById('result').textContent")
-        assert said == "2.0000 m², around 6.0000 m"
-        page.evaluate("clear(); cursor = [400, 200]; tellCursor()")
-        x, y, z = CORNER + GSD_M * (400 * np.array([1.0, 0.0, 0.0]) - 200 * UP)
-        world = page.evaluate("document.getElementById('world').textContent")
-        assert f"{x:.3f}, {y:.3f}, {z:.3f} m" in world
-        wall = page.evaluate("document.getElementById('wall').textContent")
-        assert wall == "wall X, Y: 2.000, -1.000 m"
-        # What is painted in the middle is what the orthoimage has there.
-        page.evaluate("cursor = null; whole()")
-        page.evaluate("new Promise(done => setTimeout(done, 500))")
-        (tmp_path / "page.png").write_bytes(page.screenshot())
-        picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+        return picture[round(y), round(x)]
 
-        def shown(column: int, row: int) -> np.ndarray:
-            x, y = page.evaluate(
-                f"(() => {{ const [x, y] = onScreen([{column}, {row}]), box = "
-                "canvas.getBoundingClientRect(); return [x + box.left, y + box.top]; })()"
-            )
-            return picture[round(y), round(x)]
-
-        assert np.abs(shown(800, 500) - colours(WALL_SHAPE)[500, 800].astype(int)).max() <= 12
-        # Three cells inside the hole nothing shows, least of all a coarser level.
-        assert np.ptp(shown(350, 103)) == np.ptp(shown(350, 200)) == 0
-        assert page.complaints == []
-        assert all(address.startswith(("file:", "data:")) for address in page.requests)
+    assert np.abs(shown(800, 500) - colours(WALL_SHAPE)[500, 800].astype(int)).max() <= 12
+    # Three cells inside the hole nothing shows, least of all a coarser level.
+    assert np.ptp(shown(350, 103)) == np.ptp(shown(350, 200)) == 0
+    assert page.complaints == []
+    assert all(address.startswith(("file:", "data:")) for address in page.requests)
 
 
 def test_names_do_not_end_the_script(tiled: Path) -> None:

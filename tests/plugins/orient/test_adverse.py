@@ -39,7 +39,7 @@ def test_a_photo_in_trouble_is_right_or_refused(tmp_path: Path, kind: str) -> No
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="200 photos")
+@pytest.mark.skipif(not IS_LONG, reason="200 photos: .ci/run --long")
 def test_of_two_hundred_photos_in_trouble_the_solvable_ones_are_ok(tmp_path: Path) -> None:
     n_solvable = n_ok = 0
     for case in every_case(10):

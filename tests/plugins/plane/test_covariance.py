@@ -162,7 +162,7 @@ def test_stated_sigmas_of_scanned_rooms_are_their_errors(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="fifty rooms; set ORTHOFLOW_LONG_TESTS=1")
+@pytest.mark.skipif(not IS_LONG, reason="fifty rooms: .ci/run --long")
 @pytest.mark.parametrize("step_deg", [0.5, 1.0])
 def test_stated_sigmas_of_fifty_rooms_are_their_errors(step_deg: float, tmp_path: Path) -> None:
     found = [item for seed in range(50) for item in room_ratios(seed, tmp_path, step_deg=step_deg)]

@@ -183,7 +183,7 @@ def test_a_turned_room_gives_the_turned_planes(
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="eighty detections; set ORTHOFLOW_LONG_TESTS=1")
+@pytest.mark.skipif(not IS_LONG, reason="eighty detections: .ci/run --long")
 @every_detector
 def test_ten_other_turns_give_the_turned_planes(
     detector: str, rooms: dict[str, Any], tmp_path: Path
