@@ -23,10 +23,11 @@ _POINTS_LEAST: Final = 2
 # this hides it only where a station is known to look past.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.0
-# Rays from the wall to the stations: side of a voxel, how many are filled, how far both ends are
-# left out, and how many tiles are asked.
+# Rays from the wall to the stations: side of a voxel, how many there are and along one axis, how
+# far both ends are left out, and how many tiles are asked.
 _VOXEL_M: Final = 0.1
 _VOXELS_MOST: Final = 1 << 24
+_VOXELS_MOST_ALONG: Final = 1 << 11
 _ENDS_M: Final = 0.35
 _RAYS_MOST: Final = 4000
 
@@ -166,14 +167,21 @@ def _blocked(
     room = sight.room
     is_blocked = np.ones(len(asked), dtype=np.bool_)
     for station in np.unique(stations, axis=0):
-        ways = station - sight.points.origin - starts
-        lengths_m = np.linalg.norm(ways, axis=1)
-        faces = ways @ frame.normal_world > 0.0
-        ways /= np.maximum(lengths_m, 1e-9)[:, None]
-        is_met = ~faces
-        for along_m in np.arange(_ENDS_M, float(lengths_m.max()) - _ENDS_M, 0.5 * room.side_m):
-            going = ~is_met & (along_m < lengths_m - _ENDS_M)
-            is_met[going] = room.holds(starts[going] + along_m * ways[going])
+        rays = station - sight.points.origin - starts
+        lengths_m = np.linalg.norm(rays, axis=1)
+        is_met = rays @ frame.normal_world <= 0.0
+        rays /= np.maximum(lengths_m, 1e-9)[:, None]
+        # A station may stand far from all points, or be a point at the origin of a survey grid:
+        # nothing hides a wall beyond the voxels.
+        enter_m, leave_m = room.crossed_m(starts, rays)
+        enter_m = np.maximum(enter_m, _ENDS_M)
+        leave_m = np.minimum(leave_m, lengths_m - _ENDS_M)
+        step_m = 0.5 * room.side_m
+        n_steps = np.ceil(np.maximum(leave_m - enter_m, 0.0) / step_m)
+        for step in range(int(n_steps.max(initial=0.0))):
+            going = np.flatnonzero(~is_met & (step < n_steps))
+            along_m = enter_m[going] + step * step_m
+            is_met[going] = room.holds(starts[going] + along_m[:, None] * rays[going])
         is_blocked &= is_met
     return np.repeat(is_blocked, every)[: len(tiles)]
 
@@ -192,7 +200,11 @@ class _Room:
         # Single points far out must not make voxels coarse.
         low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
         low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
-        side_m = max(_VOXEL_M, float(np.cbrt((high - low).prod() / _VOXELS_MOST)))
+        side_m = max(
+            _VOXEL_M,
+            float(np.cbrt((high - low).prod() / _VOXELS_MOST)),
+            float((high - low).max()) / _VOXELS_MOST_ALONG,
+        )
         shape = np.ceil((high - low) / side_m).astype(np.int64) + 1
         places = np.column_stack(
             [(axis - start) / side_m for axis, start in zip(axes, low, strict=True)]
@@ -202,6 +214,21 @@ class _Room:
         # One stray point hides nothing.
         counts = np.bincount(voxels, minlength=int(shape.prod())).reshape(tuple(shape))
         return cls(low_m=low, side_m=side_m, occupied=counts >= _POINTS_LEAST)
+
+    def crossed_m(
+        self, starts: NDArray[np.float64], ways: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where rays (n, 3) from places (n, 3), unit vectors, enter and leave the voxels, metres.
+
+        A ray that misses them leaves before it enters.
+        """
+        high_m = self.low_m + self.side_m * np.array(self.occupied.shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first_m, second_m = (self.low_m - starts) / ways, (high_m - starts) / ways
+        # A ray along a face of the voxels (0 / 0) is bounded by the other axes.
+        enter_m = np.nanmax(np.fmin(first_m, second_m), axis=1)
+        leave_m = np.nanmin(np.fmax(first_m, second_m), axis=1)
+        return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points lie in the voxels of places (n, 3)."""

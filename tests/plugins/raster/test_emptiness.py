@@ -224,3 +224,27 @@ def test_a_screen_hides_what_lies_between_it_and_the_station_but_for_their_ends(
     assert found.get(cause, 0.0) > 0.8
     # Nobody looks from behind the wall.
     assert told(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
+
+
+def screened(station: tuple[float, float, float], *stray: tuple[float, float, float]) -> float:
+    """Share of the void that a screen 2 m before it hides from a station."""
+    off = 0.05 * np.arange(-40, 41) + 0.3
+    right, down = (axis.ravel() for axis in np.meshgrid(off, off))
+    screen = np.repeat(np.column_stack([right, down, np.full(right.size, 2.0)]), 2, axis=0)
+    points = np.vstack([screen, np.array(stray).reshape(-1, 3)])
+    return told(points, station=station).get("hidden", 0.0)
+
+
+@pytest.mark.parametrize("far_m", [5.0, 5e3, 5e6, 5e12])
+def test_a_station_may_stand_anywhere(far_m: float) -> None:
+    # Two points at the origin of a survey grid may be taken for one.
+    assert screened((0.3, 0.3, far_m)) == pytest.approx(1.0)
+    # From the side its rays pass beside the screen.
+    assert screened((4.0 * far_m, 0.3, far_m)) == 0.0
+
+
+@pytest.mark.parametrize("far_m", [1e3, 1e6])
+def test_stray_points_far_away_cost_no_voxels(far_m: float) -> None:
+    assert screened((0.3, 0.3, 5.0), (far_m, far_m, far_m)) == pytest.approx(1.0)
+    # Half of the points: voxels are coarse then, and there are no more of them.
+    assert 0.0 <= screened((0.3, 0.3, 5.0), *[(far_m, 0.0, 0.0)] * 4000) <= 1.0
