@@ -34,5 +34,4 @@ def test_files_that_are_named_are_there(name: str) -> None:
 def test_the_changelog_is_of_this_version_and_read_in_two_minutes() -> None:
     newest = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1]
     assert newest.startswith(orthoflow.__version__)
-    (brief,) = re.findall(r"### In two minutes\n(.*?)\n### ", newest, re.DOTALL)
-    assert 150 < len(brief.split()) < 480  # four words a second
+    assert len(newest.split()) < 700  # one page
