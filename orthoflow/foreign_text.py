@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from types import SimpleNamespace
 from typing import Final, TypeAlias
 
 Value: TypeAlias = str | int | float | None
@@ -20,6 +18,13 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE
 _WIDE: Final = ("\uff1d", "\uff0b", "\uff0d", "\uff20")
 # What spreadsheets take for the beginning of a formula, and the mark that is put before one.
 _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", *_WIDE, "'")
+# Before what another reader takes for the beginning of a formula: a separator or line end, and
+# what it may strip. Numbers up to the next separator are none.
+_INNER_CELL: Final = re.compile(
+    rf"""[,;|\t\r\n] [\s"']*
+    (?=[=@{"".join(_WIDE)}] | [+-] (?!(\d+\.?\d*|\.\d+)(e[+-]?\d+)?[\s"']*([,;|\t\r\n]|$)))""",
+    re.VERBOSE | re.IGNORECASE,
+)
 
 
 def shown(text: str, *, keep: str = "") -> str:
@@ -55,20 +60,19 @@ def shown_json(text: str) -> str:
 
 
 def csv_text(rows: Iterable[Sequence[Value]]) -> str:
-    r"""Write rows as CSV that no spreadsheet takes for formulas.
+    r"""Write rows as CSV in which no reader finds a formula, whatever it separates by.
 
-    A text that begins with one of `= + - @`, a tab, a line end or an apostrophe, and is no number,
-    gets an apostrophe before it; who reads the table takes the first apostrophe of a cell away.
-    Numbers stay numbers, with every digit that they have.
+    Spreadsheets separate by `,`, `;` or tab, as the country or the user has it, and each sees other
+    cells. Text is therefore quoted, and what could begin a cell and is one of `= + - @`, a tab, a
+    line end or an apostrophe gets an apostrophe before it, unless the cell is a number: at the
+    beginning of a text, and in it behind a separator or a line end, with quotes or spaces between.
+    Who reads the table takes the first apostrophe of a cell away. Numbers stay numbers, with every
+    digit that they have.
 
-    >>> csv_text([("name", "value"), ("=1+1", -2.5), ("-3.5e-2", None)])
-    "name,value\n'=1+1,-2.5\n-3.5e-2,\n"
+    >>> csv_text([("name", "value"), ("=1+1", -2.5), ("a;=1+1", None)])
+    '"name","value"\n"\'=1+1",-2.5\n"a;\'=1+1",\n'
     """
-    # With this end of lines, cells that hold either of its letters are quoted.
-    lines: list[str] = []
-    writer = csv.writer(SimpleNamespace(write=lines.append), lineterminator="\r\n")
-    writer.writerows([_cell(value) for value in row] for row in rows)
-    return "".join(f"{line[:-2]}\n" for line in lines)
+    return "".join(f"{','.join(map(_cell, row))}\n" for row in rows)
 
 
 def _is_unseen(letter: str) -> bool:
@@ -84,7 +88,12 @@ def _escaped_in_json(letter: str) -> str:
     return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
 
 
-def _cell(value: Value) -> Value:
-    if isinstance(value, str) and value.startswith(_FORMULA) and not _NUMBER.fullmatch(value):
-        return f"'{value}"
-    return value
+def _cell(value: Value) -> str:
+    if isinstance(value, float):
+        return repr(float(value))
+    if not isinstance(value, str):
+        return "" if value is None else str(value)
+    if value.startswith(_FORMULA) and not _NUMBER.fullmatch(value):
+        value = f"'{value}"
+    value = _INNER_CELL.sub(lambda found: f"{found[0]}'", value)
+    return '"{}"'.format(value.replace('"', '""'))
