@@ -391,6 +391,6 @@ def _camera_json(camera: Camera) -> JsonValue:
     return entry
 
 
-def _cell(value: float) -> str:
-    """Shortest text that gives the number back; empty for NaN."""
-    return repr(float(value)) if np.isfinite(value) else ""
+def _cell(value: float) -> float | None:
+    """Return the number; None, an empty cell, for NaN and infinity."""
+    return float(value) if np.isfinite(value) else None

@@ -329,12 +329,12 @@ def test_cameras_and_ties_are_told_completely(tmp_path: Path) -> None:
         "product_digest": DIGEST,
     }
     assert (tmp_path / "ties.csv").read_text() == (
-        "photo,wall,u_px,v_px,x,y,z,role,residual_u_px,residual_v_px,sigma_px,"
-        "opencv_pixel_convention\n"
-        '"a, b.jpg",0,0.0,0.0,634512.347,1.0,2.0,control,0.25,-0.125,0.5,'
-        "first pixel centre at 0 0\n"
-        "b.jpg,2,99.75,6.625,0.1,0.2,0.3,rejected,,,1.0,first pixel centre at 0 0\n"
-        "b.jpg,1,0.5,1.5,7.0,8.0,9.0,check,,1.0,,first pixel centre at 0 0\n"
+        '"photo","wall","u_px","v_px","x","y","z","role","residual_u_px","residual_v_px",'
+        '"sigma_px","opencv_pixel_convention"\n'
+        '"a, b.jpg",0,0.0,0.0,634512.347,1.0,2.0,"control",0.25,-0.125,0.5,'
+        '"first pixel centre at 0 0"\n'
+        '"b.jpg",2,99.75,6.625,0.1,0.2,0.3,"rejected",,,1.0,"first pixel centre at 0 0"\n'
+        '"b.jpg",1,0.5,1.5,7.0,8.0,9.0,"check",,1.0,,"first pixel centre at 0 0"\n'
     )
 
 

@@ -309,8 +309,8 @@ def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path
     run = hostile.changed(finished.folder / "first", folder / "run", write)
     assert finished("export", run, "--to", "csv", "-o", "csv").exit_code == 0
     text = Path("csv/metrics.csv").read_text()
-    assert "paint,paint,paint.plain,'=HYPERLINK(1),-1.5,'@unit\n" in text
-    assert "paint,paint,paint.plain,plain,2.0,1\n" in text
+    assert '"paint","paint","paint.plain","\'=HYPERLINK(1)",-1.5,"\'@unit"\n' in text
+    assert '"paint","paint","paint.plain","plain",2.0,"1"\n' in text
 
 
 def test_halves_of_letters_are_written_as_json_has_them(finished: Studio, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 from pathlib import Path
@@ -24,65 +25,80 @@ def run(tmp_path: Path) -> Run:
     return Run(path=tmp_path / "run.h5", record=sample_record(CLOUD, WALLS))
 
 
+def rows(*texts: str) -> list[list[str]]:
+    return list(csv.reader("\n".join(texts).splitlines()))
+
+
 def test_tables_hold_a_line_per_fact(run: Run) -> None:
     written = write_csv_tables(run, run.folder)
     assert [path.name for path in written] == [
         *("metrics.csv", "cells.csv", "parameters.csv", "inputs.csv", "products.csv"),
         "environments.csv",
     ]
-    texts = {path.name: path.read_text() for path in written}
+    texts = {path.name: rows(path.read_text()) for path in written}
     first, second, third = run.record.cells
     # Nothing is known of what the results take in the store, and of the time to load.
     spent = "2025-01-02T03:04:05Z,2025-01-02T03:04:06Z,1.5,2.5,64.0,,,"
     built_in = "orthoflow-tls,0.1.0,1,exact"
-    assert texts["cells.csv"].splitlines() == [
-        (
-            "cell,step,variants,repeat,status,method,distribution,distribution_version,"
-            "result_version,determinism,seed,started,ended,wall_s,cpu_s,peak_rss_mib,stored_mib,"
-            "compile_s,"
-            "environment,cached_from,key,error_type,error_message,warnings"
-        ),
-        f"cloud,cloud,,0,ok,read.scan,{built_in},,{spent}{ENVIRONMENT},earlier-run,{first.key},,,",
-        (
-            f'{WALL},wall,"plane=hough2d,orient=pnp",2,ok,raster.grid,{built_in},{2**100 + 1},'
-            f"{spent}{ENVIRONMENT},,{second.key},,,the scan has no intensity"
-        ),
-        (
-            f"ortho,ortho,,0,failed,{third.method},,,{third.result_version},{third.determinism}"
-            ",,,,0.0,0.0,0.0,,,,,,MethodError,no cell has enough points,"
-        ),
-    ]
+    assert texts["cells.csv"] == rows(
+        *[
+            (
+                "cell,step,variants,repeat,status,method,distribution,distribution_version,"
+                "result_version,determinism,seed,started,ended,wall_s,cpu_s,peak_rss_mib,stored_mib,"
+                "compile_s,"
+                "environment,cached_from,key,error_type,error_message,warnings"
+            ),
+            f"cloud,cloud,,0,ok,read.scan,{built_in},,{spent}{ENVIRONMENT},earlier-run,{first.key},,,",
+            (
+                f'{WALL},wall,"plane=hough2d,orient=pnp",2,ok,raster.grid,{built_in},{2**100 + 1},'
+                f"{spent}{ENVIRONMENT},,{second.key},,,the scan has no intensity"
+            ),
+            (
+                f"ortho,ortho,,0,failed,{third.method},,,{third.result_version},{third.determinism}"
+                ",,,,0.0,0.0,0.0,,,,,,MethodError,no cell has enough points,"
+            ),
+        ]
+    )
     parameters = "gsd_m,0.01,1\n", 'windows,"[3, 5, 7]",0\n', "label,null,0\n"
-    assert texts["parameters.csv"] == "cell,method,parameter,value,is_set\n" + "".join(
-        f"{cell},{line}"
-        for cell in ("cloud,read.scan", f"{WALL},raster.grid")
-        for line in parameters
+    assert texts["parameters.csv"] == rows(
+        "cell,method,parameter,value,is_set\n"
+        + "".join(
+            f"{cell},{line}"
+            for cell in ("cloud,read.scan", f"{WALL},raster.grid")
+            for line in parameters
+        )
     )
     (file,) = run.record.inputs[0].files
-    assert texts["inputs.csv"] == (
+    assert texts["inputs.csv"] == rows(
         f"input,file,size_bytes,sha256\nscan,hall.laz,{2**40},{file.sha256}\n"
     )
-    assert texts["products.csv"] == (
+    assert texts["products.csv"] == rows(
         "cell,direction,port,type,encoding_version,digest,source\n"
         f"cloud,out,cloud,cloud,1,{CLOUD},\n"
         f"{WALL},in,cloud,cloud,1,{CLOUD},cloud.cloud\n"
         f"{WALL},out,walls,walls,1,{WALLS},\n"
     )
-    assert texts["environments.csv"] == "environment,name,version\n" + "".join(
-        f"{ENVIRONMENT},{line}\n"
-        for line in (
-            *("python,3.11.7", "os,Linux 6.1", "cpu,A processor", "cores,2", "threads,2"),
-            *("git_commit,", "numpy,2.4.0", "h5py,3.16.0"),
+    assert texts["environments.csv"] == rows(
+        "environment,name,version\n"
+        + "".join(
+            f"{ENVIRONMENT},{line}\n"
+            for line in (
+                *("python,3.11.7", "os,Linux 6.1", "cpu,A processor", "cores,2", "threads,2"),
+                *("git_commit,", "numpy,2.4.0", "h5py,3.16.0"),
+            )
         )
     )
     costs = ("wall_s,1.5,s", "cpu_s,2.5,s", "peak_rss_mib,64.0,MiB")
-    assert texts["metrics.csv"] == "cell,step,method,metric,value,unit\n" + "".join(
-        f"{line}\n"
-        for line in (
-            *(f"cloud,cloud,read.scan,{cost}" for cost in costs),
-            f"{WALL},wall,raster.grid,rms_mm,1.25,mm",
-            f"{WALL},wall,raster.grid,cells,5400.0,1",
-            *(f"{WALL},wall,raster.grid,{cost}" for cost in costs),
+    assert texts["metrics.csv"] == rows(
+        "cell,step,method,metric,value,unit\n"
+        + "".join(
+            f"{line}\n"
+            for line in (
+                *(f"cloud,cloud,read.scan,{cost}" for cost in costs),
+                f"{WALL},wall,raster.grid,rms_mm,1.25,mm",
+                f"{WALL},wall,raster.grid,cells,5400.0,1",
+                *(f"{WALL},wall,raster.grid,{cost}" for cost in costs),
+            )
         )
     )
     assert cell_metrics(run.record.cells[2]) == ()
