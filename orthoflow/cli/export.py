@@ -122,6 +122,27 @@ _HELP: Final = "\n\n".join(
     "may be given twice.",
 )
 @click.option(
+    "--height",
+    "heights_m",
+    type=float,
+    multiple=True,
+    metavar="METRES",
+    help="plan: how far above the floor it is cut; 1.2 without it; may be given several times.",
+)
+@click.option(
+    "--through",
+    multiple=True,
+    metavar="X,Y,X,Y",
+    help="section: two places of the plan, metres in the coordinates of the scan; who looks at the "
+    "section has the first on the left; may be given several times.",
+)
+@click.option("--dimensions", is_flag=True, help="plan, section: write lengths beside the lines.")
+@click.option(
+    "--language",
+    type=click.Choice(["en", "de", "fr", "pl", "es"]),
+    help="plan, section: language of labels; en without it.",
+)
+@click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
     help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from orthoflow.files.clouds.dressing import Colouring
+    from orthoflow.files.drawings.words import Language
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +34,10 @@ class Choices:
         box: corners of the only part that is meant, as text.
         clean: without gross outliers.
         relief: with the depths of walls.
+        heights_m: where plans are cut, above the floor.
+        through: where sections are cut, `x,y,x,y`.
+        dimensions: with lengths beside the lines of plans and sections.
+        language: of labels.
     """
 
     cell: str | None = None
@@ -52,3 +57,7 @@ class Choices:
     box: str | None = None
     clean: bool = False
     relief: bool = False
+    heights_m: tuple[float, ...] = ()
+    through: tuple[str, ...] = ()
+    dimensions: bool = False
+    language: Language | None = None

@@ -47,6 +47,8 @@ class Format:
 
 _CLOUD_OPTIONS: Final = frozenset({"cell", "colour", "wall", "box", "clean"})
 
+_SECTION_OPTIONS: Final = frozenset({"cell", "scale", "paper", "dimensions", "language"})
+
 FORMATS: Final[Mapping[str, Format]] = {
     "colmap": Format(
         writer="results:export_colmap",
@@ -117,6 +119,18 @@ FORMATS: Final[Mapping[str, Format]] = {
         options=frozenset({"cell", "wall"}),
         takes_rasters=True,
     ),
+    "plan": Format(
+        writer="sections:export_plans",
+        summary="the room cut level at --height above the floor, as DXF, SVG and PDF to scale",
+        options=_SECTION_OPTIONS | {"heights_m"},
+        takes_rasters=True,
+    ),
+    "section": Format(
+        writer="sections:export_sections",
+        summary="the room cut upright through two places of the plan, likewise",
+        options=_SECTION_OPTIONS | {"through"},
+        takes_rasters=True,
+    ),
     "prov": Format(
         writer="results:export_prov",
         summary="W3C PROV-JSON: which products came of which, by which method of which software",
@@ -156,6 +170,10 @@ FLAGS: Final = {
     "grid_m": "--grid",
     "title_block": "--title-block",
     "beside": "--beside",
+    "heights_m": "--height",
+    "through": "--through",
+    "dimensions": "--dimensions",
+    "language": "--language",
 }
 
 

@@ -80,7 +80,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
             begins = wall.place_m(residuals.points_world[own])
             shifts = residuals.displacement_m[own] * [1.0, -1.0]
             _add_residuals(space, residuals, begins, begins + residuals.times * shifts)
-    _save(document, path)
+    save_document(document, path)
 
 
 def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> None:
@@ -120,7 +120,7 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
             axes = np.array([wall.frame.u_world, wall.frame.v_world])
             ends[own] += residuals.times * residuals.displacement_m[own] @ axes
         _add_residuals(space, residuals, residuals.points_world, ends)
-    _save(document, path)
+    save_document(document, path)
 
 
 def _new_document() -> tuple[Drawing, Modelspace]:
@@ -201,7 +201,12 @@ def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: s
     added.set_placement(tuple(place.tolist()))
 
 
-def _save(document: Drawing, path: Path) -> None:
+def save_document(document: Drawing, path: Path) -> None:
+    """Write a document.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
     try:
         document.saveas(path)
     except OSError as error:

@@ -18,7 +18,7 @@ SIZES_MM: Final = {
     "A4": (297.0, 210.0),
 }
 MOST_SHEETS: Final = 200
-_SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
+SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
 _EDGE_MM: Final = (150.0, 5000.0)
 MARGIN_MM: Final = 10.0
 # Around a picture: for its frame and the coordinates beside it.
@@ -105,13 +105,13 @@ def paper_of(text: str) -> Paper:
 
 def fitting_scale(sizes_m: Sequence[tuple[float, float]], paper: Paper) -> int:
     """The largest usual scale, 1 : n, at which each of some walls fits onto one sheet; gives n."""
-    for scale in _SCALES:
+    for scale in SCALES:
         if all(
             any(_fits(size, scale, way.area_mm) for way in (paper, paper.turned))
             for size in sizes_m
         ):
             return scale
-    return _SCALES[-1]
+    return SCALES[-1]
 
 
 def placed_views(

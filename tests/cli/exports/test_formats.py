@@ -28,6 +28,10 @@ GIVEN: Final[Mapping[str, object]] = {
     "grid_m": 0.0,
     "title_block": "block.yaml",
     "beside": ("depth",),
+    "heights_m": (1.2,),
+    "through": ("0,0,1,1",),
+    "dimensions": True,
+    "language": "de",
 }
 
 
@@ -41,11 +45,6 @@ def test_every_option_is_one_of_the_choices_and_has_a_flag() -> None:
 def test_every_format_has_its_writer(target: str) -> None:
     module, _, name = FORMATS[target].writer.partition(":")
     assert callable(getattr(import_module(f"orthoflow.cli.exports.{module}"), name))
-
-
-def test_what_draws_or_shows_rasters_takes_those_beside_the_record() -> None:
-    taking = {target for target, entry in FORMATS.items() if entry.takes_rasters}
-    assert taking == {"dxf", "geojson", "gltf", "tiles", "stac", "sheet", "ro-crate"}
 
 
 @pytest.mark.parametrize("name", GIVEN)

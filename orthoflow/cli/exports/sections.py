@@ -1,0 +1,130 @@
+"""Exports of plans and sections, cut from the planes and the cloud of a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from orthoflow.cli.exports.choices import Choices
+from orthoflow.cli.exports.products import branch_of, last_product, make_empty, product_of
+from orthoflow.cli.tables import counted
+from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.section_files import SectionDrawing, fitted, write_section
+from orthoflow.files.drawings.sections import Cut, plan_cut, section_cut, section_of
+from orthoflow.geometry.directions import basis_from_up
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.records.runs import Run
+from orthoflow.records.wall_results import RoomResults, room_results
+
+_USUAL_HEIGHT_M = 1.2
+
+
+def export_plans(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `plan_<n>.dxf`, `.svg` and `.pdf` for each height."""
+    results, planes = _room(run, chosen)
+    cuts = [
+        plan_cut(planes, height, chosen.language or "en")
+        for height in chosen.heights_m or (_USUAL_HEIGHT_M,)
+    ]
+    return _write(run, folder, chosen, "plan", (results, planes), cuts)
+
+
+def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `section_<n>.dxf`, `.svg` and `.pdf` for each pair of places."""
+    if not chosen.through:
+        raise ArgumentError(
+            "--to section needs --through X,Y,X,Y, two places of the plan in metres "
+            "(`--to plan` shows the coordinates)"
+        )
+    results, planes = _room(run, chosen)
+    cuts = [section_cut(planes, _places(text), chosen.language or "en") for text in chosen.through]
+    return _write(run, folder, chosen, "section", (results, planes), cuts)
+
+
+def _places(text: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not all(map(math.isfinite, values)):
+        raise ArgumentError(
+            f"--through takes four numbers in metres with commas between, X,Y,X,Y of two places, "
+            f"got {text!r}"
+        )
+    return values
+
+
+def _room(run: Run, chosen: Choices) -> tuple[RoomResults, Planes]:
+    results = room_results(run, chosen.cell)
+    if results.planes is None:
+        raise ArgumentError(f"the run {run.record.run_id} has no planes, so nothing can be cut")
+    return results, results.planes
+
+
+def _write(
+    run: Run,
+    folder: Path,
+    chosen: Choices,
+    kind: Literal["plan", "section"],
+    room: tuple[RoomResults, Planes],
+    cuts: Sequence[Cut],
+) -> str:
+    results, planes = room
+    cloud, labels = _points(run, results.address, chosen)
+    made = [section_of(cut, planes, results.openings, cloud, labels) for cut in cuts]
+    make_empty(folder)
+    said = []
+    for number, section in enumerate(made, start=1):
+        scale, paper = fitted(section, chosen.scale, chosen.paper, has_dimensions=chosen.dimensions)
+        drawing = SectionDrawing(
+            kind=kind,
+            section=section,
+            scale=scale,
+            paper=paper,
+            origin=f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}",
+            has_dimensions=chosen.dimensions,
+            up_label=_up_label(planes) if kind == "plan" else "",
+            language=chosen.language or "en",
+        )
+        write_section(folder, f"{kind}_{number}", drawing)
+        said.append(
+            f"{kind}_{number} at 1:{scale}, {section.cut.title}: "
+            f"{counted(len(section.lines), 'line')} cut, {section.n_points:,} points in a slab of "
+            f"{1e3 * section.slab_m:.0f} mm"
+        )
+    if cloud is None:
+        said.append("without the cloud, which neither record nor store holds: openings are missing")
+    return "; ".join(said)
+
+
+def _up_label(planes: Planes) -> str:
+    """Which world axis points upwards on a plan."""
+    second = basis_from_up(planes.up)[1]
+    axis = int(np.argmax(np.abs(second)))
+    return f"{'-' if second[axis] < 0 else ''}{'xyz'[axis]}"
+
+
+def _points(
+    run: Run, address: str, chosen: Choices
+) -> tuple[PointCloud | None, PointLabels | None]:
+    """The cloud in which planes were found, and its labels; None where they are kept nowhere."""
+    cells = branch_of(run, address)
+    for cell in reversed(cells.values()):
+        labels = [out.digest for out in cell.outputs.values() if out.type_name == "labels"]
+        taken = [item.digest for item in cell.inputs.values() if item.type_name == "cloud"]
+        if labels and len(taken) == 1:
+            try:
+                return (
+                    product_of(run, taken[0], PointCloud, chosen.store),
+                    product_of(run, labels[0], PointLabels, chosen.store),
+                )
+            except ArgumentError:
+                return None, None
+    try:
+        return last_product(run, cells, PointCloud, chosen.store), None
+    except ArgumentError:
+        return None, None

@@ -1,0 +1,142 @@
+"""Plans and sections of the box room, whose corners are known exactly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import pdfplumber
+import pytest
+
+from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.section_files import SectionDrawing, fitted, write_section
+from orthoflow.files.drawings.sections import plan_cut, section_cut, section_of
+from orthoflow.products import PointCloud
+from tests.drawing_runs import AXES, CORNER, SIZE_M, box_planes, box_points
+
+DOOR_M = (1.0, 1.9)
+POINTS_PER_MM = 72.0 / 25.4
+
+
+def box_cloud() -> PointCloud:
+    """Points every centimetre on the four walls, but for a door in the wall y = 0, and a table."""
+    along = np.arange(0.0, 6.0, 0.01)
+    places = []
+    for axis, level in ((0, 0.0), (0, SIZE_M[0]), (1, 0.0), (1, SIZE_M[1])):
+        u, z = np.meshgrid(along[along <= SIZE_M[1 - axis]], np.arange(0.0, SIZE_M[2], 0.01))
+        wall = np.empty((u.size, 3))
+        wall[:, axis], wall[:, 1 - axis], wall[:, 2] = level, u.ravel(), z.ravel()
+        if (axis, level) == (1, 0.0):
+            is_door = (wall[:, 0] > DOOR_M[0]) & (wall[:, 0] < DOOR_M[1]) & (wall[:, 2] < 2.0)
+            wall = wall[~is_door]
+        places.append(wall)
+    table = np.random.default_rng(7).uniform([2.0, 1.5, 0.0], [2.6, 1.9, 1.5], (40_000, 3))
+    points = box_points(np.concatenate([*places, table]))
+    origin = points.mean(axis=0)
+    x, y, z = (points - origin).astype(np.float32).T
+    return PointCloud(
+        origin=origin,
+        x=np.ascontiguousarray(x),
+        y=np.ascontiguousarray(y),
+        z=np.ascontiguousarray(z),
+        up=np.array([0.0, 0.0, 1.0]),
+    )
+
+
+def test_a_plan_has_the_corners_of_the_room_in_world_coordinates() -> None:
+    section = section_of(plan_cut(box_planes(), 1.2), box_planes())
+    ends = np.concatenate([line.ends_m for line in section.lines])
+    wanted = box_points(np.array([[x, y, 0] for x in (0, SIZE_M[0]) for y in (0, SIZE_M[1])]))
+    assert len(section.lines) == 4
+    for corner in wanted[:, :2]:
+        assert np.sum(np.linalg.norm(ends - corner, axis=1) < 1e-6) == 2
+    # What is solid lies outside.
+    middle = wanted[:, :2].mean(axis=0)
+    assert all((line.ends_m.mean(axis=0) - middle) @ line.behind > 1.0 for line in section.lines)
+    assert math.isclose(section.cut.origin_world[2], CORNER[2] + 1.2, abs_tol=1e-6)
+
+
+def test_a_door_is_a_gap_and_furniture_stays_as_points() -> None:
+    section = section_of(plan_cut(box_planes(), 1.2), box_planes(), (), box_cloud())
+    (gap,) = section.gaps_m
+    in_room = (gap - CORNER[:2]) @ AXES[:2, :2].T
+    assert sorted(in_room[:, 0]) == pytest.approx(DOOR_M, abs=0.011)
+    assert np.abs(in_room[:, 1]).max() < 1e-6
+    table = (section.points_m - CORNER[:2]) @ AXES[:2, :2].T
+    assert len(table) > 100
+    assert table.min(axis=0) == pytest.approx([2.0, 1.5], abs=0.02)
+    assert table.max(axis=0) == pytest.approx([2.6, 1.9], abs=0.02)
+
+
+def test_a_section_has_heights_and_the_first_place_on_the_left() -> None:
+    ends = box_points(np.array([[-0.5, 1.0, 0.0], [SIZE_M[0] + 0.5, 1.0, 0.0]]))[:, :2]
+    section = section_of(section_cut(box_planes(), ends.ravel().tolist()), box_planes())
+    left, bottom, right, top = section.bounds_m
+    assert (bottom, top) == pytest.approx((CORNER[2], CORNER[2] + SIZE_M[2]), abs=1e-6)
+    assert (left, right) == pytest.approx((0.5, 0.5 + SIZE_M[0]), abs=1e-6)
+    # The wall at x = 0 is left of the room: what is behind it lies to the left.
+    (wall,) = [line for line in section.lines if abs(line.ends_m[:, 0] - 0.5).max() < 1e-6]
+    assert wall.behind == pytest.approx([-1.0, 0.0], abs=1e-9)
+
+
+def test_two_sides_of_a_wall_give_its_thickness() -> None:
+    planes = box_planes()
+    inside = int(np.argmax(planes.normal @ AXES[1]))  # the wall y = 0, whose normal is y
+    shift = -0.4 * AXES[1]
+    both = replace(
+        planes,
+        normal=np.vstack([planes.normal, -planes.normal[inside]]),
+        offset=np.append(planes.offset, 0.4 - planes.offset[inside]),
+        corners=np.concatenate([planes.corners, (planes.corners[inside] + shift)[None]]),
+        covariance=np.concatenate([planes.covariance, planes.covariance[inside][None]]),
+        n_points=np.append(planes.n_points, 1000),
+        rms_m=np.append(planes.rms_m, 0.001),
+        names=(*planes.names, f"wall {len(planes)}"),
+        part_corners=None,
+        part_plane=None,
+    )
+    section = section_of(plan_cut(both, 1.2), both)
+    thickness = {line.plane: line.thickness_m for line in section.lines}
+    assert thickness.pop(inside) == pytest.approx(0.4, abs=1e-6)
+    assert thickness.pop(len(planes)) == pytest.approx(0.4, abs=1e-6)
+    assert all(math.isnan(value) for value in thickness.values())
+
+
+def test_a_cut_that_meets_nothing_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="meets no plane"):
+        section_of(section_cut(box_planes(), [0.0, 0.0, 1.0, 0.0]), box_planes())
+    with pytest.raises(ArgumentError, match="twice"):
+        section_cut(box_planes(), [1.0, 2.0, 1.0, 2.0])
+
+
+def test_the_three_files_show_the_same_lines_in_scale(tmp_path: Path) -> None:
+    section = section_of(plan_cut(box_planes(), 1.2), box_planes(), (), box_cloud())
+    scale, paper = fitted(section, 50, None, has_dimensions=True)
+    drawing = SectionDrawing(
+        kind="plan",
+        section=section,
+        scale=scale,
+        paper=paper,
+        origin="a box",
+        has_dimensions=True,
+        language="pl",
+    )
+    write_section(tmp_path, "plan_1", drawing)
+    document = ezdxf.readfile(tmp_path / "plan_1.dxf")
+    assert len(document.audit().errors) == 0
+    assert document.units == 6
+    drawn = list(document.modelspace().query("LINE[layer=='A-SECT-MCUT']"))
+    lengths = sorted(line.dxf.start.distance(line.dxf.end) for line in drawn)
+    assert lengths[-1] == pytest.approx(SIZE_M[0], abs=1e-6)
+    texts = " ".join(entity.dxf.text for entity in document.modelspace().query("TEXT"))
+    assert "Rzut" in texts
+    with pdfplumber.open(tmp_path / "plan_1.pdf") as pdf:
+        (page,) = pdf.pages
+        assert float(page.width) == pytest.approx(paper.width_mm * POINTS_PER_MM, abs=0.1)
+        thick = [c for c in (*page.lines, *page.curves) if c["linewidth"] > 1.2]
+        longest = max(math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick)
+    assert longest == pytest.approx(1000 * SIZE_M[0] / scale * POINTS_PER_MM, rel=2e-3)
+    assert f'width="{paper.width_mm:g}mm"' in (tmp_path / "plan_1.svg").read_text()
