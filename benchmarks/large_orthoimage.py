@@ -25,7 +25,7 @@ from orthoflow_plugins.ortho.painting import PaintRule, paint
 from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
-from orthoflow.files.geotiff import read_raster, write_orthoimage
+from orthoflow.files.geotiff import GridPlace, read_raster, write_orthoimage
 from orthoflow.files.images import preview_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.depth_noise import depth_noise_m
@@ -135,7 +135,7 @@ def main() -> None:
         shown = painting.mask == LayerMask.PAINTED
         path = folder / "ortho.tif"
         with measured("cloud-optimised GeoTIFF"):
-            write_orthoimage(path, painting.rgb, shown, gsd_m=GSD_M, tags={})
+            write_orthoimage(path, painting.rgb, shown, place=GridPlace(gsd_m=GSD_M), tags={})
         with measured("preview"):
             preview_png(painting.rgb, shown)
         print(f"file of {path.stat().st_size / 2**20:.0f} MiB, {shown.mean():.1%} painted")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthoflow.files.geotiff import write_orthoimage
+from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.ortho_files import ortho_files
 from orthoflow.files.sidecars import frame_json, write_json
 from orthoflow.files.tiles.pyramid import write_tiles, write_viewer
@@ -48,7 +48,7 @@ def large_orthoimage(folder: Path, side: int, n_rows: int) -> Path:
         shown[rows] = True
     shown[n_rows // 3 : n_rows // 2, side // 3 : side // 2] = False
     path = folder / "wall_0_ortho.tif"
-    write_orthoimage(path, rgb, shown, gsd_m=GSD_M, tags={})
+    write_orthoimage(path, rgb, shown, place=GridPlace(gsd_m=GSD_M), tags={})
     write_json(path.with_suffix(".json"), frame_json(frame) | {"name": "wall 0"})
     for name in ("rgb", "shown"):
         (folder / name).unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,9 @@ def box_planes() -> Planes:
 
 def wall_frame(planes: Planes) -> WallFrame:
     """Cells over the photographed wall's rectangle: 3.8 x 2.3 m."""
-    return frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
+    frame = frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
+    east, north, top = planes.up.tolist()
+    return replace(frame, up=(east, north, top), name=planes.names[WALL])
 
 
 def drawn_wall(planes: Planes, *, is_known: bool) -> DrawnWall:

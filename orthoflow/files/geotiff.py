@@ -1,8 +1,9 @@
 """GeoTIFF in the plane of a wall: one-band rasters and cloud-optimised orthoimages.
 
-X = gsd * column and Y = -gsd * row in a local metric coordinate system, pixel-is-area, so that GIS
-and CAD programs measure metres on the wall. Rasters of level planes may lie in a map instead, X to
-the east and Y to the north. Equal rasters give equal bytes.
+X is metres along the wall from its left edge and Y the height, or world x and y of floors and
+ceilings, in a local metric coordinate system of the wall's own, pixel-is-area; rasters of level
+planes may lie in a map instead, X to the east and Y to the north. `WallFrame.raster_axes` decides
+it. Equal rasters give equal bytes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,6 @@ _LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["{},'
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
-LOCAL_CRS_WKT: Final = _LOCAL_CRS_WKT.format("plane of the wall")
 SITE_CRS: Final = "site"
 SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 # What is read is held as a whole, beside copies of it.
@@ -74,6 +74,7 @@ class RasterFile:
         shown: (rows, cols) True where the dataset mask says that there is something.
         gsd_m: side of a cell in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
+        down: change of Y per metre down the rows, -1 or 1.
         tags: the dataset's tags.
         crs_wkt: coordinate system, as GDAL gives it.
         nodata: the value that means nothing, or None.
@@ -85,31 +86,49 @@ class RasterFile:
     shown: NDArray[np.bool_]
     gsd_m: float
     corner_m: tuple[float, float] = (0.0, 0.0)
+    down: float = -1.0
     tags: dict[str, str] = field(default_factory=dict)
     crs_wkt: str = ""
     nodata: float | None = None
     overviews: tuple[int, ...] = ()
     layout: str = ""
 
+    @property
+    def place(self) -> GridPlace:
+        """Where it lies; of its coordinate system nothing is said."""
+        return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
+
 
 @dataclass(frozen=True, kw_only=True)
-class MapPlace:
-    """Where a raster lies in a map.
+class GridPlace:
+    """Where a raster lies in its coordinate system.
 
     Attributes:
-        corner_m: east and north of the outer corner of the top-left cell.
-        crs: an EPSG code, or `site`.
+        gsd_m: side of a cell in metres.
+        corner_m: X and Y of the outer corner of the top-left cell.
+        crs: an EPSG code, `site`, or the name of a local one.
+        down: change of Y per metre down the rows, -1 or 1.
     """
 
-    corner_m: tuple[float, float]
-    crs: str
+    gsd_m: float
+    corner_m: tuple[float, float] = (0.0, 0.0)
+    crs: str = "plane"
+    down: float = -1.0
+
+    @classmethod
+    def of(cls, frame: WallFrame) -> Self:
+        """Place the raster of a wall."""
+        return cls(
+            gsd_m=frame.gsd_m,
+            corner_m=frame.raster_corner_m,
+            crs=frame.crs,
+            down=frame.raster_down,
+        )
 
 
-def map_place(frame: WallFrame) -> MapPlace | None:
-    """Give where a raster lies in a map; None for one in the plane of its wall."""
-    if frame.map_crs is None:
-        return None
-    return MapPlace(corner_m=frame.raster_corner_m, crs=frame.map_crs)
+def local_crs_wkt(name: str) -> str:
+    """Give the WKT of the coordinate system of a wall, by its name."""
+    return _LOCAL_CRS_WKT.format(re.sub(r"[^\w .,()-]", "_", name, flags=re.ASCII))
 
 
 def require_map_crs(crs: str) -> None:
@@ -178,9 +197,8 @@ def write_raster(
     path: Path,
     values: NDArray[np.generic],
     *,
-    gsd_m: float,
+    place: GridPlace,
     tags: Mapping[str, str],
-    place: MapPlace | None = None,
 ) -> None:
     """Write one band: values with NaN for nothing, labels with -1 for it, or classes.
 
@@ -190,9 +208,8 @@ def write_raster(
         path: file to write; its folder exists.
         values: (rows, cols) float32, int16 or int32 labels, or uint8 classes, which have no value
             for nothing.
-        gsd_m: side of a cell in metres.
+        place: where it lies.
         tags: text to keep with the raster.
-        place: in a map; without one X and Y count from the top-left corner.
 
     Raises:
         StoreError: the file cannot be written.
@@ -213,7 +230,7 @@ def write_raster(
         "blockysize": TILE_PX,
         "nodata": _NOTHING[str(values.dtype)],
     }
-    profile |= _placed(values.shape, gsd_m, place)
+    profile |= _placed(values.shape, place)
     if values.size > _IN_MEMORY_CELLS:
         _write_large_raster(path, values, profile, tags)
     else:
@@ -242,10 +259,9 @@ def write_orthoimage(
     rgb: Colours,
     shown: NDArray[np.bool_],
     *,
-    gsd_m: float,
+    place: GridPlace,
     tags: Mapping[str, str],
     icc_profile: bytes | None = None,
-    place: MapPlace | None = None,
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
@@ -256,10 +272,9 @@ def write_orthoimage(
         path: file to write; its folder exists.
         rgb: (rows, cols, 3), 8 or 16 bits; the file has as many.
         shown: (rows, cols) True where the image shows something (painted or filled).
-        gsd_m: side of a cell in metres.
+        place: where it lies.
         tags: text to keep with the image.
         icc_profile: what the colours mean; None for sRGB or unknown.
-        place: in a map; without one X and Y count from the top-left corner.
 
     Raises:
         StoreError: the file cannot be written.
@@ -272,7 +287,7 @@ def write_orthoimage(
         )
     image = _Image(rgb=rgb, shown=shown, tags=tags, icc_profile=icc_profile)
     placed: dict[str, object] = {"count": 3, "dtype": rgb.dtype.name}
-    placed |= _placed(shown.shape, gsd_m, place)
+    placed |= _placed(shown.shape, place)
     if shown.size > _IN_MEMORY_CELLS:
         _write_banded(path, image, placed)
     else:
@@ -335,27 +350,20 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
                 raise OSError(f"rows {rows.start} to {rows.stop} do not read back")
 
 
-def world_file_text(
-    gsd_m: float,
-    *,
-    rows: float = 1.0,
-    columns: float = 1.0,
-    corner_m: tuple[float, float] = (0.0, 0.0),
-) -> str:
+def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0) -> str:
     """Give the world file of a wall's raster, for programs that read no GeoTIFF tags.
 
     Six lines: step along a row, two rotations, step down a column, and the centre of the first
     pixel.
 
     Args:
-        gsd_m: side of a cell in metres.
+        place: where the raster lies.
         rows: of cells that a pixel covers; more than one for a preview.
         columns: of cells that a pixel covers.
-        corner_m: X and Y of the outer corner of the top-left cell.
     """
-    across_m, down_m = columns * gsd_m, rows * gsd_m
-    first = (corner_m[0] + 0.5 * across_m, corner_m[1] - 0.5 * down_m)
-    numbers = (across_m, 0.0, 0.0, -down_m, *first)
+    across_m, down_m = columns * place.gsd_m, place.down * rows * place.gsd_m
+    first = (place.corner_m[0] + 0.5 * across_m, place.corner_m[1] + 0.5 * down_m)
+    numbers = (across_m, 0.0, 0.0, down_m, *first)
     return "".join(f"{number!r}\n" for number in numbers)
 
 
@@ -379,6 +387,7 @@ def read_raster(path: Path) -> RasterFile:
                 shown=dataset.dataset_mask() > 0,
                 gsd_m=_gsd_m(path, dataset.transform),
                 corner_m=(float(dataset.transform.c), float(dataset.transform.f)),
+                down=math.copysign(1.0, dataset.transform.e),
                 tags=dict(dataset.tags()),
                 crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
                 nodata=dataset.nodata,
@@ -399,6 +408,7 @@ class RasterParts:
         shape: rows and columns.
         gsd_m: side of a cell in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
+        down: change of Y per metre down the rows, -1 or 1.
         bands: how many there are.
         dtype: numpy's name of the stored type.
     """
@@ -419,8 +429,14 @@ class RasterParts:
         self.shape: tuple[int, int] = (self._dataset.height, self._dataset.width)
         self.gsd_m = _gsd_m(path, self._dataset.transform)
         self.corner_m = (float(self._dataset.transform.c), float(self._dataset.transform.f))
+        self.down = math.copysign(1.0, self._dataset.transform.e)
         self.bands: int = self._dataset.count
         self.dtype: str = self._dataset.dtypes[0]
+
+    @property
+    def place(self) -> GridPlace:
+        """Where it lies; of its coordinate system nothing is said."""
+        return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
 
     def __enter__(self) -> Self:
         return self
@@ -501,13 +517,13 @@ def _check_size(path: Path, dataset: DatasetReader) -> None:
 
 
 def _gsd_m(path: Path, transform: Affine) -> float:
-    """Side of square cells whose X grows to the right and whose Y grows upwards."""
+    """Side of square cells whose X grows to the right and whose Y grows along the columns."""
     side = float(transform.a)
     limit = 1e-6 * abs(side)
     if (
         not side > 0.0
         or max(abs(transform.b), abs(transform.d)) > limit
-        or (abs(transform.e + side) > limit)
+        or abs(abs(transform.e) - side) > limit
     ):
         raise InputError(
             f"{path.name} has cells that are not square and upright (geotransform "
@@ -520,16 +536,17 @@ def _gsd_m(path: Path, transform: Affine) -> float:
     return side
 
 
-def _placed(shape: tuple[int, ...], gsd_m: float, place: MapPlace | None) -> dict[str, object]:
+def _placed(shape: tuple[int, ...], place: GridPlace) -> dict[str, object]:
     from rasterio.crs import CRS
     from rasterio.transform import Affine
 
-    left_m, top_m = (0.0, 0.0) if place is None else place.corner_m
+    is_map = place.crs == SITE_CRS or epsg_of(place.crs) is not None
+    left_m, top_m = place.corner_m
     return {
         "height": shape[0],
         "width": shape[1],
-        "crs": CRS.from_wkt(LOCAL_CRS_WKT) if place is None else _map_crs(place.crs),
-        "transform": Affine(gsd_m, 0.0, left_m, 0.0, -gsd_m, top_m),
+        "crs": _map_crs(place.crs) if is_map else CRS.from_wkt(local_crs_wkt(place.crs)),
+        "transform": Affine(place.gsd_m, 0.0, left_m, 0.0, place.down * place.gsd_m, top_m),
     }
 
 

@@ -42,7 +42,7 @@ def publish_openings(product: Openings, folder: Path, digest: str) -> None:
             write_features(
                 folder / f"wall_{wall}_openings.geojson",
                 [opening_feature(opening, place) for place, opening in enumerate(own)],
-                own[0].map_crs,
+                own[0].crs,
                 digest=digest,
             )
     features = [

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.geotiff import LOCAL_CRS_WKT, SITE_CRS_WKT, epsg_of
+from orthoflow.files.geotiff import SITE_CRS, SITE_CRS_WKT, epsg_of, local_crs_wkt
 from orthoflow.files.json_texts import json_bytes, parse_json
 from orthoflow.files.regular_files import open_file
 from orthoflow.files.sidecars import write_bytes
@@ -139,7 +139,7 @@ def outlines(
 def write_features(
     path: Path,
     features: Iterable[Feature],
-    crs: str | None,
+    crs: str,
     *,
     indent: int | None = 1,
     digest: str | None = None,
@@ -152,8 +152,8 @@ def write_features(
     Args:
         path: the file.
         features: in order, as RFC 7946 has them: type, properties and geometry.
-        crs: an EPSG code or `site` (coordinates of the scan), as `WallFrame.map_crs`; None for the
-            plane of a wall, that of `WallFrame.raster_from_wall`.
+        crs: an EPSG code, `site` (coordinates of the scan), or the name of a wall's own, as
+            `WallFrame.crs`.
         indent: of the text; None for one line.
         digest: of the product that it shows.
 
@@ -161,7 +161,7 @@ def write_features(
         StoreError: it cannot be written.
     """
     epsg = epsg_of(crs)
-    local = LOCAL_CRS_WKT if crs is None else SITE_CRS_WKT
+    local = SITE_CRS_WKT if crs == SITE_CRS else local_crs_wkt(crs)
     name = local if epsg is None else f"urn:ogc:def:crs:EPSG::{epsg}"
     content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
     if digest is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
-from orthoflow.files.geotiff import map_place, world_file_text, write_orthoimage, write_raster
+from orthoflow.files.geotiff import GridPlace, world_file_text, write_orthoimage, write_raster
 from orthoflow.files.images import Cells, cells_per_preview_px, cells_png, grey_cells
 from orthoflow.files.sidecars import (
     LAYER_MASK_MEANINGS,
@@ -154,7 +154,7 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         for rows in row_bands(shown.shape):
             shown[rows] |= image.mask[rows] == OrthoMask.FILLED
         stem = f"wall_{image.number}_ortho"
-        gsd_m, place = image.frame.gsd_m, map_place(image.frame)
+        place = GridPlace.of(image.frame)
         colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
         content = f"orthoimage, {colours}"
         tags = raster_tags(image.frame, digest=digest, name=image.name, content=content, extra={})
@@ -162,16 +162,14 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
             folder / f"{stem}.tif",
             image.rgb,
             shown,
-            gsd_m=gsd_m,
+            place=place,
             tags=tags,
             icc_profile=product.icc_profile,
-            place=place,
         )
-        world_file = world_file_text(gsd_m, corner_m=image.frame.raster_corner_m)
-        write_text(folder / f"{stem}.tfw", world_file)
+        write_text(folder / f"{stem}.tfw", world_file_text(place))
         mask_tags = tags | {"content": "mask of the orthoimage"}
         mask_path = folder / f"{stem}_mask.tif"
-        write_raster(mask_path, image.mask, gsd_m=gsd_m, tags=mask_tags, place=place)
+        write_raster(mask_path, image.mask, place=place, tags=mask_tags)
         _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
         picture = cells_png(shown.shape, _cells_of(image, shown))
         _write_preview(folder / f"{stem}.png", picture, image.frame)
@@ -208,10 +206,9 @@ def _write_layers(
             folder / f"{stem}.tif",
             layer.rgb,
             layer.mask == LayerMask.PAINTED,
-            gsd_m=layer.frame.gsd_m,
+            place=GridPlace.of(layer.frame),
             tags=tags,
             icc_profile=icc_profile,
-            place=map_place(layer.frame),
         )
         about: dict[str, JsonValue] = {
             "wall": number,
@@ -312,9 +309,8 @@ def _publish_raster(
     write_raster(
         stem.with_suffix(".tif"),
         values,
-        gsd_m=wall.frame.gsd_m,
+        place=GridPlace.of(wall.frame),
         tags=all_tags,
-        place=map_place(wall.frame),
     )
     write_json(
         stem.with_suffix(".json"),
@@ -340,8 +336,7 @@ def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
 def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
     """Write the preview of a raster, and the world file that places it where the raster lies."""
     rows, columns = cells_per_preview_px(frame.shape)
-    corner_m = frame.raster_corner_m
-    text = world_file_text(frame.gsd_m, rows=rows, columns=columns, corner_m=corner_m)
+    text = world_file_text(GridPlace.of(frame), rows=rows, columns=columns)
     write_bytes(path, picture)
     write_text(path.with_suffix(".pgw"), text)
 

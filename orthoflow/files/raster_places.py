@@ -48,7 +48,8 @@ def place_of(path: Path) -> RasterPlace:
         with quiet(), rasterio.open(path, driver="GTiff") as dataset:
             check_header(path, dataset)
             epsg = dataset.crs.to_epsg() if dataset.crs else None
-            left, bottom, right, top = dataset.bounds
+            left, first, right, last = dataset.bounds
+            bottom, top = sorted((first, last))
             outline: tuple[tuple[float, float], ...] = ()
             if epsg is not None:
                 x, y = (left, right, right, left, left), (bottom, bottom, top, top, bottom)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,17 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
-from orthoflow.files.geotiff import RasterParts
+from orthoflow.files.geotiff import GridPlace, RasterParts
 from orthoflow.files.json_texts import json_bytes, parse_json
 from orthoflow.files.regular_files import text_of_file
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.frames import FARTHEST_M
+from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
 
 MOST_SIDECAR_BYTES: Final = 1 << 20
 # Numbers of walls are kept in 16 bits.
 MOST_WALLS: Final = 32_000
 _LONGEST_SHOWN: Final = 100
+_UNIT: Final = 1e-6
 
 SURFACE_MASK_MEANINGS: Final[dict[SurfaceMask, str]] = {
     SurfaceMask.VOID: "void: no point of the scan fell here",
@@ -44,14 +46,26 @@ ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
 }
 
 
+_GEOTIFF: Final[dict[RasterAxes, str]] = {
+    "map": "X = x_of_left_m + gsd_m * column (east), Y = y_of_top_m - gsd_m * row (north)",
+    "wall": "X = x_of_left_m + gsd_m * column (metres along the wall from its left edge), Y = "
+    "height_of_top_m - gsd_m * row (height along up_world)",
+    "level": "X = x_of_left_m + gsd_m * column, Y = y_of_top_m - gsd_m * row: the world's "
+    "horizontal axes",
+    "plane": "X = gsd_m * column, Y = - gsd_m * row: metres in the plane from the top-left corner",
+}
+
+
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
     """Frame of a wall's raster: world = origin + gsd * (column * u + row * v) + depth * n."""
     plane = frame.plane
     placed: dict[str, JsonValue] = {} if frame.map_crs is None else {"map_crs": frame.map_crs}
-    geotiff = "X = gsd_m * column, Y = -gsd_m * row, pixel is area"
-    if frame.map_crs is not None:
-        geotiff = "X = origin_world[0] + gsd_m * column (east), Y = origin_world[1] - gsd_m * row "
-        geotiff += "(north), pixel is area"
+    if frame.up is not None:
+        placed["up_world"] = list(frame.up)
+    left_m, top_m = frame.raster_corner_m
+    geotiff = _GEOTIFF[frame.raster_axes]
+    if frame.raster_down > 0.0:
+        geotiff = geotiff.replace(" - gsd_m", " + gsd_m")
     return placed | {
         "origin_world": numbers(frame.origin_world),
         "u_world": numbers(frame.u_world),
@@ -62,10 +76,14 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "height": frame.height,
         "plane": {"normal": numbers(plane.normal), "offset_m": plane.offset_m},
         "corners_world": numbers(frame.corners_world()),
+        # X and Y of the top-left corner: of a wall metres along it, and height.
+        "x_of_left_m": left_m,
+        "height_of_top_m" if frame.raster_axes == "wall" else "y_of_top_m": top_m,
+        "crs": frame.crs,
         "raster": {
             "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
             "depth_m * normal_world; v_world points down, cell centres lie at .5",
-            "geotiff": geotiff,
+            "geotiff": f"{geotiff}; pixel is area",
         },
     }
 
@@ -104,8 +122,7 @@ def shown_value(value: object) -> str:
 def frame_of_raster(
     content: Mapping[str, object],
     *,
-    corner_m: tuple[float, float],
-    gsd_m: float,
+    raster: GridPlace,
     shape: tuple[int, int],
     name: str,
 ) -> WallFrame:
@@ -113,10 +130,10 @@ def frame_of_raster(
 
     Args:
         content: `origin_world`, `u_world`, `v_world` (down), `normal_world` of that plane, as in
-            the sidecars that orthoflow writes; X counts along u, Y against v, from that origin,
-            or with `map_crs` from that of the map.
-        corner_m: X and Y of the outer corner of its top-left cell.
-        gsd_m: side of its cells.
+            the sidecars that orthoflow writes; X counts along u and Y against v from what
+            `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`) say of that origin, or without
+            them from 0, or with `map_crs` from its place in the map.
+        raster: where the GeoTIFF lies.
         shape: its rows and columns.
         name: what to call it in an error.
 
@@ -132,19 +149,38 @@ def frame_of_raster(
                 f"{shown_value(content.get(key))}"
             )
     u, v, origin = vectors["u_world"], vectors["v_world"], vectors["origin_world"]
-    map_crs = content.get("map_crs")
+    map_crs, up = content.get("map_crs"), _vector(content.get("up_world"))
+    left_m, top_m = (
+        _number(content.get("x_of_left_m")),
+        _number(content.get("height_of_top_m", content.get("y_of_top_m"))),
+    )
     if map_crs is not None:
-        corner_m = (corner_m[0] - float(origin[0]), corner_m[1] - float(origin[1]))
+        left_m, top_m = float(origin[0]), float(origin[1])
     try:
-        return WallFrame(
-            origin_world=origin + corner_m[0] * u - corner_m[1] * v,
+        placed = WallFrame(
+            origin_world=origin,
             u_world=u,
             v_world=v,
             normal_world=vectors["normal_world"],
-            gsd_m=gsd_m,
+            gsd_m=raster.gsd_m,
             width=shape[1],
             height=shape[0],
             map_crs=None if map_crs is None else str(map_crs),
+            up=tuple(up.tolist()) if up.shape == (3,) and abs(up @ up - 1.0) < _UNIT else None,
+            name=str(content.get("name", "")),
+        )
+        if placed.raster_down != raster.down:
+            raise InputError(
+                f"{name}: its rows go {'up' if raster.down > 0.0 else 'down'} along Y, but those "
+                "of the wall that the file beside it describes go the other way: export it with "
+                "the rows in the order of orthoflow's own GeoTIFF"
+            )
+        right_m = raster.corner_m[0] - left_m
+        below_m = (raster.corner_m[1] - top_m) * raster.down
+        return replace(
+            placed,
+            origin_world=origin + right_m * u + below_m * v,
+            left_m=raster.corner_m[0] if placed.raster_axes == "wall" else 0.0,
         )
     except GeometryError as error:
         raise InputError(f"{name}: {error}") from error
@@ -160,12 +196,18 @@ def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
     with RasterParts(path) as raster:
         frame = frame_of_raster(
             content,
-            corner_m=raster.corner_m,
-            gsd_m=raster.gsd_m,
+            raster=raster.place,
             shape=raster.shape,
             name=path.name,
         )
     return frame, content
+
+
+def _number(value: object) -> float:
+    """A number of a sidecar; 0 where it holds none, or one that is no place."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return 0.0
+    return float(value) if abs(value) < FARTHEST_M else 0.0
 
 
 def _vector(value: object) -> NDArray[np.float64]:
@@ -183,18 +225,13 @@ def raster_tags(
 ) -> dict[str, str]:
     """Tags of a GeoTIFF: enough to place it in the world without the JSON file beside it."""
     plane = frame.plane
-    placed = {} if frame.map_crs is None else {"map_crs": frame.map_crs}
+    of_frame = ("map_crs", "up_world", "origin_world", "u_world", "v_world", "normal_world")
+    of_raster = ("x_of_left_m", "height_of_top_m", "y_of_top_m")
+    placed = frame_json(frame)
     return {
         "content": content,
         "frame": json.dumps(
-            {
-                **placed,
-                "origin_world": numbers(frame.origin_world),
-                "u_world": numbers(frame.u_world),
-                "v_world": numbers(frame.v_world),
-                "normal_world": numbers(frame.normal_world),
-            },
-            sort_keys=True,
+            {key: placed[key] for key in (*of_frame, *of_raster) if key in placed}, sort_keys=True
         ),
         "gsd_m": repr(float(frame.gsd_m)),
         "name": name,

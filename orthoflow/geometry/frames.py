@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from orthoflow.geometry.planes import Plane
 LEVEL_LIMIT_DEG: Final = 10.0
 # Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
 FARTHEST_M: Final = 1e9
+_LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
+
+RasterAxes = Literal["map", "wall", "level", "plane"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +42,9 @@ class WallFrame:
         height: number of rows.
         map_crs: set where the raster is a map, with u to the east and v to the south: its
             coordinate system, an EPSG code, or `site` for the world's own without a name.
+        up: unit vector along which heights count; None where it is unknown.
+        name: what the wall is called, and with it the coordinate system of its raster.
+        left_m: metres along the wall from its left edge to this raster's, for a part of a wall.
     """
 
     origin_world: NDArray[np.float64]
@@ -48,6 +55,9 @@ class WallFrame:
     width: int
     height: int
     map_crs: str | None = None
+    up: tuple[float, float, float] | None = None
+    name: str = ""
+    left_m: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
@@ -67,11 +77,56 @@ class WallFrame:
         return self.height, self.width
 
     @property
+    def raster_axes(self) -> RasterAxes:
+        """What X and Y of the raster's files are; this is the only place that decides it.
+
+        An upright wall has metres along it and heights, exact at its top edge; floors and ceilings
+        have the world's horizontal axes, ceilings with rows that go north, so that they lie over
+        the floor; sloping planes, and rasters whose up is unknown, count from the top-left corner.
+        """
+        if self.map_crs is not None:
+            return "map"
+        if self.up is None:
+            return "plane"
+        if -float(self.v_world @ self.up) >= _LEAST_COSINE:
+            return "wall"
+        first = basis_from_up(np.array(self.up))[0]
+        is_level = abs(float(self.normal_world @ self.up)) >= _LEAST_COSINE
+        return "level" if is_level and float(self.u_world @ first) >= _LEAST_COSINE else "plane"
+
+    @property
     def raster_corner_m(self) -> tuple[float, float]:
-        """X and Y of the outer corner of the top-left cell in the raster's GeoTIFF."""
-        if self.map_crs is None:
+        """X and Y of the outer corner of the top-left cell in the raster's files."""
+        axes = self.raster_axes
+        if axes == "map":
+            return float(self.origin_world[0]), float(self.origin_world[1])
+        if axes == "plane" or self.up is None:
             return 0.0, 0.0
-        return float(self.origin_world[0]), float(self.origin_world[1])
+        first, second, height = (basis_from_up(np.array(self.up)) @ self.origin_world).tolist()
+        return (self.left_m, height) if axes == "wall" else (first, second)
+
+    @property
+    def raster_down(self) -> float:
+        """Change of Y per metre down the rows: -1, but 1 for ceilings, seen from below."""
+        if self.up is None or self.raster_axes != "level":
+            return -1.0
+        return 1.0 if float(self.normal_world @ self.up) < 0.0 else -1.0
+
+    @property
+    def crs(self) -> str:
+        """Name of the coordinate system of the raster's files: that of the map, or the wall's own.
+
+        The latter holds the wall's name and a number made of where X = Y = 0 lies in the world, so
+        that rasters and parts of one wall share it and no two walls do.
+        """
+        if self.map_crs is not None:
+            return self.map_crs
+        zero = self.world_from_wall(self.wall_from_raster(np.zeros((1, 2))))[0]
+        # Whole millimetres of the place, and axes to a millionth.
+        axes = np.concatenate([self.u_world, self.v_world])
+        place = [*np.round(1e3 * zero), *np.round(1e6 * axes)]
+        digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
+        return f"{self.name or 'plane'} {digest[:8]}"
 
     @property
     def plane(self) -> Plane:
@@ -110,13 +165,13 @@ class WallFrame:
         )
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X and Y (n, 2), metres, in the raster's GeoTIFF of wall positions (n, 2)."""
-        return np.array(self.raster_corner_m) + (self.gsd_m * pixels_wall * [1.0, -1.0])
+        """X and Y (n, 2), metres, in the raster's files of wall positions (n, 2)."""
+        return np.array(self.raster_corner_m) + self.gsd_m * pixels_wall * [1.0, self.raster_down]
 
     def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Wall positions (n, 2) = (column, row) of X and Y (n, 2) in the raster's GeoTIFF."""
+        """Wall positions (n, 2) = (column, row) of X and Y (n, 2) in the raster's files."""
         pixels: NDArray[np.float64] = (
-            (places_m - np.array(self.raster_corner_m)) * [1.0, -1.0] / self.gsd_m
+            (places_m - np.array(self.raster_corner_m)) * [1.0, self.raster_down] / self.gsd_m
         )
         return pixels
 

@@ -44,8 +44,8 @@ class Opening:
         wall_name: what the wall is called.
         kind: `through` (the laser saw what lies behind the wall), `niche` (its back was measured)
             or `no data` (nothing came back).
-        outline_m: (n, 2) float64 X and Y as the wall's GeoTIFF has them (metres from its top-left
-            corner, Y upwards, or east and north of a map), counter-clockwise, not closed.
+        outline_m: (n, 2) float64 X and Y as the wall's GeoTIFF has them (metres along the wall and
+            height, or east and north of a map), counter-clockwise, not closed.
         outline_world: (n, 3) float64 metres, the same corners on the wall's plane.
         side_sigma_m: (n,) float64 standard deviation of each side, across it, from corner i to the
             next; NaN for sides that nobody saw.
@@ -56,7 +56,7 @@ class Opening:
         sill_m: height of its lowest corner above the lower edge of the wall's raster.
         seen_share: share of the outline along which the wall beside it was measured.
         depth_m: how far the back lies behind the wall's face, median; None where none was measured.
-        map_crs: coordinate system of `outline_m` where the wall's raster is a map.
+        crs: coordinate system of `outline_m`, as `WallFrame.crs`.
     """
 
     wall: int
@@ -72,7 +72,7 @@ class Opening:
     sill_m: float
     seen_share: float
     depth_m: float | None = None
-    map_crs: str | None = None
+    crs: str = "plane"
 
     def __post_init__(self) -> None:
         count = len(self.outline_m)

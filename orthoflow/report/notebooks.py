@@ -356,7 +356,7 @@ class WallImage:
         return self.image.frame
 
     def to_xarray(self) -> Any:  # Any: of a library that need not be there
-        """Give an `xarray.DataArray` with metres along the wall, y upwards, as the GeoTIFF has.
+        """Give an `xarray.DataArray` with x along the wall and y as heights, as the GeoTIFF has.
 
         Its coordinate `is_shown` (y, x) tells cells that are black from those that show nothing.
 
@@ -369,11 +369,12 @@ class WallImage:
             raise PluginError("to_xarray needs xarray: pip install xarray") from error
         frame = self.frame
         left, top = frame.raster_corner_m
+        down_m = frame.raster_down * frame.gsd_m
         return xarray.DataArray(
             self.rgb,
             dims=("y", "x", "band"),
             coords={
-                "y": ("y", top - frame.gsd_m * (np.arange(frame.height) + 0.5), {"units": "m"}),
+                "y": ("y", top + down_m * (np.arange(frame.height) + 0.5), {"units": "m"}),
                 "x": ("x", left + frame.gsd_m * (np.arange(frame.width) + 0.5), {"units": "m"}),
                 "band": ["red", "green", "blue"],
                 "is_shown": (("y", "x"), self.is_shown),

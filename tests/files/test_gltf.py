@@ -14,7 +14,7 @@ import trimesh
 from PIL import Image
 
 from orthoflow.files import gltf
-from orthoflow.files.geotiff import write_raster
+from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.files.gltf import write_page, write_room
 from tests.browser import Page
 from tests.ortho_file_scenes import CORNER, FLOOR_SHAPE, GSD_M, UP, WALL_SHAPE, colours, room
@@ -48,7 +48,7 @@ def carved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         depth_m = np.zeros(ortho.frame.shape, dtype=np.float32)
         depth_m[:, ortho.frame.width // 2 :] = 1.0
         depths[ortho.wall] = folder / f"depth_{ortho.wall}.tif"
-        write_raster(depths[ortho.wall], depth_m, gsd_m=GSD_M, tags={})
+        write_raster(depths[ortho.wall], depth_m, place=GridPlace(gsd_m=GSD_M), tags={})
     write_room(folder / "room.glb", orthos, UP, depths)
     return folder / "room.glb"
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files import ortho_files as module
-from orthoflow.files.geotiff import write_orthoimage, write_raster
+from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
 from orthoflow.files.ortho_files import OrthoFile, ortho_files
 from orthoflow.geometry import WallFrame
 
@@ -35,7 +35,7 @@ def frame(rows: int = ROWS, columns: int = COLUMNS) -> WallFrame:
 def ortho(folder: Path, rgb: NDArray[np.uint8 | np.uint16] = RGB) -> OrthoFile:
     path = folder / "wall_0_ortho.tif"
     shown = SHOWN[: len(rgb)]
-    write_orthoimage(path, rgb, shown, gsd_m=0.5, tags={})
+    write_orthoimage(path, rgb, shown, place=GridPlace(gsd_m=0.5), tags={})
     return OrthoFile(path=path, wall=0, name="wall 0", frame=frame(*rgb.shape[:2]), digest="")
 
 
@@ -97,6 +97,8 @@ def test_pictures_of_sixteen_bits_have_eight_of_them(tmp_path: Path) -> None:
 
 def test_depths_are_no_colours(tmp_path: Path) -> None:
     one = ortho(tmp_path)
-    write_raster(one.path, np.zeros((ROWS, COLUMNS), np.float32), gsd_m=0.5, tags={})
+    write_raster(
+        one.path, np.zeros((ROWS, COLUMNS), np.float32), place=GridPlace(gsd_m=0.5), tags={}
+    )
     with pytest.raises(InputError, match=r"ortho\.tif has 1 bands of float32, expected 3 of 8 or"):
         one.shrunk(9)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.geotiff import MapPlace, read_raster, write_raster
+from orthoflow.files.geotiff import GridPlace, read_raster, write_raster
 from orthoflow.files.polygons import (
     NamedPolygon,
     filled,
@@ -111,8 +111,8 @@ def test_areas_are_drawn_along_their_cells_and_touch_at_corners_only() -> None:
     np.testing.assert_array_equal(painted, values)
 
 
-@pytest.mark.parametrize("crs", [None, "site", "EPSG:25832"])
-def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str | None) -> None:
+@pytest.mark.parametrize("crs", ["wall 0 (1f)", "site", "EPSG:25832"])
+def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str) -> None:
     from rasterio.crs import CRS
 
     ring: Any = [[[0.5, -0.5], [1.0, -0.5], [1.0, -1.0], [0.5, -0.5]]]
@@ -126,8 +126,12 @@ def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str | None)
         "product_digest": "ab12",
         "features": [area],
     }
-    place = None if crs is None else MapPlace(corner_m=(0.0, 0.0), crs=crs)
-    write_raster(tmp_path / "a.tif", np.zeros((2, 2), np.uint8), gsd_m=1.0, tags={}, place=place)
+    write_raster(
+        tmp_path / "a.tif",
+        np.zeros((2, 2), np.uint8),
+        place=GridPlace(gsd_m=1.0, crs=crs),
+        tags={},
+    )
     # As GDAL reads it; without a name it takes metres for degrees.
     raster = CRS.from_wkt(read_raster(tmp_path / "a.tif").crs_wkt)
     assert CRS.from_user_input(name).to_wkt() == raster.to_wkt()
@@ -146,7 +150,7 @@ def test_features_are_written_in_one_line_on_request(tmp_path: Path) -> None:
 def test_labels_are_outlined_and_written_alike(tmp_path: Path, dtype: type) -> None:
     labels = np.full((3, 4), -1, dtype)
     labels[1, 1:3], labels[2, 0] = 300, 0
-    write_raster(tmp_path / "a.tif", labels, gsd_m=0.5, tags={})
+    write_raster(tmp_path / "a.tif", labels, place=GridPlace(gsd_m=0.5), tags={})
     raster = read_raster(tmp_path / "a.tif")
     assert raster.values.dtype == dtype
     np.testing.assert_array_equal(raster.values, labels)

@@ -13,6 +13,7 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files import geotiff, images, publishing
+from orthoflow.files.geotiff import GridPlace
 from orthoflow.files.sidecars import frame_of_raster, number, numbers
 from orthoflow.products import (
     Camera,
@@ -30,7 +31,9 @@ from tests import samples
 
 DIGEST = "sha256:" + "ab" * 32
 UP = np.array([0.0, 0.0, 1.0])
-FRAME = samples.facing_east(0.5, 3, 2, (10.0, 20.0, 30.0))
+FRAME = replace(
+    samples.facing_east(0.5, 3, 2, (10.0, 20.0, 30.0)), up=(0.0, 0.0, 1.0), name="north"
+)
 PLACED: dict[str, Any] = {
     "origin_world": [10.0, 20.0, 30.0],
     "u_world": [0.0, 1.0, 0.0],
@@ -49,20 +52,26 @@ PLACED: dict[str, Any] = {
     "raster": {
         "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
         "depth_m * normal_world; v_world points down, cell centres lie at .5",
-        "geotiff": "X = gsd_m * column, Y = -gsd_m * row, pixel is area",
+        "geotiff": "X = x_of_left_m + gsd_m * column (metres along the wall from its left edge), "
+        "Y = height_of_top_m - gsd_m * row (height along up_world); pixel is area",
     },
+    "up_world": [0.0, 0.0, 1.0],
+    "x_of_left_m": 0.0,
+    "height_of_top_m": 30.0,
+    "crs": FRAME.crs,
 }
 TAGS = {
     "AREA_OR_POINT": "Area",
-    "frame": '{"normal_world": [1.0, 0.0, 0.0], "origin_world": [10.0, 20.0, 30.0], '
-    '"u_world": [0.0, 1.0, 0.0], "v_world": [0.0, 0.0, -1.0]}',
+    "frame": '{"height_of_top_m": 30.0, "normal_world": [1.0, 0.0, 0.0], "origin_world": '
+    '[10.0, 20.0, 30.0], "u_world": [0.0, 1.0, 0.0], "up_world": [0.0, 0.0, 1.0], "v_world": '
+    '[0.0, 0.0, -1.0], "x_of_left_m": 0.0}',
     "gsd_m": "0.5",
     "plane": '{"normal": [1.0, 0.0, 0.0], "offset_m": 10.0}',
     "product_digest": DIGEST,
     "software": "orthoflow",
 }
 # One pixel is a cell: its size, and the centre of the first one.
-WORLD_FILE = "0.5\n0.0\n0.0\n-0.5\n0.25\n-0.25\n"
+WORLD_FILE = "0.5\n0.0\n0.0\n-0.5\n0.25\n29.75\n"
 
 
 def json_of(path: Path) -> Any:
@@ -174,7 +183,7 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.values, DEPTH)
     np.testing.assert_array_equal(read.shown, np.isfinite(DEPTH))
     assert read.tags == {**TAGS, "content": content, "name": "north", "unit": "m"}
-    assert (read.gsd_m, read.corner_m, read.overviews, read.layout) == (0.5, (0.0, 0.0), (), "")
+    assert (read.gsd_m, read.corner_m, read.overviews, read.layout) == (0.5, (0.0, 30.0), (), "")
     assert (tmp_path / "wall_2_depth.pgw").read_text() == WORLD_FILE
     # From the 1st percentile of 0, 1, 2, 3, 4, black, to the 99th, white; the void is transparent.
     grey = np.array([[0, 63, 128], [0, 192, 255]])
@@ -340,7 +349,9 @@ def test_cameras_and_ties_are_told_completely(tmp_path: Path) -> None:
 
 def test_a_part_of_a_raster_lies_where_its_corner_says() -> None:
     whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
-    part = frame_of_raster(whole, corner_m=(1.0, -0.5), gsd_m=0.25, shape=(4, 5), name="a.tif")
+    part = frame_of_raster(
+        whole, raster=GridPlace(gsd_m=0.25, corner_m=(1.0, -0.5)), shape=(4, 5), name="a.tif"
+    )
     np.testing.assert_array_equal(part.origin_world, [10.0, 21.0, 29.5])
     assert (part.gsd_m, part.width, part.height) == (0.25, 5, 4)
 
@@ -361,14 +372,16 @@ def test_vectors_that_are_none_are_named(key: str, given: object) -> None:
     whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
     with pytest.raises(InputError) as caught:
         frame_of_raster(
-            whole | {key: given}, corner_m=(0.0, 0.0), gsd_m=0.5, shape=(2, 3), name="a.json"
+            whole | {key: given},
+            raster=GridPlace(gsd_m=0.5, corner_m=(0.0, 0.0)),
+            shape=(2, 3),
+            name="a.json",
         )
     assert str(caught.value) == f"a.json: {key} must be three numbers below 1e+09, got {given!r}"
     with pytest.raises(InputError, match=r"^a\.json: "):
         frame_of_raster(
             whole | {"u_world": [0.0, 2.0, 0.0]},
-            corner_m=(0.0, 0.0),
-            gsd_m=0.5,
+            raster=GridPlace(gsd_m=0.5, corner_m=(0.0, 0.0)),
             shape=(2, 3),
             name="a.json",
         )

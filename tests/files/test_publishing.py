@@ -327,13 +327,15 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(
 
 def test_rasters_of_a_wrong_type_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match=r"a\.tif takes a flat raster of float32, int16"):
-        geotiff.write_raster(tmp_path / "a.tif", np.zeros((2, 2)), gsd_m=1.0, tags={})
+        geotiff.write_raster(
+            tmp_path / "a.tif", np.zeros((2, 2)), place=geotiff.GridPlace(gsd_m=1.0), tags={}
+        )
     with pytest.raises(ProductError, match=r"a\.tif takes RGB of 8 or 16 bits and a mask of"):
         geotiff.write_orthoimage(
             tmp_path / "a.tif",
             np.zeros((2, 2, 3), np.uint8),
             np.zeros((3, 2), np.bool_),
-            gsd_m=1.0,
+            place=geotiff.GridPlace(gsd_m=1.0),
             tags={},
         )
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from orthoflow.errors import InputError
-from orthoflow.files.geotiff import MapPlace, write_orthoimage, write_raster
+from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
 from orthoflow.files.raster_places import place_of
 from tests import photo_files
 
@@ -17,9 +17,9 @@ from tests import photo_files
 def test_a_raster_in_a_map_lies_on_earth(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     # On the central meridian of zone 32, nine degrees east.
-    place = MapPlace(corner_m=(499_990.0, 5_334_000.0), crs="EPSG:25832")
+    place = GridPlace(gsd_m=2.5, corner_m=(499_990.0, 5_334_000.0), crs="EPSG:25832")
     rgb = np.zeros((4, 8, 3), np.uint8)
-    write_orthoimage(path, rgb, np.ones((4, 8), np.bool_), gsd_m=2.5, tags={}, place=place)
+    write_orthoimage(path, rgb, np.ones((4, 8), np.bool_), place=place, tags={})
     found = place_of(path)
     assert found.shape == (4, 8)
     assert_allclose(found.transform, (2.5, 0.0, 499_990.0, 0.0, -2.5, 5_334_000.0))
@@ -40,10 +40,10 @@ def test_a_raster_in_a_map_lies_on_earth(tmp_path: Path) -> None:
 
 def test_a_raster_in_the_plane_of_its_wall_is_no_place_on_earth(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
-    write_raster(path, np.zeros((2, 3), np.float32), gsd_m=0.5, tags={})
+    write_raster(path, np.zeros((2, 3), np.float32), place=GridPlace(gsd_m=0.5), tags={})
     found = place_of(path)
     assert (found.epsg, found.outline_lonlat) == (None, ())
-    assert found.wkt2.startswith('ENGCRS["plane of the wall, metres"')
+    assert found.wkt2.startswith('ENGCRS["plane, metres"')
     assert (found.shape, found.bands) == ((2, 3), ("float32",))
     assert found.bounds == (0.0, -1.0, 1.5, 0.0)
 

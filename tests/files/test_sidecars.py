@@ -12,6 +12,7 @@ import pytest
 
 from orthoflow.errors import InputError, StoreError
 from orthoflow.files import sidecars
+from orthoflow.files.geotiff import GridPlace
 from orthoflow.geometry import WallFrame
 from orthoflow.products import LayerMask, OrthoMask, SurfaceMask
 
@@ -29,7 +30,7 @@ def vectors(**changes: object) -> dict[str, object]:
 
 def placed(content: dict[str, object], corner_m: tuple[float, float] = (0.0, 0.0)) -> WallFrame:
     return sidecars.frame_of_raster(
-        content, corner_m=corner_m, gsd_m=0.5, shape=(2, 4), name="a.json"
+        content, raster=GridPlace(gsd_m=0.5, corner_m=corner_m), shape=(2, 4), name="a.json"
     )
 
 
@@ -146,7 +147,10 @@ def test_tags_place_a_raster_without_the_file_beside_it(map_crs: str | None) -> 
     content = json.loads(tags["frame"])
     assert content.get("map_crs") == map_crs
     assert sidecars.frame_of_raster(
-        content, corner_m=frame.raster_corner_m, gsd_m=0.5, shape=(2, 4), name="a.tif"
+        content,
+        raster=GridPlace(gsd_m=0.5, corner_m=frame.raster_corner_m),
+        shape=(2, 4),
+        name="a.tif",
     ).has_cells_of(frame)
 
 

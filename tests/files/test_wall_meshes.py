@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files import wall_meshes as module
-from orthoflow.files.geotiff import write_raster
+from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.files.wall_meshes import WallMesh, flat_mesh, relief_mesh
 from orthoflow.geometry import WallFrame
 from tests import samples
@@ -30,7 +30,7 @@ def slope() -> NDArray[np.float32]:
 
 
 def relief(folder: Path, depths_m: NDArray[np.float32], of: WallFrame | None = None) -> WallMesh:
-    write_raster(folder / "depth.tif", depths_m, gsd_m=GSD_M, tags={})
+    write_raster(folder / "depth.tif", depths_m, place=GridPlace(gsd_m=GSD_M), tags={})
     return relief_mesh(of or frame(*depths_m.shape), folder / "depth.tif")
 
 

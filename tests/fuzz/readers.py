@@ -29,7 +29,7 @@ from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_t
 from orthoflow.files.containers import icc_profile, is_cut_off
 from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.files.exif import focal_length, read_exif
-from orthoflow.files.geotiff import write_orthoimage
+from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp
 from orthoflow.files.sidecars import frame_json, write_json
 from orthoflow.geometry import WallFrame
@@ -251,7 +251,9 @@ def _frame() -> WallFrame:
 
 def _write_image(path: Path) -> None:
     shown = np.ones((48, 64), dtype=np.bool_)
-    write_orthoimage(path, photo_files.picture(), shown, gsd_m=0.01, tags={"name": "wall"})
+    write_orthoimage(
+        path, photo_files.picture(), shown, place=GridPlace(gsd_m=0.01), tags={"name": "wall"}
+    )
 
 
 @cache

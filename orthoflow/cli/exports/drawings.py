@@ -96,7 +96,7 @@ def _drawing(
     return WallDrawing(
         number=wall.number,
         rasters={kind: wall.rasters[kind] for kind in kinds},
-        axes=axes_of(wall.frame, None if planes is None else planes.up),
+        axes=axes_of(wall.frame),
         plan=None if planes is None else key_plan(planes, wall.frame),
         text=text,
         scale=scale,
@@ -109,9 +109,11 @@ def _drawing(
 
 def _areas(results: RoomResults, wall: WallResult) -> tuple[MarkedArea, ...]:
     """Openings of a wall, from the top-left corner of its raster."""
-    corner_m = wall.frame.raster_corner_m
+    frame = wall.frame
     return tuple(
-        MarkedArea(text=opening.said, outline_m=(opening.outline_m - corner_m) * [1.0, -1.0])
+        MarkedArea(
+            text=opening.said, outline_m=frame.gsd_m * frame.wall_from_raster(opening.outline_m)
+        )
         for opening in results.openings_of(wall)
     )
 

@@ -53,7 +53,9 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     if wall.image:
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
         size = (frame.width * frame.gsd_m, frame.height * frame.gsd_m)
-        space.add_image(definition, tuple(corners[1]), size, dxfattribs={"layer": "IMAGE"})
+        image = space.add_image(definition, tuple(corners[1]), size, dxfattribs={"layer": "IMAGE"})
+        # The rows of a ceiling go up along Y.
+        image.dxf.v_pixel = (0.0, -frame.raster_down * frame.gsd_m, 0.0)
     for opening in wall.openings:
         _add_polygon(space, opening.outline_m, "OPENINGS")
         left, top = opening.outline_m[:, 0].min(), opening.outline_m[:, 1].max()
@@ -78,7 +80,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
         for residuals in lines.residuals:
             own = residuals.wall == wall.number
             begins = wall.place_m(residuals.points_world[own])
-            shifts = residuals.displacement_m[own] * [1.0, -1.0]
+            shifts = residuals.displacement_m[own] * [1.0, frame.raster_down]
             _add_residuals(space, residuals, begins, begins + residuals.times * shifts)
     save_document(document, path)
 

@@ -42,7 +42,7 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
             places = wall.place_m(lines.checkpoints.points_world[near])
             features += _points([lines.checkpoints.names[index] for index in near], places)
     features += [opening_feature(opening, place) for place, opening in enumerate(wall.openings)]
-    write_features(path, features, wall.frame.map_crs)
+    write_features(path, features, wall.frame.crs)
 
 
 def write_seams_geojson(path: Path, image: Orthoimage) -> None:
@@ -61,7 +61,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
         about: dict[str, JsonValue] = {"photo": image.sources[index], "wall": image.number}
         geometry: dict[str, JsonValue] = {"type": "Polygon", "coordinates": places}
         features.append({"type": "Feature", "properties": about, "geometry": geometry})
-    write_features(path, features, image.frame.map_crs, indent=None)
+    write_features(path, features, image.frame.crs, indent=None)
 
 
 def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:

@@ -46,23 +46,23 @@ _BEHIND: Final = (0.05, 0.30, 0.75)
 _OPENING: Final = (0.0, 0.40, 0.45)
 
 
-def axes_of(frame: WallFrame, up: NDArray[np.float64] | None) -> Axes:
-    """Coordinates of a raster: of its map, or along the wall and height, or in its plane."""
-    if frame.map_crs is not None:
-        east, north = frame.raster_corner_m
-        return Axes(
-            across=(east, 1.0), down=(north, -1.0), said=f"X east, Y north ({frame.map_crs}), m"
-        )
-    if up is not None and float(frame.v_world @ up) < -math.cos(math.radians(1.0)):
-        height = float(frame.origin_world @ up)
-        said = f"X along the wall from the image's left edge, H height: {_axis_words(up)}, m"
-        return Axes(across=(0.0, 1.0), down=(height, float(frame.v_world @ up)), said=said)
-    said = "X to the right and Y upwards from the top-left corner of the orthoimage, m"
-    return Axes(across=(0.0, 1.0), down=(0.0, -1.0), said=said)
+def axes_of(frame: WallFrame) -> Axes:
+    """Coordinates of a raster, those of its GeoTIFF."""
+    left_m, top_m = frame.raster_corner_m
+    said = {
+        "map": f"X east, Y north ({frame.map_crs}), m",
+        "wall": "X along the wall from its left edge, H height: "
+        f"{_axis_words(np.array(frame.up))}, m",
+        "level": "X and Y: the horizontal axes of the scan, m",
+        "plane": "X to the right and Y upwards from the top-left corner of the orthoimage, m",
+    }[frame.raster_axes]
+    return Axes(across=(left_m, 1.0), down=(top_m, frame.raster_down), said=said)
 
 
 def _axis_words(up: NDArray[np.float64]) -> str:
     """Say which of the scan's axes heights count along, backwards or not."""
+    if up.shape != (3,):
+        return "unknown"
     axis = int(np.argmax(np.abs(up)))
     if abs(float(up[axis])) < 1.0 - 1e-9:
         return f"along ({', '.join(f'{value:.3f}' for value in up.tolist())}) of the scan"

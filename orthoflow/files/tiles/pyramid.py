@@ -185,5 +185,7 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "v": numbers(frame.v_world),
         # X and Y as in the GeoTIFF.
         "corner": list(frame.raster_corner_m),
-        "crs": frame.map_crs,
+        "down": frame.raster_down,
+        "axes": "E, N" if frame.map_crs else "X, H" if frame.raster_axes == "wall" else "X, Y",
+        "crs": frame.crs,
     }

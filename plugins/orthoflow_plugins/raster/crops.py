@@ -64,6 +64,7 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> CroppedFrame | None:
         origin_world=frame.world_from_wall(first[None].astype(np.float64))[0],
         width=int(width),
         height=int(height),
+        left_m=frame.left_m + float(first[0]) * frame.gsd_m,
     )
     is_polygon = np.ndim(crop) == 2
     return CroppedFrame(frame=part, outline_px=outline_px - first if is_polygon else None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -154,7 +154,9 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
     down = _unit(corners[1] - corners[0])
     steps = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
     widened = corners + margin_m * (steps[:, :1] * right + steps[:, 1:] * down)
-    return frame_over(widened, planes.normal[index], gsd_m=gsd_m)
+    frame = frame_over(widened, planes.normal[index], gsd_m=gsd_m)
+    east, north, top = planes.up.tolist()
+    return replace(frame, up=(east, north, top), name=planes.names[index])
 
 
 def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> float:

@@ -31,8 +31,9 @@ class ReadOrthoimage(Method):
     Where that plane lies in the world says a JSON file of the same name among the input's files
     (`wall.tif`, `wall.json`), with `origin_world`, `u_world`, `v_world`, `normal_world` as beside
     every raster that orthoflow writes: a copy of `wall_0_intensity.json` will do. Files of
-    orthoflow itself need none. X and Y of the GeoTIFF count from that origin, so another size,
-    cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall
+    orthoflow itself need none. X and Y of the GeoTIFF are those of orthoflow's own: at that origin
+    they are `x_of_left_m` and `height_of_top_m`, 0 where the JSON file has neither. So another
+    size, cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall
     it is of: the place of its plane in `planes.json`, which names of files have too.
     """
 
@@ -108,8 +109,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
     shown = raster.shown if raster.shown.ndim == 2 else raster.shown[..., 0]
     frame = frame_of_raster(
         place,
-        corner_m=raster.corner_m,
-        gsd_m=raster.gsd_m,
+        raster=raster.place,
         shape=(rgb.shape[0], rgb.shape[1]),
         name=path.name,
     )

@@ -228,7 +228,7 @@ def _opening(
         height_m=float(spans_m[1]),
         sill_m=frame.gsd_m * float(frame.height - cells[:, 1].max()),
         seen_share=outline.seen_of_all,
-        map_crs=frame.map_crs,
+        crs=frame.crs,
     )
 
 

@@ -35,6 +35,8 @@ from tests.drawing_runs import (
 )
 from tests.report_runs import cell, given, metrics
 
+# Height of the top edge of the wall's raster.
+TOP_M = 102.4
 MM = 25.4 / 72.0
 WIDE_M, HIGH_M = SIZE_M[0] - 2 * GAP_M, SIZE_M[2] - 2 * GAP_M
 
@@ -337,7 +339,7 @@ def test_cad_files_have_no_errors_and_name_their_pictures_beside_them(
 def test_the_picture_lies_on_its_wall_to_scale(drawn: Path) -> None:
     space = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace()
     (image,) = space.query("IMAGE")
-    assert tuple(image.dxf.insert)[:2] == pytest.approx((0.0, -HIGH_M), abs=1e-9)
+    assert tuple(image.dxf.insert)[:2] == pytest.approx((0.0, TOP_M - HIGH_M), abs=1e-9)
     assert tuple(image.dxf.u_pixel) == pytest.approx((GSD_M, 0.0, 0.0), abs=1e-12)
     assert tuple(image.dxf.v_pixel) == pytest.approx((0.0, GSD_M, 0.0), abs=1e-12)
     picture = np.asarray(Image.open(drawn / f"wall_{WALL}_ortho.png"))
@@ -361,9 +363,10 @@ def test_a_wall_has_its_edges_points_and_residuals_in_metres(drawn: Path) -> Non
         for edge in edges
         for value in (edge[0] if np.ptp(edge[:, 0]) < 1e-6 else edge[0][::-1])[:1]
     )
-    assert sides == pytest.approx(sorted([-GAP_M, WIDE_M + GAP_M, GAP_M, -HIGH_M - GAP_M]))
+    beside = [-GAP_M, WIDE_M + GAP_M, TOP_M + GAP_M, TOP_M - HIGH_M - GAP_M]
+    assert sides == pytest.approx(sorted(beside))
     points = [tuple(point.dxf.location)[:2] for point in space.query("POINT")]
-    assert points == [pytest.approx((1.0, -1.0)), pytest.approx((2.0, -1.0))]
+    assert points == [pytest.approx((1.0, TOP_M - 1.0)), pytest.approx((2.0, TOP_M - 1.0))]
     shifts = [
         np.array(line.dxf.end - line.dxf.start)[:2]
         for line in space.query('LINE[layer=="RESIDUALS"]')
@@ -432,7 +435,7 @@ def test_openings_are_outlined_on_sheets_in_scale(sheet: pdfplumber.page.Page) -
     # Beside the orthoimage its depth, with the same.
     assert len(outlines) == 2
     first = min(outlines, key=lambda box: float(box["x0"]))
-    left, top = opening.outline_m[0] * [20.0, -20.0]
+    left, top = (opening.outline_m[0] - [0.0, TOP_M]) * [20.0, -20.0]
     assert (first["x0"] - ortho["x0"]) * MM == pytest.approx(left, abs=0.01)
     assert (first["top"] - ortho["top"]) * MM == pytest.approx(top, abs=0.01)
     assert first["width"] * MM == pytest.approx(20 * opening.width_m, abs=0.01)
@@ -466,7 +469,7 @@ def test_vectors_are_geojson_of_rings_and_lines(run: Path, tmp_path: Path) -> No
     wall = json.loads((tmp_path / "out" / f"wall_{WALL}.geojson").read_text())
     (frame,) = [f for f in wall["features"] if f["properties"]["kind"] == "frame"]
     corners = np.array(frame["geometry"]["coordinates"][0])
-    expected = [[0, 0], [0, -HIGH_M], [WIDE_M, -HIGH_M], [WIDE_M, 0], [0, 0]]
-    np.testing.assert_allclose(corners, expected, atol=1e-6)
+    expected = np.array([[0, 0], [0, -HIGH_M], [WIDE_M, -HIGH_M], [WIDE_M, 0], [0, 0]])
+    np.testing.assert_allclose(corners, expected + np.array([0.0, TOP_M]), atol=1e-6)
     edges = [f for f in wall["features"] if f["properties"]["kind"] == "edge"]
     assert sorted(f["properties"]["planes"] for f in edges) == [[0, 2], [1, 2], [2, 3], [2, 5]]

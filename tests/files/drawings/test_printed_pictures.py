@@ -15,7 +15,7 @@ from orthoflow.files.drawings.printed_pictures import (
     stretch_of,
     write_picture,
 )
-from orthoflow.files.geotiff import RasterParts, write_orthoimage, write_raster
+from orthoflow.files.geotiff import GridPlace, RasterParts, write_orthoimage, write_raster
 from orthoflow.files.images import decode_image
 
 WHOLE = Part(left_m=0.0, top_m=0.0, right_m=1.0, bottom_m=0.5)
@@ -30,7 +30,7 @@ def test_cells_are_kept_as_they_are_where_print_shows_them(tmp_path: Path) -> No
     rgb = ramp(50, 100)
     shown = np.ones((50, 100), dtype=np.bool_)
     shown[:5] = False
-    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.01, tags={})
+    write_orthoimage(tmp_path / "a.tif", rgb, shown, place=GridPlace(gsd_m=0.01), tags={})
     assert write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20) == (50, 100)
     picture = decode_image(picture_file(tmp_path / "p").read_bytes())
     np.testing.assert_array_equal(picture[5:], rgb[5:])
@@ -39,7 +39,9 @@ def test_cells_are_kept_as_they_are_where_print_shows_them(tmp_path: Path) -> No
 
 def test_a_part_has_the_cells_of_its_place(tmp_path: Path) -> None:
     rgb = ramp(50, 100)
-    write_orthoimage(tmp_path / "a.tif", rgb, np.ones((50, 100), np.bool_), gsd_m=0.01, tags={})
+    write_orthoimage(
+        tmp_path / "a.tif", rgb, np.ones((50, 100), np.bool_), place=GridPlace(gsd_m=0.01), tags={}
+    )
     part = Part(left_m=0.2, top_m=0.1, right_m=0.5, bottom_m=0.3)
     assert write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=20) == (20, 30)
     picture = decode_image(picture_file(tmp_path / "p").read_bytes())
@@ -50,7 +52,7 @@ def test_finer_cells_than_print_shows_are_averaged_to_400_per_inch(tmp_path: Pat
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (1000, 2000, 3), dtype=np.uint8)
     shown = np.ones((1000, 2000), np.bool_)
-    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.0005, tags={})
+    write_orthoimage(tmp_path / "a.tif", rgb, shown, place=GridPlace(gsd_m=0.0005), tags={})
     # 1 m at 1:50 is 20 mm: 0.787 inches, 315 pixels of 6.35 cells.
     shape = write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=50)
     assert shape == (158, 315)
@@ -65,7 +67,9 @@ def test_large_pictures_are_jpeg_with_the_colours_they_had(
 ) -> None:
     rgb = np.empty((300, 400, 3), dtype=np.uint8)
     rgb[:, :200], rgb[:, 200:] = (200, 40, 90), (10, 220, 30)
-    write_orthoimage(tmp_path / "a.tif", rgb, np.ones((300, 400), np.bool_), gsd_m=0.1, tags={})
+    write_orthoimage(
+        tmp_path / "a.tif", rgb, np.ones((300, 400), np.bool_), place=GridPlace(gsd_m=0.1), tags={}
+    )
     part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
     for lossless_px, suffix in ((120_000, ".png"), (119_999, ".jpg")):
         monkeypatch.setattr(printed_pictures, "_LOSSLESS_PX", lossless_px)
@@ -81,7 +85,7 @@ def test_large_pictures_are_jpeg_with_the_colours_they_had(
 def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
     values = np.tile(np.linspace(0.0, 1.0, 101, dtype=np.float32)[:100], (50, 1))
     values[:, :10] = np.nan
-    write_raster(tmp_path / "a.tif", values, gsd_m=0.01, tags={})
+    write_raster(tmp_path / "a.tif", values, place=GridPlace(gsd_m=0.01), tags={})
     stretch = stretch_of(tmp_path / "a.tif")
     low, high = np.nanpercentile(values, (2, 98))
     assert (stretch.low, stretch.high) == (pytest.approx(low), pytest.approx(high))
@@ -93,7 +97,9 @@ def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
 
 
 def test_grey_of_a_wall_that_nobody_saw_is_white(tmp_path: Path) -> None:
-    write_raster(tmp_path / "a.tif", np.full((5, 10), np.nan, "f4"), gsd_m=0.1, tags={})
+    write_raster(
+        tmp_path / "a.tif", np.full((5, 10), np.nan, "f4"), place=GridPlace(gsd_m=0.1), tags={}
+    )
     stretch = stretch_of(tmp_path / "a.tif")
     assert (stretch.low, stretch.high) == (0.0, 1.0)
     write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20)
@@ -104,7 +110,9 @@ def test_grey_of_a_wall_that_nobody_saw_is_white(tmp_path: Path) -> None:
 def test_contours_of_a_slope_are_where_it_has_their_depth(tmp_path: Path) -> None:
     # Depth grows by 0.2 m over a metre to the right.
     slope = 0.2 * (np.arange(200, dtype=np.float32) + 0.5) / 200.0
-    write_raster(tmp_path / "a.tif", np.tile(slope, (100, 1)), gsd_m=0.005, tags={})
+    write_raster(
+        tmp_path / "a.tif", np.tile(slope, (100, 1)), place=GridPlace(gsd_m=0.005), tags={}
+    )
     found = contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05)
     assert [level for level, _ in found] == pytest.approx([0.025, 0.075, 0.125, 0.175])
     for level, points in found:
@@ -116,7 +124,12 @@ def test_contours_of_a_slope_are_where_it_has_their_depth(tmp_path: Path) -> Non
 @pytest.mark.parametrize("n_rows", [1, 2, 3])
 def test_two_rows_are_enough_for_a_contour_between_them(tmp_path: Path, n_rows: int) -> None:
     rows = np.array([0.0, 0.1, 0.1], dtype=np.float32)[:n_rows]
-    write_raster(tmp_path / "a.tif", np.repeat(rows[:, None], 40, axis=1), gsd_m=0.05, tags={})
+    write_raster(
+        tmp_path / "a.tif",
+        np.repeat(rows[:, None], 40, axis=1),
+        place=GridPlace(gsd_m=0.05),
+        tags={},
+    )
     whole = Part(left_m=0.0, top_m=0.0, right_m=2.0, bottom_m=0.05 * n_rows)
     found = contours(tmp_path / "a.tif", whole, scale=10, interval_m=0.1)
     assert [level for level, _ in found] == ([] if n_rows < 2 else [0.05])
@@ -126,14 +139,14 @@ def test_two_rows_are_enough_for_a_contour_between_them(tmp_path: Path, n_rows: 
 
 def test_a_flat_wall_has_no_contours(tmp_path: Path) -> None:
     noise = np.random.default_rng(2).normal(0.0, 0.002, (100, 200)).astype(np.float32)
-    write_raster(tmp_path / "a.tif", noise, gsd_m=0.005, tags={})
+    write_raster(tmp_path / "a.tif", noise, place=GridPlace(gsd_m=0.005), tags={})
     assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05) == []
 
 
 def test_parts_of_a_raster_read_as_the_whole_does(tmp_path: Path) -> None:
     values = np.random.default_rng(3).normal(size=(700, 900)).astype(np.float32)
     values[::7] = np.nan
-    write_raster(tmp_path / "a.tif", values, gsd_m=0.01, tags={})
+    write_raster(tmp_path / "a.tif", values, place=GridPlace(gsd_m=0.01), tags={})
     with RasterParts(tmp_path / "a.tif") as source:
         assert (source.shape, source.gsd_m, source.bands) == ((700, 900), 0.01, 1)
         part, shown = source.read((100.0, 200.0, 400.0, 250.0), (50, 300))

@@ -136,8 +136,12 @@ def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="origin_world must be three numbers"):
         read(tmp_path, image, place)
     values = np.zeros((3, 4, 5), dtype=np.uint8)
-    write(image, values, Affine(0.01, 0, 0, 0, 0.01, 0))
+    write(image, values, Affine(0.01, 0, 0, 0, -0.02, 0))
     with pytest.raises(InputError, match="not square and upright"):
+        read(tmp_path, image, place)
+    image, place = foreign(tmp_path)
+    write(image, values[:3], Affine(0.01, 0, 0, 0, 0.01, 0))
+    with pytest.raises(InputError, match="its rows go up along Y"):
         read(tmp_path, image, place)
 
 
