@@ -138,12 +138,14 @@ def calibration_text(calibration: Calibration) -> str:
 
 
 def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
-    """Give the first pattern that is the photo's name, or matches it as in a shell.
+    """Return the first pattern that is the photo's name, or matches it as in a shell.
 
-    The case of letters counts. A name that holds brackets matches itself.
+    The case of letters counts. A name that holds brackets matches itself, and a name with folders
+    is also matched without them.
     """
+    names = (photo_name, photo_name.rpartition("/")[2])
     for pattern in patterns:
-        if photo_name == pattern or fnmatchcase(photo_name, pattern):
+        if pattern in names or any(fnmatchcase(name, pattern) for name in names):
             return pattern
     return None
 

@@ -1,201 +1,320 @@
-"""Look into photo files without decoding them: format, wholeness, EXIF block, colour profile."""
+"""Look into photo files without decoding them: format, page, size, EXIF, profile, transparency.
+
+Pillow reads the containers, simplejpeg (libjpeg-turbo) finds damage inside the scan data of a JPEG,
+which other decoders fill with grey or noise.
+"""
 
 from __future__ import annotations
 
-import re
-import zlib
+import io
+import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final, Literal
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, Literal
 
-from orthoflow.files.tiff_tags import read_directory
+import numpy as np
+from numpy.typing import NDArray
 
-ImageFormat = Literal["JPEG", "PNG", "TIFF"]
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+# What can be decoded; HEIC and AVIF where Pillow can.
+READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
+HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
+HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
-_EXIF_MAGIC: Final = b"Exif\x00"
-# In entropy-coded data FF 00 is a stuffed FF and FF D0..D7 are restarts; anything else is a marker.
-_MARKER: Final = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
-_END: Final = 0xD9
-_SCAN: Final = 0xDA
-_APP1: Final = 0xE1
-_APP2: Final = 0xE2
-_ICC_MAGIC: Final = b"ICC_PROFILE\x00"
-# Start of frame, all kinds; between them lie tables.
-_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_WIDTH_TAG: Final = 0x100
-_HEIGHT_TAG: Final = 0x101
-_BITS_TAG: Final = 0x102
-_ICC_TAG: Final = 34675
-# Profiles of cameras take some kilobytes; a packed one that grows beyond this is none.
-_ICC_MOST: Final = 1 << 24
-_WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD9)})
+_TIFF_MAGICS: Final = {b"II*\0": "TIFF", b"MM\0*": "TIFF", b"II+\0": "BigTIFF", b"MM\0+": "BigTIFF"}
+# First bytes of what is met under the name of a photo and is not read.
+_MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
+    (b"GIF8", "GIF"),
+    (b"BM", "BMP"),
+    (b"%PDF", "PDF"),
+    (b"8BPS", "Photoshop (PSD)"),
+    (b"\xff\x0a", "JPEG XL"),
+    (b"\0\0\0\x0cJXL ", "JPEG XL"),
+    (b"\0\0\0\x0cjP  ", "JPEG 2000"),
+    (b"\xff\x4f\xff\x51", "JPEG 2000"),
+    (b"v/1\x01", "OpenEXR"),
+    (b"FUJIFILMCCD-RAW", "camera raw (Fujifilm)"),
+    (b"IIRO", "camera raw (Olympus)"),
+    (b"IIRS", "camera raw (Olympus)"),
+    (b"MMOR", "camera raw (Olympus)"),
+    (b"IIU\0", "camera raw (Panasonic)"),
+    (b"FOVb", "camera raw (Sigma)"),
+    (b"\0MRM", "camera raw (Minolta)"),
+)
+# Of the ISO base media container: brands by format.
+_HEIC_BRANDS: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"})
+_AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
+
+_SUBFILE_TAG: Final = 254
+_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG, _ORIENTATION_TAG = 256, 257, 258, 262, 274
+_SUB_IFDS_TAG: Final = 330
+_DNG_TAG: Final = 50706
+_COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
+_MAX_PAGES: Final = 200
+# What libjpeg says of data that end, or whose codes make no sense; the rest of the photo is noise.
+_LOST_DATA: Final = ("premature end", "bad huffman code", "invalid component", "corrupt")
+_EXTRA_BYTES: Final = "extraneous bytes"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Segment:
-    """A JPEG marker or a PNG chunk, and where its content lies; a JPEG scan has none."""
+def photo_format(encoded: bytes) -> str | None:
+    """Return the format of a file by its content; None where nobody knows it.
 
-    kind: int | bytes
-    start: int
-    end: int
-
-
-def image_format(encoded: bytes) -> ImageFormat | None:
-    """Tell the format of a file by its first bytes; None for anything but JPEG, PNG and TIFF.
-
-    >>> image_format(bytes.fromhex("ffd8ffe000104a464946"))
+    >>> photo_format(bytes.fromhex("ffd8ffe000104a464946"))
     'JPEG'
     """
     if encoded.startswith(b"\xff\xd8\xff"):
         return "JPEG"
     if encoded.startswith(_PNG_MAGIC):
         return "PNG"
-    if encoded[:4] in (b"II*\x00", b"MM\x00*"):
-        return "TIFF"
+    if encoded[:4] == b"RIFF" and encoded[8:12] == b"WEBP":
+        return "WebP"
+    if encoded[4:8] == b"ftyp":
+        return _media_format(encoded)
+    if encoded[:4] in _TIFF_MAGICS:
+        return _raw_in_tiff(encoded) or _TIFF_MAGICS[encoded[:4]]
+    return next((name for magic, name in _MAGICS if encoded.startswith(magic)), None)
+
+
+def _media_format(encoded: bytes) -> str:
+    end = min(max(int.from_bytes(encoded[:4], "big"), 16), 256)
+    brands = {encoded[at : at + 4] for at in range(8, end, 4)}
+    if b"crx " in brands:
+        return "camera raw (Canon CR3)"
+    if brands & _AVIF_BRANDS:
+        return "AVIF"
+    return "HEIC" if brands & _HEIC_BRANDS else "video (MP4 or MOV)"
+
+
+def _raw_in_tiff(encoded: bytes) -> str | None:
+    """The name of the camera raw that is laid out as TIFF, else None."""
+    if encoded[8:10] == b"CR":
+        return "camera raw (Canon CR2)"
+    pages = tiff_pages(encoded)
+    for _, page in pages:
+        if _DNG_TAG in page:
+            is_raw = page.get(_PHOTOMETRIC_TAG) in (_COLOUR_FILTER_ARRAY, _LINEAR_RAW)
+            return "camera raw (DNG)" if is_raw or _SUB_IFDS_TAG in page else None
+        if page.get(_PHOTOMETRIC_TAG) == _COLOUR_FILTER_ARRAY:
+            return "camera raw"
+    # NEF, ARW, PEF: only previews in the pages, the picture itself below them.
+    if pages and all(_is_reduced(page) and _SUB_IFDS_TAG in page for _, page in pages[:1]):
+        return None if any(not _is_reduced(page) for _, page in pages) else "camera raw"
     return None
 
 
-def is_webp(encoded: bytes) -> bool:
-    """Whether a file begins as WebP, which figures are kept in; it has at most 16383 x 16383 px."""
-    return encoded[:4] == b"RIFF" and encoded[8:12] == b"WEBP"
+def tiff_pages(encoded: bytes) -> list[tuple[int, ImageFileDirectory_v2]]:
+    """Return the directories of a TIFF file with their positions, as far as they can be read."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    is_big = encoded[2:4] in (b"+\0", b"\0+")
+    header = encoded[: 16 if is_big else 8]
+    pages: list[tuple[int, ImageFileDirectory_v2]] = []
+    source = io.BytesIO(encoded)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            start = ImageFileDirectory_v2(header).next
+            while 0 < start < len(encoded) and len(pages) < _MAX_PAGES:
+                if any(start == earlier for earlier, _ in pages):
+                    break
+                source.seek(start)
+                page = ImageFileDirectory_v2(header)
+                page.load(source)
+                pages.append((start, page))
+                start = page.next
+        except Exception:  # noqa: BLE001 - Pillow raises whatever its parsing of damaged tags meets
+            return pages
+    return pages
+
+
+def _is_reduced(page: ImageFileDirectory_v2) -> bool:
+    kind = page.get(_SUBFILE_TAG)
+    return isinstance(kind, int) and bool(kind & 1)
+
+
+def _number(page: ImageFileDirectory_v2, tag: int) -> int:
+    value = page.get(tag)
+    first = value[0] if isinstance(value, tuple) and value else value
+    return int(first) if isinstance(first, int) else 0
+
+
+def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
+    """Return the page of a TIFF file that holds the photo: the largest that is no preview."""
+    pages = tiff_pages(encoded)
+    whole = [item for item in pages if not _is_reduced(item[1])] or pages
+    return max(
+        whole,
+        key=lambda item: _number(item[1], _WIDTH_TAG) * _number(item[1], _HEIGHT_TAG),
+        default=None,
+    )
+
+
+def count_pages(encoded: bytes) -> int:
+    """Return how many pages of a TIFF file are no previews; 1 for another format."""
+    if encoded[:4] not in _TIFF_MAGICS:
+        return 1
+    return max(1, sum(not _is_reduced(page) for _, page in tiff_pages(encoded)))
+
+
+def as_decoded(encoded: bytes, *, is_upright: bool = True) -> bytes:
+    """Return a TIFF file that begins with the page of the photo; others as they are.
+
+    Decoders take the first page, which may be a preview, and OpenCV and Pillow turn TIFF images by
+    their orientation even when they are not asked to.
+
+    Args:
+        encoded: the file's bytes.
+        is_upright: whether to set the orientation to 1, so that nobody turns it.
+    """
+    if encoded[:4] not in _TIFF_MAGICS:
+        return encoded
+    found = photo_page(encoded)
+    if found is None:
+        return encoded
+    start, page = found
+    order: Literal["little", "big"] = "little" if encoded[:2] == b"II" else "big"
+    is_big = encoded[2:4] in (b"+\0", b"\0+")
+    place, size = (8, 8) if is_big else (4, 4)
+    changed = bytearray(encoded)
+    changed[place : place + size] = start.to_bytes(size, order)
+    if is_upright and _number(page, _ORIENTATION_TAG) > 1:
+        _stand_upright(changed, start, order, is_big=is_big)
+    return bytes(changed)
+
+
+def _stand_upright(
+    content: bytearray, start: int, order: Literal["little", "big"], *, is_big: bool
+) -> None:
+    """Set the orientation in the directory of a TIFF file to 1."""
+    count_size, entry_size, value_at = (8, 20, 12) if is_big else (2, 12, 8)
+    first = start + count_size
+    last = first + entry_size * int.from_bytes(content[start:first], order)
+    for entry in range(first, min(last, len(content) - entry_size + 1), entry_size):
+        if int.from_bytes(content[entry : entry + 2], order) == _ORIENTATION_TAG:
+            content[entry + value_at : entry + value_at + 2] = (1).to_bytes(2, order)
+            return
+
+
+@contextmanager
+def opened(encoded: bytes, *, is_upright: bool = True) -> Iterator[Image | None]:
+    """Open a photo by Pillow, without decoding it; None where it cannot. As for `as_decoded`."""
+    from PIL import Image
+
+    if photo_format(encoded) == "HEIC":
+        _register_heic()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            image = Image.open(io.BytesIO(as_decoded(encoded, is_upright=is_upright)))
+        except Exception:  # noqa: BLE001 - Pillow's plugins raise anything on damaged files
+            image = None
+        try:
+            yield image
+        finally:
+            if image is not None:
+                image.close()
+
+
+def _register_heic() -> None:
+    """Teach Pillow HEIC, where its plugin is installed."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return
+    register_heif_opener()
 
 
 def stated_size(encoded: bytes) -> tuple[int, int] | None:
-    """Width and height as a JPEG, PNG or TIFF file states them; None where it does not."""
-    match image_format(encoded):
-        case "PNG":
-            chunk = next(_png_chunks(encoded), None)
-            if chunk is not None and chunk.kind == b"IHDR" and chunk.end - chunk.start >= 8:
-                return _two_numbers(encoded[chunk.start : chunk.start + 8])
-        case "JPEG":
-            for segment in _jpeg_segments(encoded):
-                if segment.kind in _FRAMES and segment.end - segment.start >= 5:
-                    height, width = _two_numbers(encoded[segment.start + 1 : segment.start + 5])
-                    return width, height
-        case "TIFF":
-            main = read_directory(encoded, most_bytes=len(encoded))
-            width_px, height_px = main.number(_WIDTH_TAG), main.number(_HEIGHT_TAG)
-            if width_px is not None and height_px is not None:
-                return int(width_px), int(height_px)
-    return None
+    """Return width and height as a file states them; None where it does not."""
+    if encoded.startswith(_PNG_MAGIC):
+        # Pillow refuses what is larger than it decodes.
+        width, height = (int.from_bytes(encoded[at : at + 4], "big") for at in (16, 20))
+        return (width, height) if encoded[12:16] == b"IHDR" else None
+    if encoded[:4] in _TIFF_MAGICS:
+        found = photo_page(encoded)
+        if found is None:
+            return None
+        width, height = (_number(found[1], tag) for tag in (_WIDTH_TAG, _HEIGHT_TAG))
+        return (width, height) if min(width, height) > 0 else None
+    with opened(encoded) as image:
+        return None if image is None else (image.width, image.height)
 
 
 def stated_bits(encoded: bytes) -> int | None:
-    """Bits per channel as a PNG or TIFF file states them; None where it does not."""
-    match image_format(encoded):
-        case "PNG":
-            chunk = next(_png_chunks(encoded), None)
-            if chunk is not None and chunk.kind == b"IHDR" and chunk.end - chunk.start >= 9:
-                return encoded[chunk.start + 8]
-        case "TIFF":
-            bits = read_directory(encoded, most_bytes=len(encoded)).number(_BITS_TAG)
-            return None if bits is None else int(bits)
-    return None
-
-
-def is_cut_off(encoded: bytes) -> bool:
-    """Whether a JPEG or PNG file ends before its image does.
-
-    Decoders fill the rest of a short JPEG with grey and say nothing, or refuse without a reason.
-    Bytes after the end of the image (previews, video of phones) do no harm. The directories of a
-    TIFF file may lie anywhere: its decoder finds out.
-    """
-    match image_format(encoded):
-        case "JPEG":
-            return not any(segment.kind == _END for segment in _jpeg_segments(encoded))
-        case "PNG":
-            return not any(segment.kind == b"IEND" for segment in _png_chunks(encoded))
-        case _:
-            return False
-
-
-def exif_block(encoded: bytes) -> bytes | None:
-    """Give the EXIF data of a file, which are laid out like a small TIFF file; None without any."""
-    match image_format(encoded):
-        case "TIFF":
-            return encoded
-        case "PNG":
-            for segment in _png_chunks(encoded):
-                if segment.kind == b"eXIf":
-                    return encoded[segment.start : segment.end]
-        case "JPEG":
-            for segment in _jpeg_segments(encoded):
-                if segment.kind == _SCAN:
-                    break
-                content = encoded[segment.start : segment.end]
-                # Other data (XMP) travel in segments of the same kind.
-                if segment.kind == _APP1 and content.startswith(_EXIF_MAGIC):
-                    return content[len(_EXIF_MAGIC) + 1 :]
+    """Return the bits per channel as a PNG or TIFF file states them; None where it does not."""
+    if encoded.startswith(_PNG_MAGIC):
+        return encoded[24] if encoded[12:16] == b"IHDR" and len(encoded) > 24 else None
+    if encoded[:4] in _TIFF_MAGICS:
+        found = photo_page(encoded)
+        return None if found is None else _number(found[1], _BITS_TAG) or None
     return None
 
 
 def icc_profile(encoded: bytes) -> bytes | None:
-    """Give the ICC colour profile of a JPEG, PNG or TIFF file; None without a whole one.
-
-    Layout as in ICC.1:2022, annex B: a JPEG may hold it in several numbered segments.
-    """
-    match image_format(encoded):
-        case "TIFF":
-            return read_directory(encoded, most_bytes=len(encoded)).content(_ICC_TAG)
-        case "PNG":
-            for segment in _png_chunks(encoded):
-                if segment.kind == b"iCCP":
-                    return _unpacked(encoded[segment.start : segment.end])
-        case "JPEG":
-            parts: dict[int, bytes] = {}
-            count = 0
-            for segment in _jpeg_segments(encoded):
-                if segment.kind == _SCAN:
-                    break
-                content = encoded[segment.start : segment.end]
-                if segment.kind == _APP2 and content.startswith(_ICC_MAGIC) and len(content) > 14:
-                    number, count = content[12], content[13]
-                    parts[number] = content[14:]
-            if parts and sorted(parts) == list(range(1, count + 1)):
-                return b"".join(parts[number] for number in sorted(parts))
-    return None
+    """Return the ICC colour profile of a photo; None without a whole one."""
+    with opened(encoded) as image:
+        found = None if image is None else image.info.get("icc_profile")
+    return found if isinstance(found, bytes) and found else None
 
 
-def _unpacked(content: bytes) -> bytes | None:
-    """Profile of a PNG chunk: a name, the method of compression, and the compressed profile."""
-    _, _, packed = content.partition(b"\x00")
-    unpacking = zlib.decompressobj()
-    try:
-        profile = unpacking.decompress(packed[1:], _ICC_MOST)
-    except zlib.error:
-        return None
-    return profile if profile and unpacking.eof else None
+def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
+    """Return which pixels (height, width) are not transparent; None where all are opaque."""
+    with opened(encoded) as image:
+        if image is None or not image.has_transparency_data:
+            return None
+        try:
+            alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+        except Exception:  # noqa: BLE001 - damage is found by whoever decodes the colours
+            return None
+    opaque: NDArray[np.bool_] = alpha >= 128
+    return None if opaque.all() else opaque
 
 
-def _two_numbers(content: bytes) -> tuple[int, int]:
-    half = len(content) // 2
-    return int.from_bytes(content[:half], "big"), int.from_bytes(content[half:], "big")
-
-
-def _jpeg_segments(encoded: bytes) -> Iterator[_Segment]:
-    """Walk from marker to marker; stops where the file breaks off."""
-    position = 2
-    while (found := _MARKER.search(encoded, position)) is not None:
-        kind, position = found.group(1)[0], found.end()
-        if kind in _WITHOUT_LENGTH:
-            continue
-        if kind == _END:
-            yield _Segment(kind=kind, start=position, end=position)
-            return
-        length = int.from_bytes(encoded[position : position + 2], "big")
-        if length < 2 or position + length > len(encoded):
-            return
-        yield _Segment(kind=kind, start=position + 2, end=position + length)
-        position += length
-
-
-def _png_chunks(encoded: bytes) -> Iterator[_Segment]:
+def is_whole_png(encoded: bytes) -> bool:
+    """Whether the chunks of a PNG file lead to its end: decoders make room for what they state."""
     position = len(_PNG_MAGIC)
     while position + 12 <= len(encoded):
-        length = int.from_bytes(encoded[position : position + 4], "big")
-        start = position + 8
-        if start + length + 4 > len(encoded):
-            return
-        yield _Segment(kind=encoded[position + 4 : start], start=start, end=start + length)
-        position = start + length + 4
+        if encoded[position + 4 : position + 8] == b"IEND":
+            return True
+        position += 12 + int.from_bytes(encoded[position : position + 4], "big")
+    return False
+
+
+def damage(encoded: bytes) -> tuple[str, bool]:
+    """Decode a photo and return what is damaged in it, and whether pixels are lost by that.
+
+    Returns:
+        What was found, empty for a sound file; True where a part of the photo is missing or noise.
+    """
+    if photo_format(encoded) == "JPEG":
+        import simplejpeg
+
+        try:
+            _, _, colours, _ = simplejpeg.decode_jpeg_header(encoded, strict=False)
+            space = "CMYK" if colours in ("CMYK", "YCCK") else "GRAY"
+            smallest = {"min_height": 1, "min_width": 1, "min_factor": 8}
+            simplejpeg.decode_jpeg(encoded, colorspace=space, **smallest)
+        except ValueError as error:
+            text = str(error)
+            if _EXTRA_BYTES in text:
+                return text, False
+            # Others are oddities that cost nothing.
+            is_lost = any(part in text.lower() for part in _LOST_DATA)
+            return (text, True) if is_lost else ("", False)
+        except KeyError:
+            # It names the kinds of sub-sampling that it knows; Pillow sees truncation.
+            pass
+        else:
+            return "", False
+    with opened(encoded) as image:
+        if image is None:
+            return "its header cannot be read", True
+        try:
+            image.load()
+        except Exception as error:  # noqa: BLE001 - Pillow's plugins raise anything
+            return str(error) or type(error).__name__, True
+    return "", False

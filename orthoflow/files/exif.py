@@ -7,13 +7,17 @@ a photo is good without it.
 from __future__ import annotations
 
 import math
-import struct
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Final
+from numbers import Real
+from typing import TYPE_CHECKING, Final
 
-from orthoflow.files.containers import exif_block, image_format
-from orthoflow.files.tiff_tags import Directory, read_directory
+from orthoflow.files.containers import opened
+
+if TYPE_CHECKING:
+    from PIL.Image import Exif as PillowExif
+    from PIL.Image import Image
 
 # Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by equal angle over the
 # diagonal, and the cameras we could check keep to it: a Redmi Note 9S (4.74 mm, sensor diagonal
@@ -33,9 +37,15 @@ _RESOLUTION_Y: Final = 0xA20F
 _RESOLUTION_UNIT: Final = 0xA210
 _FOCAL_LENGTH_35MM: Final = 0xA405
 
-_SHORT: Final = 3
-# More than what cameras write beside the picture, notes of makers included.
-MOST_BYTES: Final = 1 << 20
+_DIGITAL_ZOOM: Final = 0xA404
+
+_TAGS: Final = frozenset(
+    {_ORIENTATION, _MAKE, _MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM}
+    | {_WIDTH, _HEIGHT, _RESOLUTION_X, _RESOLUTION_Y, _RESOLUTION_UNIT}
+)
+_MAX_TEXT: Final = 200
+# As long as an EXIF block may be.
+_PADDING: Final = 1 << 16
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
 # Longest side of sensors, from the smallest phone to large format scanning backs.
@@ -57,6 +67,7 @@ class Exif:
         model: model of the camera.
         focal_mm: focal length.
         focal_35mm: full-frame equivalent of it.
+        digital_zoom: by how much the picture was enlarged; 1 without.
         resolution_px_per_mm: pixels of the picture as it was taken per millimetre of the sensor.
         width: pixels of the picture as it was taken; it may have been made smaller since.
         height: pixels.
@@ -68,6 +79,7 @@ class Exif:
     model: str = ""
     focal_mm: float | None = None
     focal_35mm: float | None = None
+    digital_zoom: float | None = None
     resolution_px_per_mm: float | None = None
     width: int | None = None
     height: int | None = None
@@ -97,26 +109,64 @@ class FocalLength:
 
 
 def read_exif(encoded: bytes) -> Exif:
-    """Read the EXIF data of a JPEG, PNG or TIFF file; without any, everything is absent."""
-    block = exif_block(encoded)
-    if block is None:
-        return Exif()
-    main = read_directory(block, most_bytes=MOST_BYTES)
-    start = main.number(_EXIF_DIRECTORY)
-    inner = (
-        Directory() if start is None else read_directory(block, int(start), most_bytes=MOST_BYTES)
-    )
+    """Read the EXIF data of a photo; without any, everything is absent."""
+    with opened(encoded, is_upright=False) as image:
+        if image is None:
+            return Exif()
+        found, is_damaged = _tags(image)
     return Exif(
-        orientation=_orientation(main),
-        make=main.text(_MAKE),
-        model=main.text(_MODEL),
-        focal_mm=inner.number(_FOCAL_LENGTH),
-        focal_35mm=inner.number(_FOCAL_LENGTH_35MM),
-        resolution_px_per_mm=_resolution(inner),
-        width=_whole(inner.number(_WIDTH)),
-        height=_whole(inner.number(_HEIGHT)),
-        is_damaged=main.is_damaged or inner.is_damaged,
+        orientation=_orientation(_number(found.get(_ORIENTATION))),
+        make=_text(found.get(_MAKE)),
+        model=_text(found.get(_MODEL)),
+        focal_mm=_number(found.get(_FOCAL_LENGTH)),
+        focal_35mm=_number(found.get(_FOCAL_LENGTH_35MM)),
+        digital_zoom=_number(found.get(_DIGITAL_ZOOM)),
+        resolution_px_per_mm=_resolution(found),
+        width=_whole(_number(found.get(_WIDTH))),
+        height=_whole(_number(found.get(_HEIGHT))),
+        is_damaged=is_damaged,
     )
+
+
+def _tags(image: Image) -> tuple[Mapping[int, object], bool]:
+    """The tags that count, and whether the block is damaged, which gives what is left of it."""
+    block = image.info.get("exif")
+    if not isinstance(block, bytes):
+        return _readable_tags(image.getexif)
+    found, is_damaged = _readable_tags(lambda: _loaded(block))
+    if is_damaged:
+        # Zeros stand for what is missing, so that one bad place does not end the reading.
+        found = _readable_tags(lambda: _loaded(block + bytes(_PADDING)))[0] | found
+    return found, is_damaged
+
+
+def _loaded(block: bytes) -> PillowExif:
+    from PIL.Image import Exif as PillowExif
+
+    exif = PillowExif()
+    exif.load(block)
+    return exif
+
+
+def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], bool]:
+    """Tags of the main and of the inner directory, and whether some could not be read."""
+    tags: dict[int, object] = {}
+    is_damaged = False
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("always")
+        try:
+            main = read()
+            directories: list[Callable[[], Mapping[int, object]]] = [
+                lambda: main,
+                lambda: main.get_ifd(_EXIF_DIRECTORY),
+            ]
+            for directory in directories:
+                content = directory()
+                for tag in _TAGS & set(content):
+                    tags[tag] = content[tag]
+        except Exception:  # noqa: BLE001 - Pillow raises whatever its parsing of damaged tags meets
+            is_damaged = True
+    return tags, is_damaged or bool(noticed)
 
 
 def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
@@ -181,25 +231,26 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     )
 
 
-def without_orientation(encoded: bytes) -> bytes:
-    """Give a TIFF file with its orientation set to 1; anything else unchanged.
-
-    OpenCV turns TIFF images by that tag even when it is asked not to.
-    """
-    if image_format(encoded) != "TIFF":
-        return encoded
-    main = read_directory(encoded, most_bytes=MOST_BYTES)
-    orientation = _orientation(main)
-    if orientation == 1:
-        return encoded
-    entry = partial(struct.pack, f"{main.order}HHIH", _ORIENTATION, _SHORT, 1)
-    before, directory = encoded[: main.start], encoded[main.start :]
-    return before + directory.replace(entry(orientation), entry(1), 1)
+def _number(value: object) -> float | None:
+    """Number of a tag, the first one where it has several, where it is finite and positive."""
+    if isinstance(value, bytes):
+        value = tuple(value)
+    first = value[0] if isinstance(value, tuple) and value else value
+    number = float(first) if isinstance(first, Real) else math.nan
+    return number if 0.0 < number < math.inf else None
 
 
-def _orientation(main: Directory) -> int:
-    orientation = main.number(_ORIENTATION) or 1.0
-    return int(orientation) if 1.0 <= orientation < 9.0 else 1
+def _text(value: object) -> str:
+    """Text of a tag up to its first NUL; empty where it is absent, long or a number."""
+    if not isinstance(value, str) or len(value) >= _MAX_TEXT:
+        return ""
+    # Pillow takes them for Latin-1, but these texts are ASCII.
+    plain = value.encode("latin-1", "replace").decode("ascii", "replace")
+    return plain.split("\0")[0].strip()
+
+
+def _orientation(number: float | None) -> int:
+    return int(number) if number is not None and 1.0 <= number < 9.0 else 1
 
 
 def _is_cropped(exif: Exif, width: int, height: int) -> bool:
@@ -229,11 +280,14 @@ def _whole(value: float | None) -> int | None:
     return int(value) if value is not None and value >= 1.0 else None
 
 
-def _resolution(directory: Directory) -> float | None:
-    """Pixels per millimetre, the mean of both axes where both are said."""
-    unit_mm = _UNIT_MM.get(int(directory.number(_RESOLUTION_UNIT) or _INCH))
-    said = [directory.number(tag) for tag in (_RESOLUTION_X, _RESOLUTION_Y)]
-    known = [value for value in said if value is not None]
+def _resolution(tags: Mapping[int, object]) -> float | None:
+    """Pixels per millimetre, the mean of both axes where both are there."""
+    unit_mm = _UNIT_MM.get(int(_number(tags.get(_RESOLUTION_UNIT)) or _INCH))
+    known = [
+        value
+        for tag in (_RESOLUTION_X, _RESOLUTION_Y)
+        if (value := _number(tags.get(tag))) is not None
+    ]
     if unit_mm is None or not known:
         return None
     return math.fsum(known) / len(known) / unit_mm

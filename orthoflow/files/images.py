@@ -14,18 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError
-from orthoflow.files.containers import image_format, is_cut_off, is_webp, stated_size
-from orthoflow.files.exif import without_orientation
+from orthoflow.files.containers import (
+    HOW_TO_READ_HEIC,
+    READABLE,
+    as_decoded,
+    is_whole_png,
+    opened,
+    photo_format,
+    stated_size,
+)
 from orthoflow.geometry.levels import Colours, eight_bits
 
 # What photos end in; another file holds none, or one that must be converted first.
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff")
-# What cameras call their raw photos, and what to do with them.
+PHOTO_SUFFIXES: Final = (
+    *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
+    *(".webp", ".heic", ".heif", ".avif"),
+)
+# What cameras call their raw photos.
 RAW_SUFFIXES: Final = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
-HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 PREVIEW_SIDE_PX: Final = 1600
 # 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
 MOST_PIXELS: Final = 1 << 28
@@ -83,9 +92,9 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]
     """Decode an image: RGB of 8 bits, or BGR of its own depth."""
     import cv2
 
+    kind = photo_format(encoded)
     # OpenCV makes room for a chunk of a PNG as long as it says that it is.
-    is_cut_png = image_format(encoded) == "PNG" and is_cut_off(encoded)
-    if is_cut_png or (image_format(encoded) is None and not is_webp(encoded)):
+    if kind not in READABLE or (kind == "PNG" and not is_whole_png(encoded)):
         raise InputError(_not_an_image(encoded, name))
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
@@ -93,16 +102,28 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]
             f"{name} is too large: {size[0]} x {size[1]} pixels, at most {MOST_PIXELS} are "
             "decoded; make it smaller or cut it into parts"
         )
+    if kind in ("HEIC", "AVIF"):
+        return _decoded_by_pillow(encoded, name, is_deep=is_deep)
     try:
         depth = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH if is_deep else cv2.IMREAD_COLOR_RGB
         flags = depth | cv2.IMREAD_IGNORE_ORIENTATION
-        data = np.frombuffer(without_orientation(encoded), dtype=np.uint8)
-        image = cv2.imdecode(data, flags)
+        image = cv2.imdecode(np.frombuffer(as_decoded(encoded), dtype=np.uint8), flags)
     except cv2.error as error:
         raise InputError(_not_an_image(encoded, name)) from error
     if image is None:
         raise InputError(_not_an_image(encoded, name))
     return np.asarray(image)
+
+
+def _decoded_by_pillow(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]:
+    with opened(encoded) as image:
+        if image is None:
+            raise InputError(_not_an_image(encoded, name))
+        try:
+            colours = np.asarray(image.convert("RGB"))
+        except Exception as error:
+            raise InputError(_not_an_image(encoded, name)) from error
+    return colours[..., ::-1] if is_deep else colours
 
 
 def encode_png(image: Colours) -> bytes:
@@ -318,6 +339,11 @@ def _encode(suffix: str, image: Colours, options: list[int]) -> bytes:
 
 
 def _not_an_image(encoded: bytes, name: str) -> str:
+    kind = photo_format(encoded)
+    if kind == "HEIC":
+        return f"{name} is a HEIC file: {HOW_TO_READ_HEIC}"
+    if kind is not None and kind not in READABLE:
+        return f"{name} is a {kind} file: expected JPEG, PNG or TIFF; convert it"
     return (
         f"{name} cannot be decoded as an image ({len(encoded)} bytes): expected a whole JPEG, PNG "
         "or TIFF file; open it in an image viewer, or copy it again from the camera"

@@ -91,7 +91,8 @@ class Photo:
     """One photograph.
 
     Attributes:
-        name: file name without folder; poses and ties refer to it.
+        name: file name, with the folders below the input where several photos have that name; poses
+            and ties refer to it.
         encoded: the file's bytes as they were; pixel frame = the stored array, EXIF orientation
             not applied.
         width: pixels of the stored array.
@@ -101,6 +102,9 @@ class Photo:
         intrinsics: calibration if known, or None.
         mask: PNG of the same pixels, white where they may be used; None where all may
             (`files.photo_masks`).
+        camera: which camera and focal length took it, the same text for photos of one lens; empty
+            where nobody knows.
+        folder: of the file below the input, empty where all photos lie in one.
     """
 
     name: str
@@ -111,6 +115,8 @@ class Photo:
     exif_focal_px: float | None = None
     intrinsics: Intrinsics | None = None
     mask: bytes | None = None
+    camera: str = ""
+    folder: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -209,7 +209,7 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         where = ""
     look = _Look(f"input {spec.name}: {pattern}{where}")
     if path.is_dir():
-        files = [item for item in look.into(path) if item.is_file() and item.name[0] != "."]
+        files = [item for item in look.below(path) if item.name[0] != "."]
         missing = f"the folder {pattern}{where} holds no files"
     elif path.exists():
         files, missing = [path], ""
@@ -261,6 +261,17 @@ class _Look:
                     yield folder / entry.name
         except OSError:
             return
+
+    def below(self, folder: Path) -> Iterator[Path]:
+        """Yield the files in a folder and its subfolders; links to folders are not followed."""
+        waiting = [folder]
+        while waiting:
+            for path in self.into(waiting.pop()):
+                if path.is_dir():
+                    if path.name[0] != "." and not path.is_symlink():
+                        waiting.append(path)
+                elif path.is_file():
+                    yield path
 
     def for_pattern(self, folder: Path, pattern: str) -> list[Path]:
         """Give what a pattern matches below a folder, as `glob` does with `recursive`.

@@ -11,9 +11,10 @@ from typing import Final, Literal, TypeAlias
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
+from orthoflow.files.containers import HOW_TO_DEVELOP
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
-from orthoflow.files.images import HOW_TO_DEVELOP, PHOTO_SUFFIXES, RAW_SUFFIXES
+from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.sdk.lines import text_of_path

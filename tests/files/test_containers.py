@@ -1,153 +1,110 @@
-"""Colour profiles in photo files: whole ones are found, broken ones are none."""
+"""What a photo's file is and holds, read without decoding it: made by Pillow, OpenCV and others."""
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
+from collections.abc import Callable
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from orthoflow_plugins.ortho.photos_on_walls import shared_profile
+import rasterio
+from numpy.typing import NDArray
+from PIL import Image
+from rasterio.transform import Affine
 
-from orthoflow.files.containers import icc_profile, is_webp, stated_bits, stated_size
-from orthoflow.files.images import encode_jpeg, encode_png
-from orthoflow.products import Photo
-from orthoflow.sdk import StepContext
-
-PROFILE = bytes(range(256)) * 700
-GREY = np.full((8, 8, 3), 90, dtype=np.uint8)
-
-
-def jpeg_with(parts: list[tuple[int, int, bytes]]) -> bytes:
-    """A JPEG with profile segments given by number, count and content."""
-    plain = encode_jpeg(GREY)
-    segments = b""
-    for number, count, part in parts:
-        content = b"ICC_PROFILE\x00" + bytes([number, count]) + part
-        segments += b"\xff\xe2" + (len(content) + 2).to_bytes(2, "big") + content
-    return plain[:2] + segments + plain[2:]
-
-
-def png_with(packed: bytes) -> bytes:
-    plain = encode_png(GREY)
-    content = b"name\x00\x00" + packed
-    chunk = b"iCCP" + content
-    # The header is 8 + 25 bytes.
-    full = len(content).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
-    return plain[:33] + full + plain[33:]
-
-
-def test_a_profile_is_found_whole_in_any_order_of_its_segments() -> None:
-    parts = [PROFILE[:60_000], PROFILE[60_000:120_000], PROFILE[120_000:]]
-    numbered = [(k + 1, 3, part) for k, part in enumerate(parts)]
-    assert icc_profile(jpeg_with([numbered[2], numbered[0], numbered[1]])) == PROFILE
-    assert icc_profile(png_with(zlib.compress(PROFILE))) == PROFILE
-
-
-def tiff_with(order: str, place: int | None = None) -> bytes:
-    """The head of a TIFF file whose only tag is a profile after its directory."""
-    mark, place = {"<": b"II*\x00", ">": b"MM\x00*"}[order], 26 if place is None else place
-    directory = struct.pack(order + "HHHIII", 1, 34675, 7, len(PROFILE), place, 0)
-    return mark + struct.pack(order + "I", 8) + directory + PROFILE
-
-
-@pytest.mark.parametrize("order", ["<", ">"], ids=["little-endian", "big-endian"])
-def test_the_profile_of_a_tiff_file_is_found(order: str) -> None:
-    assert icc_profile(tiff_with(order)) == PROFILE
-    assert icc_profile(tiff_with(order)[:-1]) is None
-    assert icc_profile(tiff_with(order)[:15]) is None
-    assert icc_profile(tiff_with(order, place=1 << 30)) is None
-
-
-@pytest.mark.parametrize(
-    "encoded",
-    [
-        encode_jpeg(GREY),
-        encode_png(GREY),
-        jpeg_with([(1, 2, b"half")]),
-        jpeg_with([(2, 2, b"half")]),
-        png_with(zlib.compress(PROFILE)[:-20]),
-        png_with(b"no zlib"),
-        png_with(zlib.compress(bytes(1 << 25))),
-        b"something else",
-    ],
-    ids=["jpeg", "png", "second half", "first half", "cut", "unpacked", "bomb", "no image"],
+from orthoflow.errors import InputError
+from orthoflow.files.containers import (
+    count_pages,
+    damage,
+    icc_profile,
+    opaque_pixels,
+    photo_format,
+    stated_bits,
+    stated_size,
 )
-def test_what_is_no_whole_profile_is_none(encoded: bytes) -> None:
-    assert icc_profile(encoded) is None
+from orthoflow.files.exif import read_exif
+from orthoflow.files.images import decode_image, encode_jpeg
+from tests import photo_files as made
+
+PICTURE = made.picture(128, 96)
 
 
-def test_photos_of_different_profiles_share_none_and_that_is_said(tmp_path) -> None:
-    def photo(name: str, encoded: bytes) -> Photo:
-        return Photo(name=name, encoded=encoded, width=8, height=8)
-
-    one, other = (photo(name, jpeg_with([(1, 1, name.encode())])) for name in ("a", "b"))
-    ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    assert shared_profile([one, one], ctx) == b"a"
-    assert shared_profile([photo("c", encode_jpeg(GREY))], ctx) is None
-    assert not ctx.warnings
-    assert shared_profile([one, other], ctx) is None
-    assert any("2 different colour profiles" in warning for warning in ctx.warnings)
+def saved(kind: str, image: NDArray[np.uint8] = PICTURE, **options: object) -> bytes:
+    """A file as Pillow writes it."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, **options)
+    return stream.getvalue()
 
 
-def png_of(side: int = 8, *, header: bytes | None = None) -> bytes:
-    """A PNG file, with another header chunk where one is given."""
-    plain = encode_png(np.zeros((side, 2 * side, 3), dtype=np.uint8))
-    if header is None:
-        return plain
-    chunk = b"IHDR" + header
-    return plain[:8] + struct.pack(">I", len(header)) + chunk + bytes(4) + plain[33:]
+def pages(*images: NDArray[np.uint8], subfiles: tuple[int, ...], big: bool = False) -> bytes:
+    """A TIFF file of several pages, with the kind of each (1: a preview)."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-
-def tiff_of(tags: dict[int, int]) -> bytes:
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
-    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
-
-
-def jpeg_of(*segments: tuple[int, bytes]) -> bytes:
-    parts = (
-        bytes([0xFF, kind]) + struct.pack(">H", len(content) + 2) + content
-        for kind, content in segments
+    frames = [Image.fromarray(image) for image in images]
+    for frame, subfile in zip(frames, subfiles, strict=True):
+        tags = ImageFileDirectory_v2()
+        tags[254] = subfile
+        frame.encoderinfo = {"tiffinfo": tags}
+    stream = io.BytesIO()
+    first = ImageFileDirectory_v2()
+    first[254] = subfiles[0]
+    frames[0].save(
+        stream, "TIFF", save_all=True, append_images=frames[1:], tiffinfo=first, big_tiff=big
     )
-    return b"\xff\xd8" + b"".join(parts) + b"\xff\xd9"
-
-
-FRAME = b"\x08" + struct.pack(">HH", 300, 400) + b"\x01"
+    return stream.getvalue()
 
 
 @pytest.mark.parametrize(
-    ("encoded", "size"),
+    ("encoded", "kind"),
     [
-        (png_of(8), (16, 8)),
-        (png_of(header=struct.pack(">II", 70_000, 3)), (70_000, 3)),
-        (png_of(header=b"\0" * 7), None),
-        (png_of().replace(b"IHDR", b"IHDX"), None),
-        (tiff_of({0x100: 70_000, 0x101: 3}), (70_000, 3)),
-        (tiff_of({0x100: 70_000}), None),
-        (tiff_of({0x101: 3}), None),
-        (jpeg_of((0xE0, b"JFIF"), (0xC0, FRAME)), (400, 300)),
-        (jpeg_of((0xE0, b"JFIF"), (0xCF, FRAME)), (400, 300)),
-        # Tables and arithmetic conditioning stand between the frames' numbers.
-        *((jpeg_of((kind, FRAME), (0xC2, b"\x08\0\1\0\2")), (2, 1)) for kind in (0xC4, 0xC8, 0xCC)),
-        (jpeg_of((0xD9, b"")), None),
-        (jpeg_of((0xBF, FRAME)), None),
-        (jpeg_of((0xC0, FRAME[:4])), None),
-        (b"BM" + bytes(60), None),
+        (saved("JPEG"), "JPEG"),
+        (saved("PNG"), "PNG"),
+        (saved("TIFF"), "TIFF"),
+        (saved("TIFF", big_tiff=True), "BigTIFF"),
+        (saved("WEBP"), "WebP"),
+        (saved("GIF"), "GIF"),
+        (saved("BMP"), "BMP"),
+        (saved("JPEG2000"), "JPEG 2000"),
+        (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", "HEIC"),
+        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1heic", "HEIC"),
+        (b"\0\0\0\x1cftypavif\0\0\0\0mif1avif", "AVIF"),
+        (b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "camera raw (Canon CR3)"),
+        (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "video (MP4 or MOV)"),
+        (b"II*\0\x10\0\0\0CR\2\0", "camera raw (Canon CR2)"),
+        (b"FUJIFILMCCD-RAW 0201", "camera raw (Fujifilm)"),
+        (made.exif_block({254: 0, 256: 60, 257: 40, 262: 32803}), "camera raw"),
+        (made.exif_block({254: 1, 256: 16, 257: 12, 262: 2, 330: 200}), "camera raw"),
+        (made.exif_block({254: 0, 262: 32803, 50706: 1}), "camera raw (DNG)"),
+        (b"%PDF-1.7", "PDF"),
+        (b"<html>", None),
+        (b"", None),
     ],
 )
-def test_a_size_is_what_the_file_states(encoded: bytes, size: tuple[int, int] | None) -> None:
-    assert stated_size(encoded) == size
+def test_a_format_is_known_by_its_content(encoded: bytes, kind: str | None) -> None:
+    assert photo_format(encoded) == kind
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP"])
+def test_size_profile_and_exif_are_read_of_every_format(kind: str) -> None:
+    exif = Image.Exif()
+    exif[made.MODEL], exif[made.ORIENTATION] = "X100", 6
+    encoded = saved(kind, icc_profile=b"profile" * 20, exif=exif)
+    assert stated_size(encoded) == (128, 96)
+    assert icc_profile(encoded) == b"profile" * 20
+    assert (read_exif(encoded).model, read_exif(encoded).orientation) == ("X100", 6)
+    assert decode_image(encoded).shape == (96, 128, 3)
 
 
 @pytest.mark.parametrize(
     ("encoded", "bits"),
     [
-        (png_of(), 8),
-        (png_of(header=struct.pack(">IIB", 4, 4, 16)), 16),
-        (png_of(header=struct.pack(">II", 4, 4)), None),
-        (tiff_of({0x102: 16}), 16),
-        (tiff_of({0x100: 16}), None),
-        (jpeg_of((0xC0, FRAME)), None),
+        (saved("PNG"), 8),
+        (saved("TIFF"), 8),
+        (cv2.imencode(".png", PICTURE.astype(np.uint16) * 257)[1].tobytes(), 16),
+        (cv2.imencode(".tif", PICTURE.astype(np.uint16) * 257)[1].tobytes(), 16),
+        (saved("JPEG"), None),
         (b"", None),
     ],
 )
@@ -155,21 +112,132 @@ def test_bits_per_channel_are_what_the_file_states(encoded: bytes, bits: int | N
     assert stated_bits(encoded) == bits
 
 
-def test_a_figures_format_is_told_by_its_first_bytes() -> None:
-    assert is_webp(b"RIFF\x10\0\0\0WEBPVP8 ")
-    assert not is_webp(b"RIFF\x10\0\0\0WAVEfmt ")
-    assert not is_webp(b"RIFX\x10\0\0\0WEBPVP8 ")
+@pytest.mark.parametrize("big", [False, True], ids=["TIFF", "BigTIFF"])
+@pytest.mark.parametrize(
+    "order", [(1, 0), (0, 1), (1, 0, 1)], ids=["preview-first", "last", "both"]
+)
+def test_the_photo_of_a_tiff_is_its_largest_page_that_is_no_preview(
+    order: tuple[int, ...], big: bool
+) -> None:
+    images = [np.ascontiguousarray(PICTURE[::8, ::8]) if kind else PICTURE for kind in order]
+    encoded = pages(*images, subfiles=order, big=big)
+    assert stated_size(encoded) == (128, 96)
+    assert count_pages(encoded) == 1
+    np.testing.assert_array_equal(decode_image(encoded), PICTURE)
 
 
-@pytest.mark.parametrize("kind", [0x01, *range(0xD0, 0xD8)])
-def test_markers_without_a_length_are_stepped_over(kind: int) -> None:
-    encoded = b"\xff\xd8" + bytes([0xFF, kind]) + jpeg_of((0xC0, FRAME))[2:]
-    assert stated_size(encoded) == (400, 300)
+def test_whole_pages_of_a_tiff_are_counted() -> None:
+    encoded = pages(PICTURE, PICTURE, subfiles=(0, 0))
+    assert count_pages(encoded) == 2
+    assert count_pages(saved("JPEG")) == 1
 
 
-def test_a_profile_behind_the_start_of_the_scan_is_none() -> None:
-    profile = b"ICC_PROFILE\x00\x01\x01" + PROFILE[:100]
-    assert icc_profile(jpeg_of((0xE2, profile), (0xDA, b""))) == PROFILE[:100]
-    assert icc_profile(jpeg_of((0xDA, b""), (0xE2, profile))) is None
-    assert icc_profile(jpeg_of((0xE1, profile))) is None
-    assert icc_profile(jpeg_of((0xE2, profile[:14]))) is None
+def transparent(kind: str) -> bytes:
+    """PICTURE with its left third transparent."""
+    alpha = np.full(PICTURE.shape[:2], 255, dtype=np.uint8)
+    alpha[:, :40] = 0
+    if kind == "TIFF":
+        memory = rasterio.MemoryFile()
+        size = {"height": 96, "width": 128, "count": 4, "dtype": "uint8"}
+        options = {"photometric": "RGB", "alpha": "yes", "transform": Affine.scale(2, -2)}
+        with memory.open(driver="GTiff", **options, **size) as out:
+            out.write(np.moveaxis(np.dstack([PICTURE, alpha]), -1, 0))
+        return bytes(memory.getbuffer())
+    if kind == "palette":
+        image = Image.fromarray(np.where(alpha > 0, 7, 3).astype(np.uint8)).convert("P")
+        stream = io.BytesIO()
+        image.save(stream, "PNG", transparency=3)
+        return stream.getvalue()
+    return saved(kind, np.dstack([PICTURE, alpha]), lossless=True)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP", "palette"])
+def test_what_is_transparent_is_known_in_every_format(kind: str) -> None:
+    opaque = opaque_pixels(transparent(kind))
+    assert opaque is not None
+    expected = np.ones((96, 128), dtype=np.bool_)
+    expected[:, :40] = False
+    np.testing.assert_array_equal(opaque, expected)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG", "WEBP"])
+def test_a_photo_without_transparency_is_opaque(kind: str) -> None:
+    assert opaque_pixels(saved(kind)) is None
+
+
+PHOTO = cv2.GaussianBlur(
+    np.random.default_rng(1).integers(0, 256, (400, 600, 3)).astype(np.uint8), (0, 0), 2
+)
+
+
+def jpeg(*options: int) -> bytes:
+    return cv2.imencode(".jpg", PHOTO, list(options))[1].tobytes()
+
+
+def _cmyk() -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(PHOTO).convert("CMYK").save(stream, "JPEG")
+    return stream.getvalue()
+
+
+JPEGS = {
+    "baseline": jpeg(),
+    "progressive": jpeg(cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restarts": jpeg(cv2.IMWRITE_JPEG_RST_INTERVAL, 4),
+    "optimised": jpeg(cv2.IMWRITE_JPEG_OPTIMIZE, 1),
+    "grey": encode_jpeg(PHOTO[..., 0]),
+    "cmyk": _cmyk(),
+}
+
+
+@pytest.mark.parametrize("encoded", JPEGS.values(), ids=JPEGS)
+def test_sound_photos_are_not_called_damaged(encoded: bytes) -> None:
+    assert damage(encoded) == ("", False)
+    # A phone's video may follow.
+    assert not damage(encoded + b"video of a phone")[1]
+
+
+def _zeros(encoded: bytes) -> bytes:
+    at = len(encoded) // 2
+    return encoded[:at] + bytes(2000) + encoded[at + 2000 :]
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "cut": lambda encoded: encoded[: len(encoded) * 6 // 10],
+    "cut with an end marker": lambda encoded: encoded[: len(encoded) * 6 // 10] + b"\xff\xd9",
+    "zeros in the scan": _zeros,
+    "zeros to the end": lambda encoded: encoded[: len(encoded) // 2] + bytes(len(encoded) // 2),
+}
+
+
+@pytest.mark.parametrize("harm", DAMAGES.values(), ids=DAMAGES)
+@pytest.mark.parametrize("kind", ["baseline", "optimised", "grey", "cmyk"])
+def test_damage_in_the_scan_of_a_jpeg_is_found(kind: str, harm: Callable[[bytes], bytes]) -> None:
+    found, is_lost = damage(harm(JPEGS[kind]))
+    assert found
+    assert is_lost
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
+def test_other_formats_that_are_cut_off_are_found(kind: str) -> None:
+    encoded = saved(kind, PHOTO)
+    assert damage(encoded) == ("", False)
+    assert damage(encoded[: len(encoded) * 6 // 10])[1]
+
+
+def test_a_flipped_bit_in_a_png_is_found() -> None:
+    encoded = bytearray(saved("PNG", PHOTO))
+    encoded[len(encoded) // 2] ^= 16
+    assert damage(bytes(encoded))[1]
+
+
+def test_heic_is_read_by_its_plugin_or_named_with_the_way_out(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    stream = io.BytesIO()
+    heif.from_pillow(Image.fromarray(PHOTO)).save(stream, quality=95)
+    encoded = stream.getvalue()
+    assert photo_format(encoded) == "HEIC"
+    assert stated_size(encoded) == (600, 400)
+    assert np.abs(decode_image(encoded).astype(int) - PHOTO).mean() < 6.0
+    with pytest.raises(InputError, match=r"is a HEIC file.*orthoflow-tls\[heic\]"):
+        decode_image(encoded[:40], "IMG_1.heic")

@@ -26,7 +26,7 @@ from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
 from orthoflow.engine.store import Store
 from orthoflow.engine.stored_results import list_results
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
-from orthoflow.files.containers import icc_profile, is_cut_off
+from orthoflow.files.containers import damage, icc_profile
 from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.files.exif import focal_length, read_exif
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
@@ -222,7 +222,7 @@ def _exif_files(folder: Path) -> None:
 def _read_exif(path: Path) -> object:
     encoded = path.read_bytes()
     exif = read_exif(encoded)
-    return exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), is_cut_off(encoded)
+    return exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), damage(encoded)
 
 
 def _figure_files(folder: Path) -> None:

@@ -61,7 +61,7 @@ def names(project: Path, catalog: Catalog, spec: str, *options: str) -> list[str
     ("spec", "expected"),
     [
         ("{files: photos/b.jpg}", ["b.jpg"]),
-        ("{files: photos}", ["[1].jpg", "a.jpg", "b.jpg"]),
+        ("{files: photos}", ["[1].jpg", "a.jpg", "b.jpg", "c.jpg"]),
         ("{files: photos/*.jpg}", ["[1].jpg", "a.jpg", "b.jpg"]),
         ("{files: 'photos/[1].jpg'}", ["[1].jpg"]),
         ("{files: 'photos/**/?.jpg'}", ["a.jpg", "b.jpg", "c.jpg"]),

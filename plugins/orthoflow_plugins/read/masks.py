@@ -75,7 +75,7 @@ class Masks:
             InputError: the picture is none, has another size, or leaves nothing of the photo.
         """
         used: NDArray[np.bool_] | None = None
-        for key in dict.fromkeys((photo, Path(photo).stem)):
+        for key in dict.fromkeys((photo, Path(photo).name, Path(photo).stem)):
             path = self._pictures.get(key)
             if path is not None:
                 used = self._picture(path, photo, size)

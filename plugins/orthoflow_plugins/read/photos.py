@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -21,13 +22,22 @@ from orthoflow.files.calibration import (
     read_calibration,
 )
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.containers import image_format, is_cut_off, stated_bits
+from orthoflow.files.containers import (
+    HOW_TO_DEVELOP,
+    HOW_TO_READ_HEIC,
+    READABLE,
+    count_pages,
+    damage,
+    opaque_pixels,
+    opened,
+    photo_format,
+    stated_bits,
+)
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
 from orthoflow.files.fisheyes import FisheyeFace, FisheyeLens, fisheye_faces
 from orthoflow.files.images import (
-    HOW_TO_DEVELOP,
     PHOTO_SUFFIXES,
     RAW_SUFFIXES,
     decode_image,
@@ -48,24 +58,27 @@ _NAMED: Final = 3
 
 
 class ReadPhotos(Method):
-    """Read JPEG, PNG and TIFF photos as they are, also from inside E57 files, ordered by name.
+    """Read JPEG, PNG, TIFF, WebP and HEIC photos as they are, also of E57 files, ordered by name.
+
+    Photos of one file name in several folders are called by their paths within the input.
 
     A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
     PNG; their lenses are exact. So does a photo whose lens is a fisheye, as the calibration or the
     given cameras say (OpenCV's fisheye model), but of faces only what it shows.
 
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
-    EXIF orientation is written down, not applied. Every photo is decoded once, so that a damaged
-    file is found here and not after an hour.
+    EXIF orientation is written down, not applied. Of a TIFF with several pages the largest that is
+    no preview is the photo. Every photo is decoded once, so that a damaged file is found here and
+    not after an hour.
 
-    What is black in a mask, or within polygons, is used of a photo neither for ties nor for
-    colours: pictures NAME_mask.png beside NAME.jpg, or files of the input masks, named likewise or
-    as the photo, or GeoJSON with polygons in pixels. Masks of a panorama or a fisheye hold for its
-    faces.
+    What is transparent, black in a mask, or within polygons, is used of a photo neither for ties
+    nor for colours: pictures NAME_mask.png beside NAME.jpg, or files of the input masks, named
+    likewise or as the photo, or GeoJSON with polygons in pixels. Masks of a panorama or a fisheye
+    hold for its faces.
     """
 
     id = "read.photos"
-    result_version = 3
+    result_version = 4
     determinism = "exact"
     metrics = (
         "n_photos",
@@ -142,6 +155,7 @@ class _ReadPhoto:
     exif: Exif
     focal: FocalLength
     whole: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,12 +168,14 @@ class _Source:
             photo.
         lens: what that file says of its lens.
         whole: name of the photo that it is a face of, whose lens nobody else knows; or "".
+        folder: of the file, within the input.
     """
 
     name: str
     content: Path | E57Image | PanoramaFace | FisheyeFace
     lens: Intrinsics | None = None
     whole: str = ""
+    folder: str = ""
 
     def encoded(self) -> bytes:
         """The bytes of the photo as they are."""
@@ -218,7 +234,7 @@ class _Cubes:
                 f"photo {path.name} is named in panoramas, but has {width} x {height} pixels: a "
                 "panorama over the whole sphere is twice as wide as high"
             )
-        used = self._used(path.name, (width, height))
+        used = self._used(path.name, (width, height), encoded)
         return _of_faces(faces_of(encoded, path.stem, width, used), path.name)
 
     def _faces(self, path: Path, lens: FisheyeLens) -> list[_Source]:
@@ -229,12 +245,21 @@ class _Cubes:
                 f"{lens.width} x {lens.height}: calibrate at the size of the photos as they are "
                 "stored, without the EXIF rotation"
             )
-        faces = fisheye_faces(encoded, path.stem, lens, self._used(path.name, size))
+        used = self._used(path.name, size, encoded)
+        faces = fisheye_faces(encoded, path.stem, lens, used)
         return _of_faces(faces, path.name)
 
-    def _used(self, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    def _used(self, name: str, size: tuple[int, int], encoded: bytes) -> NDArray[np.bool_] | None:
         mask = self.masks.encoded(name, size)
-        return None if mask is None else decode_mask(mask, f"the mask of {name}")
+        given = None if mask is None else decode_mask(mask, f"the mask of {name}")
+        return _both(given, opaque_pixels(encoded))
+
+
+def _both(
+    one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None
+) -> NDArray[np.bool_] | None:
+    """Which pixels two masks leave; None stands for all."""
+    return other if one is None else one if other is None else one & other
 
 
 def _whole_photo(path: Path) -> tuple[bytes, tuple[int, int]]:
@@ -270,48 +295,67 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
     """Give a photo with its mask, where it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
-    of_face = None if isinstance(source.content, Path | E57Image) else source.content.mask()
-    if of_face is not None:
-        if mask is not None:
-            of_face = of_face & decode_mask(mask, f"the mask of {photo.name}")
-        mask = encode_png(np.where(of_face, np.uint8(255), np.uint8(0)))
+    own = (
+        opaque_pixels(photo.encoded)
+        if isinstance(source.content, Path | E57Image)
+        else source.content.mask()
+    )
+    if own is not None:
+        given = None if mask is None else decode_mask(mask, f"the mask of {photo.name}")
+        used = _both(own, given)
+        if used is None or not used.any():
+            raise InputError(
+                f"nothing of photo {photo.name} is opaque and unmasked: leave the photo out"
+            )
+        mask = encode_png(np.where(used, np.uint8(255), np.uint8(0)))
     return replace(read, photo=replace(photo, mask=mask))
 
 
 def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
-    """Photos ordered by name; says which other files there are."""
+    """Photos ordered by name; warns of other files."""
     if not files.paths:
         raise InputError(f"the input {files.name} names no files: expected photos")
+    photos = [path for path in files.paths if path not in masks]
+    folders = _folders(photos)
     sources, others = [], []
-    for path in files.paths:
-        if path in masks:
-            continue
+    for path in photos:
         if path.suffix.lower() in PHOTO_SUFFIXES:
-            sources += cubes.sources(path)
+            found = cubes.sources(path)
         elif path.suffix.lower() == E57_SUFFIX:
-            sources += _inside_e57(path)
+            found = _inside_e57(path)
         else:
             others.append(path.name)
+            continue
+        sources += [replace(source, folder=folders[path]) for source in found]
     _refuse_raw(files.name, [source.name for source in sources], others)
     if not sources:
         raise InputError(
             f"the input {files.name} holds no photo, only {len(others)} other files: "
-            f"{_names(others)}; expected JPEG, PNG or TIFF (.jpg, .png, .tif), so convert HEIC "
-            "photos first"
-        )
-    counts = Counter(source.name for source in sources)
-    twice = sorted(name for name, count in counts.items() if count > 1)
-    if twice:
-        raise InputError(
-            f"the input {files.name} holds several photos named {_names(twice)} in different "
-            "folders: poses and ties refer to photos by name, so rename one of them"
+            f"{_names(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
         )
     if others:
         ctx.warn(
-            f"{len(others)} of {len(files.paths)} files of the input {files.name} are no JPEG, "
-            f"PNG or TIFF and were left out: {_names(others)}"
+            f"{len(others)} of {len(files.paths)} files of the input {files.name} are no photos "
+            f"(JPEG, PNG, TIFF, WebP, HEIC) and were left out: {_names(others)}"
         )
-    return sorted(sources, key=lambda source: source.name)
+    return sorted(_by_their_paths(sources), key=lambda source: source.name)
+
+
+def _folders(paths: Sequence[Path]) -> dict[Path, str]:
+    """Folder of each file below the one that they have in common; empty for that one."""
+    common = os.path.commonpath([path.parent for path in paths]) if paths else ""
+    relative = {path: path.parent.relative_to(common).as_posix() for path in paths}
+    return {path: "" if folder == "." else folder for path, folder in relative.items()}
+
+
+def _by_their_paths(sources: Sequence[_Source]) -> Iterator[_Source]:
+    """Call photos of one file name by their paths within the input."""
+    counts = Counter(source.name for source in sources)
+    for source in sources:
+        if counts[source.name] > 1 and source.folder:
+            yield replace(source, name=f"{source.folder}/{source.name}")
+        else:
+            yield source
 
 
 def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -> None:
@@ -352,29 +396,39 @@ def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
     return read_calibration(files.paths[0])
 
 
-def _require_whole(name: str, encoded: bytes) -> None:
-    """Refuse what is no photo, or not all of one.
+def _require_whole(name: str, encoded: bytes) -> str:
+    """Return what is odd about a photo that is whole nevertheless, or an empty text.
 
     Raises:
-        InputError: it is not.
+        InputError: it is no photo, of a format that is not read, or a part of it is lost.
     """
-    if image_format(encoded) is None:
+    kind = photo_format(encoded)
+    if kind == "HEIC":
+        with opened(encoded) as image:
+            if image is None:
+                raise InputError(f"photo {name} is a HEIC file: {HOW_TO_READ_HEIC}")
+    elif kind is not None and kind not in READABLE:
+        way_out = HOW_TO_DEVELOP if "raw" in kind else "convert it to JPEG or TIFF, at full size"
+        raise InputError(f"photo {name} is {kind}, which is not read: {way_out}")
+    elif kind is None:
         raise InputError(
-            f"photo {name} is no JPEG, PNG or TIFF file ({len(encoded)} bytes), whatever its name "
-            "says: copy it again from the camera, or take it out"
+            f"photo {name} is no JPEG, PNG, TIFF, WebP or HEIC file ({len(encoded)} bytes), "
+            "whatever its name says: copy it again from the camera, or take it out"
         )
-    if is_cut_off(encoded):
+    found, is_lost = damage(encoded)
+    if is_lost:
         raise InputError(
-            f"photo {name} is cut off: its {len(encoded)} bytes end before the image does; copy "
-            "it again from the camera, or take it out"
+            f"photo {name} is damaged or cut off: a part of its {len(encoded)} bytes cannot be "
+            f"decoded ({found}); copy it again from the camera, or take it out"
         )
+    return found
 
 
 def _read_photo(
     source: _Source, calibration: CalibratedLenses | None, sheet: ContactSheet
 ) -> _ReadPhoto:
     name, encoded = source.name, source.encoded()
-    _require_whole(name, encoded)
+    odd = _require_whole(name, encoded)
     is_deep = (stated_bits(encoded) or 0) > _PLAIN_BITS
     pixels = (decode_levels if is_deep else decode_image)(encoded, f"photo {name}")
     height, width = pixels.shape[:2]
@@ -402,9 +456,29 @@ def _read_photo(
         exif_orientation=exif.orientation,
         exif_focal_px=focal.value_px,
         intrinsics=intrinsics,
+        camera=_camera(exif),
+        folder=source.folder,
     )
     sheet.add(name, eight_bits(pixels))
-    return _ReadPhoto(photo=photo, exif=exif, focal=focal, whole=source.whole)
+    n_pages = count_pages(encoded)
+    remarks = (
+        f"holds bytes that its decoder passes over ({odd}), so it may be damaged" if odd else "",
+        f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
+    )
+    return _ReadPhoto(
+        photo=photo,
+        exif=exif,
+        focal=focal,
+        whole=source.whole,
+        remarks=tuple(filter(None, remarks)),
+    )
+
+
+def _camera(exif: Exif) -> str:
+    """Camera and focal length, which photos of one lens have in common; empty where unknown."""
+    if not exif.camera:
+        return ""
+    return exif.camera if exif.focal_mm is None else f"{exif.camera}, {exif.focal_mm:g} mm"
 
 
 def _described(read: _ReadPhoto) -> str:
@@ -434,6 +508,8 @@ def _warn(
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
         ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")
+    for remark in dict.fromkeys(remark for item in read for remark in item.remarks):
+        ctx.warn(f"{_counted([x.photo.name for x in read if remark in x.remarks])}: {remark}")
     doubts = dict.fromkeys(item.focal.doubt for item in read if item.focal.doubt)
     for doubt in doubts:
         doubted = [item.photo.name for item in read if item.focal.doubt == doubt]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,12 @@ import pytest
 import rasterio
 from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
+from PIL import Image
 from rasterio.transform import Affine
 
 from orthoflow.errors import CancelledStepError, InputError
-from orthoflow.files.images import decode_image, decode_levels, encode_jpeg, encode_png
+from orthoflow.files.images import decode_image, decode_levels, encode_jpeg, encode_png, encode_webp
+from orthoflow.files.photo_masks import used_pixels
 from orthoflow.products import InputFiles, Photo
 from orthoflow.sdk import StepContext
 from tests import photo_files as made
@@ -165,7 +168,7 @@ def test_a_panorama_of_another_shape_is_refused(tmp_path: Path, read: Reader) ->
 
 def test_a_panorama_that_is_cut_off_is_refused(tmp_path: Path, read: Reader) -> None:
     files = {"a.jpg": encode_jpeg(made.picture(128, 64))[:-40]}
-    with pytest.raises(InputError, match=r"photo a\.jpg is cut off"):
+    with pytest.raises(InputError, match=r"photo a\.jpg is damaged or cut off"):
         read(*made.write(tmp_path, files), panoramas=("*",))
 
 
@@ -332,10 +335,7 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> N
         "K.txt": b"",
     }
     assert [item.name for item in read(*made.write(tmp_path, files))] == ["a.jpg"]
-    assert (
-        "4 of 5 files of the input photos are no JPEG, PNG or TIFF and were left out: "
-        "a.jpg.camera, Thumbs.db, a.CR2 ..." in read.warnings
-    )
+    assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 ..." in read.warnings
 
 
 @pytest.mark.parametrize("developed", [{}, {"a.jpg": encode_jpeg(made.picture())}])
@@ -397,55 +397,106 @@ def test_sixteen_bits_in_separate_planes_are_refused_where_they_decode_as_noise(
 
 
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
-    paths = made.write(tmp_path, {"a.heic": b"x", "b.txt": b"x"})
-    with pytest.raises(
-        InputError,
-        match=r"the input photos holds no photo, only 2 other files: a\.heic, b\.txt; expected "
-        r"JPEG, PNG or TIFF \(\.jpg, \.png, \.tif\), so convert HEIC photos first",
-    ):
+    paths = made.write(tmp_path, {"a.doc": b"x", "b.txt": b"x"})
+    with pytest.raises(InputError, match=r"holds no photo, only 2 other files: a\.doc, b\.txt"):
         read(*paths)
     with pytest.raises(InputError, match="the input photos names no files: expected photos"):
         read()
 
 
-def test_two_photos_of_one_name_are_refused(tmp_path: Path, read: Reader) -> None:
-    photo = encode_jpeg(made.picture())
-    paths = made.write(tmp_path, {"x/a.jpg": photo, "y/a.jpg": photo, "y/b.jpg": photo})
-    with pytest.raises(InputError, match=r"several photos named a\.jpg in different folders"):
-        read(*paths)
+def test_photos_of_one_name_live_together_under_their_paths(tmp_path: Path, read: Reader) -> None:
+    pictures = [encode_jpeg(made.picture(seed=seed)) for seed in range(4)]
+    names = ("x/one/a.jpg", "x/two/a.jpg", "x/two/b.jpg", "x/c.jpg")
+    photos = read(*made.write(tmp_path, dict(zip(names, pictures, strict=True))), calibration=None)
+    assert {photo.name: photo.encoded for photo in photos} == {
+        "one/a.jpg": pictures[0],
+        "two/a.jpg": pictures[1],
+        "b.jpg": pictures[2],
+        "c.jpg": pictures[3],
+    }
+    assert [photo.folder for photo in photos] == ["two", "", "one", "two"]
 
 
-# Damage
+def test_a_calibration_names_photos_with_and_without_their_folders(
+    tmp_path: Path, read: Reader
+) -> None:
+    names = ("one/a.jpg", "two/a.jpg")
+    paths = made.write(tmp_path, dict.fromkeys(names, encode_jpeg(made.picture())))
+    other = CAMERA.replace("fx: 60", "fx: 70")
+    text = f"cameras: {{two/*.jpg: {other}, a.jpg: {CAMERA}}}"
+    photos = read(*paths, calibration=text)
+    assert [photo.intrinsics.fx for photo in photos if photo.intrinsics] == [60.0, 70.0]
 
 
-@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+# Transparency and pages
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
+def test_what_is_transparent_is_masked(tmp_path: Path, read: Reader, kind: str) -> None:
+    alpha = np.full((48, 64), 255, dtype=np.uint8)
+    alpha[:, :21] = 0
+    stream = io.BytesIO()
+    Image.fromarray(np.dstack([made.picture(), alpha])).save(stream, kind)
+    mask = np.full((48, 64), 255, dtype=np.uint8)
+    mask[:8] = 0
+    files = {f"a.{kind.lower().replace('tiff', 'tif')}": stream.getvalue()}
+    (photo,) = read(*made.write(tmp_path, files))
+    np.testing.assert_array_equal(used_pixels(photo), alpha > 0)
+    (photo,) = read(*made.write(tmp_path, files | {"a_mask.png": encode_png(mask)}))
+    np.testing.assert_array_equal(used_pixels(photo), (alpha > 0) & (mask > 0))
+
+
+def test_a_photo_of_which_nothing_is_opaque_is_refused(tmp_path: Path, read: Reader) -> None:
+    clear = encode_png(np.dstack([made.picture(), np.zeros((48, 64), dtype=np.uint8)]))
+    with pytest.raises(InputError, match=r"nothing of photo a\.png is opaque"):
+        read(*made.write(tmp_path, {"a.png": clear}))
+
+
+# Damage and other formats
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 @pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
 def test_a_photo_that_is_cut_off_is_named(
-    tmp_path: Path, read: Reader, name: str, share: float
+    tmp_path: Path, read: Reader, suffix: str, share: float
 ) -> None:
     image = made.picture(256, 192)
-    whole = encode_jpeg(image) if name == "a.jpg" else encode_png(image)
+    writers = {"jpg": encode_jpeg, "png": encode_png, "tif": made.tiff, "webp": encode_webp}
+    whole = writers[suffix](image)
     content = whole[: int(share * len(whole))]
-    with pytest.raises(
-        InputError, match=rf"photo {name} is cut off: its {len(content)} bytes end before the image"
-    ):
-        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), name: content}))
+    with pytest.raises(InputError, match=rf"photo a\.{suffix} is damaged or cut off"):
+        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), f"a.{suffix}": content}))
 
 
-def test_a_tiff_that_is_cut_off_is_named(tmp_path: Path, read: Reader) -> None:
-    whole = made.tiff(made.picture(256, 192))
-    with pytest.raises(InputError, match=r"photo a\.tif cannot be decoded as an image"):
-        read(*made.write(tmp_path, {"a.tif": whole[: len(whole) // 2]}))
+def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: Reader) -> None:
+    whole = encode_jpeg(made.picture(256, 192))
+    padded = whole[:-2] + b"\x12" * 40 + whole[-2:]
+    assert len(read(*made.write(tmp_path, {"a.jpg": padded, "b.jpg": whole}))) == 2
+    assert "photo a.jpg: holds bytes that its decoder passes over" in read.warnings
 
 
-@pytest.mark.parametrize("content", [b"", b"<html>", b"\0" * 500], ids=["empty", "page", "zeros"])
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (b"", "is no JPEG"),
+        (b"<html>", "is no JPEG"),
+        (b"\0" * 500, "is no JPEG"),
+        (b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", r"is camera raw \(Canon CR3\).*develop to TIFF"),
+        (b"%PDF-1.7", "is PDF, which is not read: convert it"),
+        (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", r"is a HEIC file: install orthoflow-tls\[heic\]"),
+    ],
+)
 def test_a_file_that_only_has_the_name_of_a_photo_is_named(
-    tmp_path: Path, read: Reader, content: bytes
+    tmp_path: Path, read: Reader, content: bytes, named: str
 ) -> None:
-    with pytest.raises(
-        InputError, match=rf"photo a\.jpg is no JPEG, PNG or TIFF file \({len(content)} bytes\)"
-    ):
+    with pytest.raises(InputError, match=rf"photo a\.jpg {named}"):
         read(*made.write(tmp_path, {"a.jpg": content}))
+
+
+def test_webp_under_the_name_of_a_jpeg_is_read(tmp_path: Path, read: Reader) -> None:
+    image = made.picture(64, 48)
+    (photo,) = read(*made.write(tmp_path, {"a.jpg": encode_webp(image)}))
+    assert np.abs(decode_image(photo.encoded).astype(int) - image).mean() < 8.0
 
 
 def test_a_photo_that_vanished_is_named(tmp_path: Path, read: Reader) -> None:
@@ -534,7 +585,7 @@ def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Read
     ]  # fmt: skip
     assert {(p.width, p.height, p.exif_orientation) for p in photos} == {(4000, 3000, 6)}
     assert [photo.exif_focal_px for photo in photos] == pytest.approx([3004.6] * 3, abs=0.1)
-    assert "4 of 7 files of the input photos are no JPEG" in read.warnings
+    assert "4 of 7 files of the input photos are no photos" in read.warnings
 
 
 def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
