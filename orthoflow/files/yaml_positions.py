@@ -22,7 +22,9 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 from ruamel.yaml.parser import Parser
+from ruamel.yaml.resolver import VersionedResolver
 from ruamel.yaml.scanner import Scanner
+from ruamel.yaml.tag import Tag
 
 from orthoflow.products.product import JsonValue
 
@@ -185,6 +187,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
             yaml = YAML(typ="safe", pure=True)
             yaml.Scanner, yaml.Parser = _QuickScanner, _LimitedParser
+            yaml.Resolver = _CoreResolver
             yaml.parser.most_values = dialect.most_values
             node: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
@@ -196,6 +199,36 @@ def _compose(text: str, dialect: Dialect) -> Node:
     if node is None:
         raise _UnreadableError(_START, dialect.empty)
     return node
+
+
+# The core schema of YAML 1.2.2, section 10.3.2. ruamel.yaml's own rules for 1.2 still read `1_000`
+# and `0b11` as numbers, and `.5e-1` as text.
+_CORE_SCHEMA: Final = (
+    ("null", re.compile(r"null|Null|NULL|~|")),
+    ("bool", re.compile(r"true|True|TRUE|false|False|FALSE")),
+    ("int", re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")),
+    (
+        "float",
+        re.compile(
+            r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
+            r"|[-+]?(\.inf|\.Inf|\.INF)|\.nan|\.NaN|\.NAN"
+        ),
+    ),
+    ("merge", re.compile(re.escape(_MERGE))),
+)
+
+
+class _CoreResolver(VersionedResolver):
+    """Finds out by the core schema what a plain scalar is."""
+
+    # Any: as in ruamel.yaml.
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        """Return the tag of a node that has none of its own."""
+        if kind is ScalarNode and implicit[0]:
+            for name, form in _CORE_SCHEMA:
+                if form.fullmatch(value):
+                    return Tag(suffix=_TAG + name)
+        return super().resolve(kind, value, (False, True))
 
 
 class _QuickScanner(Scanner):
@@ -435,7 +468,7 @@ def join(path: str, key: str) -> str:
 
 def _parse_scalar(kind: str, text: str) -> Scalar:
     match kind:
-        case "str" | "timestamp" | "merge" | "value":
+        case "str" | "merge":
             return text
         case "null":
             return None
@@ -445,14 +478,8 @@ def _parse_scalar(kind: str, text: str) -> Scalar:
             if len(text) > MOST_DIGITS:
                 # Decimal ones Python refuses by itself, others it could not put into words.
                 raise ValueError(f"more than {MOST_DIGITS} digits")
-            digits = text.replace("_", "").lower()
-            base = next((base for mark, base in _BASES.items() if mark in digits), 10)
-            return int(digits, base)
+            return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
         case "float":
-            number = text.replace("_", "").lower()
-            return float(number.replace(".inf", "inf").replace(".nan", "nan"))
+            return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
         case _:
             raise KeyError(kind)
-
-
-_BASES: Final = {"0x": 16, "0o": 8, "0b": 2}

@@ -68,18 +68,26 @@ def test_every_value_knows_its_line_and_column() -> None:
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("12", 12),
-        ("-0x1F", -31),
-        ("0o17", 15),
-        ("1_000", 1000),
-        ("1e3", 1000.0),
-        ("-.inf", float("-inf")),
-        ("true", True),
-        ("False", False),
-        ("~", None),
+        # The table of the core schema, YAML 1.2.2 section 10.3.2, and what is close to it.
+        *((text, None) for text in ("null", "Null", "NULL", "~", "")),
+        *((text, True) for text in ("true", "True", "TRUE")),
+        *((text, False) for text in ("false", "False", "FALSE")),
+        *(("12", 12), ("-12", -12), ("+12", 12), ("014", 14), ("0o14", 12), ("0xC", 12)),
+        *(("0xc", 12), ("0o17", 15), ("0", 0), ("-0", 0)),
+        *((".5e-1", 0.05), ("-.5", -0.5), ("1e3", 1000.0), ("12e03", 12000.0), ("-2E+05", -2e5)),
+        *(("5.", 5.0), ("+12.3", 12.3), ("1.e2", 100.0), ("0.1", 0.1)),
+        *((text, float("inf")) for text in (".inf", ".Inf", ".INF", "+.inf")),
+        *(("-.inf", float("-inf")), ("-.INF", float("-inf"))),
+        *(
+            (text, text)
+            for text in (
+                *("1_000", "0b11", "-0o14", "-0x1F", "0o18", "0xG", "1e", ".e1", "1.2.3", "12:30"),
+                *("yes", "no", "on", "off", "y", "n", "tRUE", "nULL", "inf", "nan", ".iNf"),
+                *("2001-01-01", "1,5", "0x", "0o", "1e-", "."),
+            )
+        ),
         ("'12'", "12"),
-        ("yes", "yes"),
-        ("2001-01-01", "2001-01-01"),
+        ('"true"', "true"),
         ("!!float 3", 3.0),
         ("!!str 3", "3"),
     ],
