@@ -21,7 +21,6 @@ from pathlib import Path
 kernels = tempfile.mkdtemp(prefix="orthoflow-compile-times-")
 atexit.register(shutil.rmtree, kernels, ignore_errors=True)
 os.environ["NUMBA_CACHE_DIR"] = kernels
-os.environ["ORTHOFLOW_KERNELS"] = kernels
 
 from numba.core import event  # noqa: E402 - it reads the variable
 

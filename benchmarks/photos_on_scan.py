@@ -49,7 +49,7 @@ def main() -> None:
     if not (folder / "calibration.yaml").exists():
         folder.mkdir(parents=True, exist_ok=True)
         make(folder, options)
-    variables = {**os.environ, "ORTHOFLOW_KERNELS": str(folder / "kernels")}
+    variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
 
     def orthoflow(*words: str) -> None:
         command = [sys.executable, "-m", "orthoflow", *words]

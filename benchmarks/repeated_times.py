@@ -57,7 +57,7 @@ def measured(folder: Path, recipe: str, step: str, number: int) -> Times:
         command = [sys.executable, "-m", "orthoflow", "run", recipe, "-o", str(target)]
         command += ["--store", str(folder / "store"), *(["--force", step] if number > 1 else [])]
         # Kernels that earlier runs of this user compiled are not taken over.
-        variables = {**os.environ, "ORTHOFLOW_KERNELS": str(folder.resolve() / "kernels")}
+        variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder.resolve() / "kernels")}
         before = os.getloadavg()[0]
         subprocess.run(command, check=True, env=variables, stdout=subprocess.DEVNULL)
         loads = {"before": before, "at its end, of 15 minutes": os.getloadavg()[2]}

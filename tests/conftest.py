@@ -6,7 +6,6 @@ import gc
 import hashlib
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 
+from orthoflow.engine.kernels import kernel_sources, private_folder
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.kept_memory import KEPT_MEMORY
@@ -32,30 +32,16 @@ if TYPE_CHECKING:
 _ROOT = Path(__file__).resolve().parents[1]
 
 
-def _kernels_digest() -> str:
-    """Digest of all modules that compile something, wherever they stand."""
-    packages = [_ROOT / "orthoflow", _ROOT / "plugins" / "orthoflow_plugins"]
-    paths = [path for package in packages for path in sorted(package.rglob("*.py"))]
-    texts = {path: path.read_bytes() for path in paths}
-    kernels = [
-        text
-        for path, text in texts.items()
-        if path.name == "compiling.py" or b"geometry.compiling" in text
-    ]
-    return hashlib.sha256(b"".join(kernels)).hexdigest()[:16]
-
-
 # As the command line has it. A search for garbage goes through all that eight thousand tests and
 # the libraries hold; with Python's own threshold that was a fifth of what detecting planes took.
 gc.set_threshold(50_000, *gc.get_threshold()[1:])
 
-# Numba's own cache does not notice edits of kernels that a kernel calls: a folder per state of all
-# of them does. One per user as well, since nobody can write into another's. Set before anything
-# imports numba.
-os.environ.setdefault(
-    "NUMBA_CACHE_DIR",
-    str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{os.getuid()}-{_kernels_digest()}"),
-)
+# For what numba compiles, set before anything imports it: a folder per state of all kernels, in the
+# private cache of the user, for the tests and for the steps that they run.
+_PACKAGES = [_ROOT / "orthoflow", _ROOT / "plugins" / "orthoflow_plugins"]
+_KERNELS = kernel_sources([path for package in _PACKAGES for path in package.rglob("*.py")])
+_STATE = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(_KERNELS))).hexdigest()
+os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba-of-tests") / _STATE[:16]))
 
 # What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
@@ -69,9 +55,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # anew: 0.7 s instead of 0.5 to import what it needs.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
     sys.dont_write_bytecode = False
-
-# Stores that tests make begin with what others have compiled, and never in the user's cache.
-os.environ.setdefault("ORTHOFLOW_KERNELS", f"{os.environ['NUMBA_CACHE_DIR']}-of-stores")
 
 # The same examples on every machine, however slow it is; the long loop draws others each time.
 settings.register_profile(

@@ -12,6 +12,6 @@ def bare_task(**more: Any) -> Task:
     plain: dict[str, Any] = {
         "method": "work.add", "address": "step", "run_id": "r1", "target": "x:Y", "key": "k",
         "key_preimage": "{}", "params": {}, "seed": 0, "inputs": {}, "outputs": {}, "cores": 1,
-        "timeout_s": None, "store": "store", "folder": "f", "log": "l", "numba_folder": "",
+        "timeout_s": None, "store": "store", "folder": "f", "log": "l", "kernels": "",
     }  # fmt: skip
     return Task(**(plain | more))

@@ -24,7 +24,6 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.engine.events import RunEvent
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduling import RunOutcome, execute
@@ -91,22 +90,17 @@ class World:
 
 @contextmanager
 def toy_world(folder: Path) -> Iterator[World]:
-    """Install the toys below a folder and make them importable while the block runs.
-
-    They need none of our kernels: their stores do not begin with all that tests have compiled.
-    """
+    """Install the toys below a folder and make them importable while the block runs."""
     site = folder / "site"
     if not site.exists():
         install_toys(site)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(KERNELS, str(site / "kernels"))
-        sys.path.insert(0, str(site))
+    sys.path.insert(0, str(site))
+    forget_toys()
+    try:
+        yield World(folder=folder, site=site)
+    finally:
+        sys.path.remove(str(site))
         forget_toys()
-        try:
-            yield World(folder=folder, site=site)
-        finally:
-            sys.path.remove(str(site))
-            forget_toys()
 
 
 def digests(outcome: RunOutcome) -> dict[str, str]:

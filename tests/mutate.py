@@ -430,8 +430,6 @@ class Worker:
             **os.environ,
             "PYTHONPATH": os.pathsep.join(parts),
             "NUMBA_CACHE_DIR": str(kernels),
-            # Those in stores are in a folder per state of the code.
-            "ORTHOFLOW_KERNELS": str(self.folder / "kernels-of-stores"),
             "MPLBACKEND": "Agg",
             "TMPDIR": str(scratch),
         }

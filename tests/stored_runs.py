@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from orthoflow.engine.compiled_code import VARIABLE
 from orthoflow.records.runs import open_run
 from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys
@@ -96,8 +95,7 @@ def stored_runs(folder: Path, workflow: str = WORKFLOW) -> Iterator[StoredRuns]:
     numbers = folder / "numbers.txt"
     numbers.write_text("3 1 4 1 5")
     os.utime(numbers, (1e9, 1e9))  # settled, so that its digest is remembered
-    own = {"PYTHONPATH": str(folder / "site"), VARIABLE: str(folder / "site" / "kernels")}
-    with run_server(folder, {**os.environ, **own}) as server:
+    with run_server(folder, {**os.environ, "PYTHONPATH": str(folder / "site")}) as server:
         first = StoredRuns(server, 0, 0.0)
         answer = first.run("sound", "quiet", here=True)
         assert answer.code == 0, answer.said

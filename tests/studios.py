@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from orthoflow.cli.program import program
 from orthoflow.records.runs import Run, open_run
-from tests.workshop_runs import KERNELS, WORKSHOP, write_studio
+from tests.workshop_runs import WORKSHOP, write_studio
 
 
 def asked(*arguments: object) -> Result:
@@ -58,8 +58,6 @@ def open_studio(folder: Path, patch: pytest.MonkeyPatch) -> Studio:
     write_studio(folder)
     patch.chdir(folder)
     patch.syspath_prepend(str(WORKSHOP))
-    for name, place in KERNELS.items():
-        patch.setenv(name, place)
     # The page takes half of such a small run, and has tests of its own.
     patch.setattr("orthoflow.report.write_report", _write_empty_report)
     return Studio(folder)

@@ -9,13 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from orthoflow.engine.compiled_code import VARIABLE
 from tests.forked_commands import run_command
 
 WORKSHOP = Path(__file__).resolve().parent / "workshop"
-
-# Its stores begin with the kernels of the workshop, not with all of ours, which it never calls.
-KERNELS = {VARIABLE: f"{os.environ[VARIABLE]}-of-the-workshop"}
 
 STUDIO = """\
 orthoflow: 1
@@ -33,7 +29,7 @@ def workshop_environment(*more: Path) -> Mapping[str, str]:
     """The environment with the workshop installed, and the distributions in more folders."""
     folders = [str(WORKSHOP), *map(str, more), os.environ.get("PYTHONPATH", "")]
     path = os.pathsep.join(folders).rstrip(os.pathsep)
-    return {**os.environ, **KERNELS, "PYTHONPATH": path}
+    return {**os.environ, "PYTHONPATH": path}
 
 
 def write_studio(folder: Path, method: str = "paint.plain") -> Path:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import inspect
 import json
 import os
-import tempfile
-import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -25,7 +23,6 @@ from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISS
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
-from orthoflow.system import usable_cores
 
 if TYPE_CHECKING:
     from orthoflow.sdk import Method, MethodParams, Ports
@@ -499,32 +496,13 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 
 @contextmanager
 def _sharing_kernels(method_id: str) -> Iterator[None]:
-    """Let the suite begin with what this user's runs have compiled, and leave them what it does.
+    """Let the suite use what this user's runs have compiled, and leave them what it compiles."""
+    from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
+    from orthoflow.engine.keys import compiled_digest
 
-    Without it the runs in a process of their own would compile everything once more. What is told
-    of the method's kernels is compiled on a second core from the last one on, until both meet.
-    """
-    from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
-    from orthoflow.engine.compiling_ahead import AheadCompiler
-    from orthoflow.engine.executors import COMPILED_CODE, compiled_code_in
-    from orthoflow.engine.keys import compiled_digest, method_facts
-    from orthoflow.engine.store import Store
-
-    if COMPILED_CODE in os.environ:
+    if VARIABLE in os.environ:
         yield
         return
-    catalog, since_ns = discover_catalog(), time.time_ns()
-    digest = compiled_digest(catalog.method(method_id))
-    ahead = AheadCompiler(is_wanted=usable_cores() > 1)
-    with tempfile.TemporaryDirectory(prefix="orthoflow-check-") as folder:
-        kernels = begun_with_warm(Store(Path(folder)).numba_folder(digest))
-        try:
-            if ahead.is_wanted:
-                # What a method lacks the suite says.
-                with suppress(PluginError):
-                    ahead.begin({kernels: [method_facts(method_id, catalog)]}, is_backwards=True)
-            with compiled_code_in(str(kernels)):
-                yield
-        finally:
-            ahead.close()
-            leave_for_others(kernels, since_ns)
+    digest = compiled_digest(discover_catalog().method(method_id))
+    with kernels_in(kernel_folder(digest)):
+        yield

@@ -15,7 +15,6 @@ from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD
 from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, duration, echo, echo_json, size
-from orthoflow.errors import StoreError
 
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
@@ -43,9 +42,9 @@ _UNKNOWN: Final = "no simulated room tries it: it compiles when it first runs"
 def warm(workflow: str | None, *, as_json: bool) -> int:
     """Compile the kernels of all our methods, or of those in WORKFLOW, on small simulated rooms.
 
-    Every store then begins with them, instead of compiling at its first run. They are kept in the
-    folder that the variable ORTHOFLOW_KERNELS names, else in the user's cache. Runs leave there
-    what they compile, where they may; so it may be a read-only part of a container image.
+    Runs of this user then find them, instead of compiling. They are kept in the user's cache
+    (~/.cache/orthoflow), or in the folder that the variable NUMBA_CACHE_DIR names, as long as
+    nobody else may write there; never in a store.
     """
     warmed = _warm(workflow)
     if as_json:
@@ -104,18 +103,13 @@ class _Call:
 
 def _warm(workflow: str | None) -> Warmed:
     from orthoflow.catalog.discovery import discover_catalog
-    from orthoflow.engine.compiled_code import VARIABLE, warm_folder
-    from orthoflow.engine.durability import size_of, writing_to
+    from orthoflow.engine.durability import size_of
+    from orthoflow.engine.kernels import all_kernels
 
-    started, folder, catalog = time.monotonic(), warm_folder(), discover_catalog()
+    started, folder, catalog = time.monotonic(), all_kernels(), discover_catalog()
     wanted = _calls_of(workflow, catalog) if workflow is not None else None
-    try:
-        with writing_to(folder), tempfile.TemporaryFile(dir=_made(folder)):
-            pass
-    except StoreError as error:
-        raise StoreError(f"{error}; name one with the variable {VARIABLE}") from error
     n_before = _n_kernels(folder)
-    results = _results(catalog, wanted, folder)
+    results = _results(catalog, wanted)
     reasons = {method: result for method, result in results.items() if result.status != "ok"}
     missing = {method for method, result in reasons.items() if result.exit_code == 4}
     unknown = sorted({call.method for call in wanted or ()} - set(results))
@@ -134,11 +128,6 @@ def _warm(workflow: str | None) -> Warmed:
     )
 
 
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
 def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
     from orthoflow.workflow.cells import expand_cells
     from orthoflow.workflow.document import load_workflow
@@ -150,9 +139,7 @@ def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
     return frozenset(calls | near | {_Call(call.method) for call in calls})
 
 
-def _results(
-    catalog: Catalog, wanted: Collection[_Call] | None, folder: Path
-) -> dict[str, CellResult]:
+def _results(catalog: Catalog, wanted: Collection[_Call] | None) -> dict[str, CellResult]:
     """Run the recipes in a store that goes away; give one result per method, a good one first."""
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
@@ -164,9 +151,6 @@ def _results(
     seen: set[_Call] = set()
     with tempfile.TemporaryDirectory(prefix="orthoflow-warm-") as scratch:
         store = Store(Path(scratch) / "store")
-        store.folder.mkdir()
-        # Numba writes where the kernels shall stay.
-        (store.folder / "numba").symlink_to(folder)
         for recipe, sets in _recipes().items():
             loaded = load_workflow(recipe, catalog, sets=sets)
             cells = _new_cells(expand_cells(loaded, catalog), wanted, seen)
@@ -232,5 +216,5 @@ def _print(warmed: Warmed) -> None:
     echo(
         f"compiled {counted(warmed.n_compiled, 'kernel')} of "
         f"{counted(len(warmed.methods), 'method')} in {duration(warmed.wall_s)}{before}",
-        f"every store begins with them: {warmed.folder}, {size(warmed.size_bytes)}",
+        f"runs of this user find them: {warmed.folder}, {size(warmed.size_bytes)}",
     )

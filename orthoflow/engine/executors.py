@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import sys
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
 from orthoflow.engine.durability import write_whole
+from orthoflow.engine.kernels import kernel_folder, kernels_in
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.running import failed_result, run_task
 from orthoflow.engine.tasks import Task
@@ -21,8 +19,6 @@ from orthoflow.foreign_text import shown
 from orthoflow.sdk.context import StepEvent
 
 Tell = Callable[[str, StepEvent], None]
-# Names the folder for what numba compiles.
-COMPILED_CODE: Final = "NUMBA_CACHE_DIR"
 # Of a long log the end is kept.
 _MOST_LINES: Final = 2000
 
@@ -126,7 +122,7 @@ class InlineExecutor:
                 log.append(shown(event.text, keep="\n"))
             self._tell(task.address, event)
 
-        with compiled_code_in(task.numba_folder):
+        with kernels_in(kernel_folder(task.kernels)):
             result = run_task(task, listen, self._is_interrupted)
         text = "".join(f"{line}\n" for line in log)
         write_whole(Path(task.log), text.encode())
@@ -139,27 +135,3 @@ class InlineExecutor:
     def close(self) -> None:
         """Forget the tasks in line."""
         self._waiting.clear()
-
-
-@contextmanager
-def compiled_code_in(folder: str) -> Iterator[None]:
-    """Let numba keep what it compiles in a folder, in this process, for as long as a step runs."""
-    before = os.environ.get(COMPILED_CODE)
-    os.environ[COMPILED_CODE] = folder
-    tell_numba()
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[COMPILED_CODE]
-        else:
-            os.environ[COMPILED_CODE] = before
-        tell_numba()
-
-
-def tell_numba() -> None:
-    """Let numba read the environment again, which it does once, when it is imported."""
-    if "numba" in sys.modules:
-        from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
-
-        config.reload_config()  # type: ignore[no-untyped-call]

@@ -25,8 +25,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from orthoflow.engine.child import run_step
-from orthoflow.engine.executors import tell_numba
 from orthoflow.engine.keeper import fork_kept
+from orthoflow.engine.kernels import reload_numba_config
 from orthoflow.system import address_space, resource
 
 # One per message: pid of the keeper, then its end as `os.waitstatus_to_exitcode` has it.
@@ -225,7 +225,7 @@ def _move_to(request: StepRequest) -> None:
     os.environ.update(request.variables)
     sys.path[:] = request.paths
     importlib.invalidate_caches()
-    tell_numba()
+    reload_numba_config()
     os.chdir(request.folder)
 
 

@@ -19,8 +19,6 @@ from orthoflow.engine.store_folder import is_store, require_store
 from orthoflow.errors import ArgumentError
 
 _DAY_S: Final = 86_400.0
-# Compiled kernels of code that nobody runs any more.
-_COMPILED_DAYS: Final = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +79,6 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
         *failures,
         *_children(store.scratch),
         *_children(parts_folder(store)),
-        *_stale_kernels(store),
         *_half_written(store),
     )
     freed = sum(size_of(path) for path in (*results, *objects, *preimages, *rest))
@@ -112,13 +109,6 @@ def _kept_objects(store: Store, gone: set[str]) -> set[str]:
         if result is not None:
             kept |= result.objects
     return kept
-
-
-def _stale_kernels(store: Store) -> Iterator[Path]:
-    for folder in _children(store.folder / "numba"):
-        newest = max((path.stat().st_mtime for path in folder.rglob("*")), default=0.0)
-        if time.time() - newest > _COMPILED_DAYS * _DAY_S:
-            yield folder
 
 
 def _half_written(store: Store) -> Iterator[Path]:

@@ -19,7 +19,7 @@ from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
 from orthoflow.catalog.distributions import package_path, source_files
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
-from orthoflow.engine.kernel_sources import kernel_sources
+from orthoflow.engine.kernels import kernel_sources
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError

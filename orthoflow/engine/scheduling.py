@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final, Literal
 
 from orthoflow.engine.clock import now
-from orthoflow.engine.compiling_ahead import AheadCompiler
 from orthoflow.engine.durability import remove_tree, writing_to
 from orthoflow.engine.events import (
     CellFinished,
@@ -58,7 +57,6 @@ from orthoflow.errors import (
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
-from orthoflow.system import HAS_STEP_PROCESSES
 from orthoflow.workflow.cells import Cell, CellOutput, compared_cells
 
 _POLL_S: Final = 0.25
@@ -171,15 +169,9 @@ def execute(
             executor = executor_of(
                 plan, scratch, _passing_on(listen, splits), lambda: interruption.is_asked
             )
-            # Of other executors, one computes in this process, and others on other machines.
-            ahead = AheadCompiler(
-                is_wanted=HAS_STEP_PROCESSES
-                and plan.options.executor == "local"
-                and plan.options.all_cores > 1
-            )
-            run = _Run(tasks, splits, journal, listen, ahead)
+            run = _Run(tasks, splits, journal, listen)
             try:
-                with closing(executor), tasks.sharing_kernels(), closing(ahead):
+                with closing(executor):
                     run.go(executor, interruption)
             except (CancelledStepError, ClusterError, StoreError):
                 if on_interruption is not None:
@@ -205,11 +197,9 @@ class _Run:
         splits: Splits,
         journal: Journal,
         listen: RunListener,
-        ahead: AheadCompiler,
     ) -> None:
         self._tasks = tasks
         self._splits = splits
-        self._ahead = ahead
         self._plan = tasks.plan
         self._store = tasks.store
         self._failures = Failures.of_store(tasks.store.folder)
@@ -389,18 +379,12 @@ class _Run:
         del self._waiting[cell.address]
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
-        if task.is_compared:
-            self._ahead.hold()
-        self._ahead.leave(task.method)
         facts, n_parts = self._plan.methods[cell.method], self._n_parts(task, executor.capacity)
         is_forced = cell.step in self._plan.options.force and not self._journal.is_resumed
         if self._splits.begin(task, facts, n_parts, is_forced=is_forced):
             self._go_on_in_parts(executor)
         else:
             self._run(task, executor)
-        if self._ahead.is_wanted and not self._compared.intersection(self._running):
-            later = (item.cell for item in self._waiting.values())
-            self._ahead.begin(self._tasks.kernels_of(later))
 
     def _run(self, task: Task, executor: Executor) -> None:
         self._running[task.address] = task

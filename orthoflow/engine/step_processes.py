@@ -20,12 +20,11 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.environment import python_path
-from orthoflow.engine.executors import COMPILED_CODE
 from orthoflow.engine.fork_server import NO_PROCESS, NUMBER, StepRequest
+from orthoflow.engine.kernels import VARIABLE, kernel_folder, private_folder
 from orthoflow.engine.tasks import Task
 from orthoflow.errors import StepFailedError
 from orthoflow.system import resource
@@ -68,7 +67,7 @@ _READ_AT_LOADING: Final = (
 # OpenCV puts it before LD_LIBRARY_PATH once it is loaded, for processes that it starts itself.
 _OF_OPENCV: Final = "/cv2/../../lib64"
 # These differ from store to store and are told to each step.
-_READ_LATER: Final = (COMPILED_CODE, "MPLCONFIGDIR", "PYTHONPATH")
+_READ_LATER: Final = (VARIABLE, "MPLCONFIGDIR", "PYTHONPATH")
 # Threads of OpenBLAS, of which numpy and scipy bring a set each, spin for 2**26 turns of the clock
 # when they begin and after each product: some 0.05 s of processor time. 2**20 are less than 1 ms.
 _SLEEPS_SOON: Final = {"OPENBLAS_THREAD_TIMEOUT": "20"}
@@ -277,14 +276,16 @@ def _start_server(variables: Mapping[str, str], log: int) -> _Server:
 def _variables(task: Task) -> dict[str, str]:
     """Environment variables for the process of a task."""
     variables = _SLEEPS_SOON | _without_opencv(os.environ)
+    # A setting of somebody who debugs kernels; for that there is --executor inline.
+    variables.pop("NUMBA_DISABLE_JIT", None)
     variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
     return variables | {
         "PYTHONPATH": python_path(),
         "PYTHONHASHSEED": "0",
         "PYTHONUNBUFFERED": "1",
-        COMPILED_CODE: task.numba_folder,
+        VARIABLE: str(kernel_folder(task.kernels)),
         "MPLBACKEND": "Agg",
-        "MPLCONFIGDIR": str(Path(task.store) / "matplotlib"),
+        "MPLCONFIGDIR": str(private_folder("matplotlib")),
         "TMPDIR": str(task.scratch),
     }
 

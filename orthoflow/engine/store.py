@@ -9,7 +9,6 @@ Layout below the store's folder:
     preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
     failures/<key>.json             how cells failed last time (`failures`); disposable
     digests.json                    memory of input files' digests; disposable
-    numba/<source digest>/          compiled kernels; disposable
     scratch/<run id>/               work in progress; removed with its run
     parts/<key>/                    a store of what parts of a step gave (`splitting`); disposable
     lock                            shared by runs, exclusive for garbage collection
@@ -142,10 +141,6 @@ class Store:
     def file_digests(self) -> FileDigests:
         """Give the memory of input files' digests; call its `save` when done."""
         return FileDigests(self.folder / "digests.json")
-
-    def numba_folder(self, source_digest: str) -> Path:
-        """Where kernels compiled from this source are kept."""
-        return self.folder / "numba" / source_digest[:32]
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:

@@ -11,10 +11,10 @@ from orthoflow.errors import ArgumentError
 # Made together when a store is first used. The last one is what a store is known by: a git
 # repository has `objects`, and anybody's folder may have `results`.
 _MADE: Final = ("scratch", "results", "objects", "preimages")
-# What else may come first: compiled kernels before any result, a lock before the folders. A disk
-# of its own has `lost+found`, and systems leave hidden files everywhere.
+# What else may come first, as a lock does. A disk of its own has `lost+found`, and systems leave
+# hidden files everywhere.
 _OURS: Final = frozenset(
-    {*_MADE, "failures", "damaged", "numba", "parts", "matplotlib", "digests.json", "lock"}
+    {*_MADE, "failures", "damaged", "parts", "digests.json", "lock"}
     | {"damaged.lock", "lost+found"}
 )
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
 from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import CellKey, MethodFacts
 from orthoflow.engine.plan import PlannedInput, ProductTarget, RunPlan
@@ -63,31 +60,10 @@ class TaskMaker:
             store=str(self.store.folder),
             folder=str(self.scratch / uuid.uuid4().hex[:12]),
             log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            numba_folder=str(self._kernels(facts)),
+            kernels=facts.compiled_digest,
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),
         )
-
-    def kernels_of(self, cells: Iterable[Cell]) -> dict[Path, list[MethodFacts]]:
-        """Give folders for compiled kernels -> the methods of cells, each once."""
-        folders: dict[Path, list[MethodFacts]] = {}
-        for method in dict.fromkeys(cell.method for cell in cells if not cell.skip_reason):
-            facts = self.plan.methods[method]
-            folders.setdefault(self._kernels(facts), []).append(facts)
-        return folders
-
-    def _kernels(self, facts: MethodFacts) -> Path:
-        return begun_with_warm(self.store.numba_folder(facts.compiled_digest))
-
-    @contextmanager
-    def sharing_kernels(self) -> Iterator[None]:
-        """Give stores that begin later what is compiled while the block runs."""
-        since_ns = time.time_ns()
-        try:
-            yield
-        finally:
-            for digest in {facts.compiled_digest for facts in self.plan.methods.values()}:
-                leave_for_others(self.store.numba_folder(digest), since_ns)
 
     def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
         source = cell.inputs[port]

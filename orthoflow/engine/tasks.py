@@ -102,7 +102,7 @@ class Task(MethodIdentity):
         store: folder of the store.
         folder: folder of the task, on the store's file system: scratch and unfinished objects.
         log: file that takes stdout and stderr.
-        numba_folder: where compiled kernels are kept.
+        kernels: names the folder for compiled kernels.
         environment: where it will run.
         is_compared: whether its times stand beside those of others.
         part: the part to compute; None for a whole step.
@@ -124,7 +124,7 @@ class Task(MethodIdentity):
     store: str
     folder: str
     log: str
-    numba_folder: str
+    kernels: str
     environment: RecordedEnvironment | None = None
     is_compared: bool = False
     part: TaskPart | None = None

@@ -11,16 +11,18 @@ about shapes: kernels put numbers, one by one.
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
-from numba.core import event, sigutils, types
-from numba.core.compiler_lock import global_compiler_lock
+from numba.core import event, types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
 
-from orthoflow.geometry.kept_kernels import KeptKernels
 from orthoflow.geometry.kernel_news import tell
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
@@ -45,7 +47,7 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Give an inlined function as Python runs it, for a few single calls."""
-    return cast("Callable[..., Any]", kernel.py_func)  # type: ignore[attr-defined]
+    return cast("Callable[..., Any]", getattr(kernel, "py_func", kernel))
 
 
 def kernel_part(function: _Kernel) -> _Kernel:
@@ -61,8 +63,9 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
 
     def compile_part(function: _Kernel) -> _Kernel:
         kernel = _kept(function, **_UNWRAPPED)
-        kernel.compile(signature)
-        kernel.disable_compile()
+        if isinstance(kernel, Dispatcher):
+            kernel.compile(signature)
+            kernel.disable_compile()
         return cast("_Kernel", kernel)
 
     return compile_part
@@ -73,29 +76,56 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
     """Make a kernel whose compiled code is kept between processes."""
     # Divisions do not stop at 0: lanes of a vector can fill.
     kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
+    if not isinstance(kernel, Dispatcher):
+        # NUMBA_DISABLE_JIT: Python runs it.
+        return kernel
     # Where nothing can be kept, no home and a program that only others may change, it is compiled
     # in each process.
     with suppress(RuntimeError):
-        _keep(kernel, KeptKernels(kernel))
+        vars(kernel)["_cache"] = _KernelCache(function)  # numba has no public name for it
     _give_constants_no_version(kernel)
     return kernel
 
 
-def _keep(kernel: Any, kept: KeptKernels) -> None:
-    """Let a kernel be loaded where it is kept, and else be compiled by one process alone."""
-    kernel._cache = kept  # noqa: SLF001 - numba has no other door for it
-    compile_it = kernel.compile
+class _KernelCache(FunctionCache):
+    """Numba's cache of a function, for processes that compile at the same time."""
 
-    def compile_once(signature: Any) -> object:
-        # The compiler's lock first: who holds it never waits for a thread of this process.
-        with global_compiler_lock:
-            arguments, _ = sigutils.normalize_signature(signature)  # type: ignore[no-untyped-call]
-            if tuple(arguments) in kernel.overloads or kept.holds(signature, kernel.targetctx):
-                return compile_it(signature)
-            with kept.alone():
-                return compile_it(signature)
+    def __init__(self, function: Callable[..., object]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file = _KernelFiles(
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=self._impl.locator.get_source_stamp(),
+        )  # type: ignore[no-untyped-call]
 
-    kernel.compile = compile_once
+
+class _KernelFiles(IndexDataCacheFile):
+    """Index and versions of a kernel.
+
+    Numba numbers the files of versions, and two processes that compile two versions at once take
+    one number for both: the index of one then names the code of the other. Here no two files have
+    one name. A file that was cut off by a power failure is as good as none.
+    """
+
+    def save(self, key: object, data: object) -> None:
+        # A full disk costs the next process some seconds, and not this one its result.
+        with suppress(OSError):
+            super().save(key, data)  # type: ignore[no-untyped-call]
+
+    def _data_name(self, number: int) -> str:
+        return f"{Path(self._index_path).stem}.{number}-{uuid.uuid4().hex[:12]}.nbc"
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            return cast("dict[Any, str]", super()._load_index())  # type: ignore[no-untyped-call]
+        except Exception:  # noqa: BLE001 - whatever unpickling half a file raises
+            return {}
+
+    def _load_data(self, name: str) -> Any:
+        try:
+            return super()._load_data(name)  # type: ignore[no-untyped-call]
+        except Exception:  # noqa: BLE001 - as above
+            return None
 
 
 def _give_constants_no_version(kernel: Any) -> None:

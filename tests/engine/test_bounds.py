@@ -15,7 +15,6 @@ from orthoflow.engine import plan as planning
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.run_folder import cell_file_name
-from tests.engine_world import World
 
 
 def test_a_file_is_called_after_its_cell_in_two_hundred_bytes() -> None:
@@ -73,20 +72,6 @@ def test_a_digest_is_kept_of_a_file_that_rests_for_two_seconds(
     digests.digest(path)
     digests.save()
     assert memo.exists() is is_kept
-
-
-@pytest.mark.parametrize(("days", "is_stale"), [(29.9, False), (30.1, True)])
-def test_kernels_that_nobody_used_for_thirty_days_are_garbage(
-    world: World, days: float, is_stale: bool
-) -> None:
-    folder = world.store.folder / "numba" / "code"
-    folder.mkdir(parents=True)
-    moment = time.time() - days * 24 * 3600
-    # The newest file counts.
-    for name, older_s in (("old.nbi", 1e6), ("new.nbi", 0.0)):
-        (folder / name).touch()
-        os.utime(folder / name, (moment, moment - older_s))
-    assert list(garbage._stale_kernels(world.store)) == ([folder] if is_stale else [])
 
 
 @pytest.mark.parametrize(("days", "is_old"), [(6.99, False), (7.01, True)])

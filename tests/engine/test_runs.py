@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 
 import pytest
 
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
-from orthoflow.engine.executors import compiled_code_in
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.engine.scheduling import RunOutcome, execute
@@ -319,12 +317,3 @@ def test_long_addresses_become_file_names() -> None:
     assert len(cell_file_name(address)) == 200
     assert cell_file_name(address) != cell_file_name(address + "x")
     assert cell_file_name("a@b=c,d=e#2") == "a@b=c,d=e#2"
-
-
-def test_a_step_in_this_process_keeps_compiled_code_where_it_is_told(tmp_path: Path) -> None:
-    from numba.core import config
-
-    before = os.environ.get("NUMBA_CACHE_DIR"), config.CACHE_DIR
-    with compiled_code_in(str(tmp_path)):
-        assert str(tmp_path) == config.CACHE_DIR
-    assert (os.environ.get("NUMBA_CACHE_DIR"), config.CACHE_DIR) == before

@@ -419,32 +419,6 @@ def test_garbage_collection_keeps_exactly_what_results_need(store: Store) -> Non
     assert [item.key for item in store.earlier_preimages("toy.make")] == [KEY]
 
 
-def test_garbage_collection_removes_compiled_kernels_that_nobody_runs_any_more(
-    store: Store,
-) -> None:
-    ages_days = {"fresh": 0.0, "a month less an hour": 30 - 1 / 24, "a month": 30 + 1 / 24}
-    with store.in_use():
-        for name, age_days in ages_days.items():
-            folder = store.folder / "numba" / name
-            (folder / "package").mkdir(parents=True)
-            written = time.time() - age_days * 86400
-            for path in (folder / "package" / "kernel.nbi", folder / "package"):
-                path.touch()
-                os.utime(path, (written, written))
-    # One that was compiled lately keeps the folder, whatever else lies there.
-    kept = store.folder / "numba" / "fresh" / "package" / "forgotten.nbi"
-    kept.touch()
-    os.utime(kept, (0.0, 0.0))
-    freed = collect_garbage(store, dry_run=True)
-    assert (freed.n_results, freed.n_objects, freed.freed_bytes) == (0, 0, 0)
-    assert {path.name for path in (store.folder / "numba").iterdir()} == set(ages_days)
-    collect_garbage(store)
-    assert {path.name for path in (store.folder / "numba").iterdir()} == {
-        "fresh",
-        "a month less an hour",
-    }
-
-
 def test_garbage_collection_removes_half_written_files_and_counts_their_bytes(
     store: Store,
 ) -> None:

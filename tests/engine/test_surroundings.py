@@ -18,7 +18,6 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.compiled_code import VARIABLE as KERNELS
 from orthoflow.records.runs import open_run
 from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys, toy_world
@@ -97,8 +96,7 @@ class Desk:
         return done.returncode, done.stderr
 
     def _variables(self, changed: Mapping[str, str | None] | None) -> dict[str, str]:
-        own = {"PYTHONPATH": self.python_path, KERNELS: str(self.folder / "site" / "kernels")}
-        variables = {**os.environ, **own, **(changed or {})}
+        variables = {**os.environ, "PYTHONPATH": self.python_path, **(changed or {})}
         return {name: value for name, value in variables.items() if value is not None}
 
     @property

@@ -21,7 +21,6 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
-from orthoflow.engine.compiled_code import VARIABLE
 from orthoflow.errors import OrthoflowError
 from tests.fuzz.mutation import Mutate, mutate_bytes
 
@@ -201,12 +200,7 @@ def _take(outcome: Outcome, answer: Mapping[str, Any], folder: Path) -> float:
 
 def _environment() -> dict[str, str]:
     """What the process is told."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    # No case begins its store with all kernels of others, which takes longer than the rest of it,
-    # nor leaves them there, which is outside of it.
-    if kernels := environment.get("NUMBA_CACHE_DIR"):
-        environment[VARIABLE] = str(Path(kernels) / "of-fuzzing")
-    return environment
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 class _Server:

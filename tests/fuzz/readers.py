@@ -427,7 +427,7 @@ def _task(folder: Path) -> Task:
         store="/store",
         folder=str(folder),
         log="/run/logs/plane.log",
-        numba_folder="/store/numba",
+        kernels="ab",
     )
 
 

@@ -8,15 +8,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine import compiling_ahead
-from orthoflow.engine.keys import compiled_digest, method_facts
-from orthoflow.engine.store import Store
 from tests.forked_commands import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,12 +59,6 @@ class Shell:
             words += ["--store", str(self.store)]
         return [sys.executable, "-m", "orthoflow", *words]
 
-    def compiled_store(self, name: str) -> str:
-        """A new store in the folder that has nothing but the session's compiled kernels."""
-        (self.folder / name).mkdir()
-        (self.folder / name / "numba").symlink_to(self.store / "numba")
-        return name
-
     def __call__(self, *arguments: object, timeout_s: float = 300, draws: bool = False) -> Ended:
         words = self.command(*arguments)[3:]
         done = run_command(self.folder, words, self.variables(), timeout_s, draws=draws)
@@ -94,7 +84,7 @@ def without_variants(text: str, variants: Iterable[str]) -> str:
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store for all processes of a test run, so that each result is computed by one of them.
 
-    `direct.yaml` ran in it once, which compiles the kernels; they lie where those of the tests lie.
+    `direct.yaml` ran in it once, which compiles the kernels.
     """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -104,30 +94,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (shell.folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (shell.folder / "warm").exists():
-            kernels = Store(shell.store).numba_folder(
-                compiled_digest(discover_catalog().method("plane.hough2d"))
-            )
-            compiled = Path(os.environ["NUMBA_CACHE_DIR"])
-            compiled.mkdir(parents=True, exist_ok=True)
-            kernels.parent.mkdir(parents=True)
-            kernels.symlink_to(compiled)
             how = (*COARSE, "--executor", "inline")
             ended = shell("run", "direct.yaml", *how, "-o", "warm", timeout_s=900)
             assert ended.code == 0, ended.said
-            assert any(compiled.rglob("*.nbi"))
-            _compile_nothing_ahead(kernels)
     return shell.store
-
-
-def _compile_nothing_ahead(kernels: Path) -> None:
-    """Say of every method that its kernels are there: what is not, its steps compile.
-
-    A process beside them would begin with what they may need, and be stopped in the midst of it.
-    """
-    facts = method_facts("read.checkpoints", discover_catalog())
-    told = compiling_ahead._foretold(facts.target.partition(".")[0])
-    for name in compiling_ahead._orders(kernels, [replace(facts, method=m) for m in told]):
-        (kernels / name).touch()
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ class Quiet:
 def quiet(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Quiet:
     shell = Shell(tmp_path_factory.mktemp("quiet"), store)
     started = time.monotonic()
-    ended = shell(*RUN, "-o", "run", "--store", shell.compiled_store("store"))
+    ended = shell(*RUN, "-o", "run", "--store", "store")
     assert ended.code == 0, ended.said
     return Quiet(time.monotonic() - started, digests(shell.folder / "run"))
 
@@ -52,7 +52,7 @@ def quiet(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Quiet:
 def test_killed_runs_resume_with_the_same_digests(shell: Shell, quiet: Quiet) -> None:
     rng = random.Random(20150807)
     for attempt in range(KILLS):
-        store = shell.compiled_store(f"store{attempt}")
+        store = f"store{attempt}"
         arguments = (*RUN, "-o", f"killed{attempt}", "--store", store)
         _kill_after(shell, arguments, rng.uniform(0.5, quiet.duration_s))
         ended = shell(*arguments)
@@ -79,7 +79,7 @@ def _kill_after(shell: Shell, arguments: tuple[str, ...], seconds: float) -> Non
 
 
 def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
-    store = shell.compiled_store("store")
+    store = "store"
     arguments = (*RUN, "-o", "run", "--store", store)
     process = subprocess.Popen(
         shell.command(*arguments),
@@ -103,7 +103,7 @@ def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
 
 
 def test_both_executors_give_the_same_digests(shell: Shell, quiet: Quiet) -> None:
-    store = shell.compiled_store("store")
+    store = "store"
     ended = shell(*RUN, "-o", "run", "--store", store, "--executor", "inline")
     assert ended.code == 0, ended.said
     assert digests(shell.folder / "run") == quiet.digests

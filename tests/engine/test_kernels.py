@@ -1,0 +1,171 @@
+"""Compiled kernels lie in a private folder of the user; what lies elsewhere is never loaded."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.engine.kernels import (
+    VARIABLE,
+    all_kernels,
+    is_private,
+    kernel_folder,
+    kernel_sources,
+    private_folder,
+)
+from orthoflow.engine.keys import compiled_digest
+from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
+
+
+class _Hostile:
+    """What runs a program when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (os.mkdir, (str(self.mark),))
+
+
+def _files(folder: Path) -> dict[Path, bytes]:
+    found = (path for path in folder.rglob("*.nb?") if path.is_file())
+    return {path.relative_to(folder): path.read_bytes() for path in found}
+
+
+@pytest.fixture
+def compiled(tmp_path: Path) -> dict[Path, bytes]:
+    """Numba's files of a run in `tmp_path`, below its folder for all kernels."""
+    write_studio(tmp_path, "paint.kernel")
+    environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "first-run", environment=environment)
+    assert done.returncode == 0, done.stderr
+    found = _files(tmp_path / "first" / "orthoflow" / "numba")
+    assert {path.suffix for path in found} == {".nbi", ".nbc"}
+    return found
+
+
+def test_a_hostile_index_in_a_store_or_working_folder_is_never_loaded(
+    tmp_path: Path, compiled: dict[Path, bytes]
+) -> None:
+    mark = tmp_path / "executed"
+    hostile = pickle.dumps(_Hostile(mark))
+    world_writable = tmp_path / "shared"
+    places = [
+        tmp_path / ".orthoflow" / "numba",
+        tmp_path / "numba",
+        tmp_path / "__pycache__",
+        tmp_path,
+        world_writable,
+    ]
+    for place in places:
+        for name in compiled:
+            # With the state of the code and the module in their paths, and without.
+            for path in (place / name, place.joinpath(*name.parts[1:]), place / name.name):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(hostile)
+    world_writable.chmod(0o777)
+    cache = tmp_path / "second"
+    environment = {"XDG_CACHE_HOME": str(cache), VARIABLE: str(world_writable)}
+    arguments = ["run", "studio.yaml", "--force", "paint", "-o"]
+    done = orthoflow(tmp_path, *arguments, "second-run", environment=environment)
+    assert done.returncode == 0, done.stderr
+    assert not mark.exists()
+    own = _files(cache)
+    assert {path.name.partition(".")[0] for path in own} == {
+        path.name.partition(".")[0] for path in compiled
+    }
+    assert hostile not in own.values()
+    # What would be loaded if it were looked at: the same file where numba keeps its own.
+    for path in _files(cache):
+        (cache / path).write_bytes(hostile)
+    orthoflow(tmp_path, *arguments, "third-run", environment=environment)
+    assert mark.exists()
+
+
+def test_files_that_were_cut_off_are_compiled_again(
+    tmp_path: Path, compiled: dict[Path, bytes]
+) -> None:
+    root = tmp_path / "first" / "orthoflow" / "numba"
+    environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
+    for suffix in (".nbi", ".nbc"):
+        for path, content in compiled.items():
+            (root / path).write_bytes(content[:40] if path.suffix == suffix else content)
+        arguments = ["run", "studio.yaml", "--force", "paint", "-o", f"run{suffix}"]
+        done = orthoflow(tmp_path, *arguments, environment=environment)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("setting", [{}, {"NUMBA_DISABLE_JIT": "1"}])
+def test_no_store_ever_holds_anything_executable(tmp_path: Path, setting: dict[str, str]) -> None:
+    write_studio(tmp_path, "paint.kernel")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "run", environment=setting)
+    assert done.returncode == 0, done.stderr
+    endings = {path.suffix for path in (tmp_path / ".orthoflow").rglob("*") if path.is_file()}
+    assert not endings & {".nbi", ".nbc", ".pkl", ".pickle", ".py", ".pyc", ".so", ".o"}
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
+def test_a_folder_that_others_may_write_to_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int
+) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(mode)
+    assert not is_private(shared)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    monkeypatch.setenv(VARIABLE, str(shared))
+    assert all_kernels() == tmp_path / "own" / "orthoflow" / "numba"
+    assert (tmp_path / "own" / "orthoflow" / "numba").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "own" / "orthoflow").chmod(mode)
+    for folder in (private_folder("numba"), kernel_folder("ab")):
+        assert tmp_path not in folder.parents
+        assert is_private(folder)
+    monkeypatch.setenv(VARIABLE, "relative")
+    assert tmp_path not in all_kernels().parents
+
+
+def test_a_link_to_a_private_folder_is_not_one(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert is_private(tmp_path)
+    assert not is_private(tmp_path / "link")
+
+
+def test_old_states_of_the_code_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for nth in range(10):
+        os.utime(kernel_folder(f"state-{nth}"), (nth, nth))
+    kept = {path.name for path in all_kernels().iterdir()}
+    assert len(kept) == 9
+    assert "state-9" in kept
+
+
+def test_kernels_belong_to_all_that_their_modules_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = {
+        "pack/__init__.py": "",
+        "pack/kernels.py": "import numba\nfrom pack.numbers import (  # some\n    TURN,\n)\n",
+        "pack/numbers.py": "from . import inner\nTURN = 3\n",
+        "pack/inner.py": "",
+        "pack/other.py": "import pack.kernels\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    files = list(tmp_path.rglob("*.py"))
+    names = {path.name for path in kernel_sources(files)}
+    assert names == {"__init__.py", "kernels.py", "numbers.py", "inner.py"}
+    assert kernel_sources(files, files) == frozenset(files)
+    (tmp_path / "pack" / "kernels.py").write_text("")
+    assert kernel_sources(files, files) == frozenset()
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    catalog = discover_catalog()
+    digests = {compiled_digest(catalog.method(name)) for name in ("paint.kernel", "plane.hough2d")}
+    assert len(digests) == 2
