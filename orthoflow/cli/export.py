@@ -140,7 +140,19 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--language",
     type=click.Choice(["en", "de", "fr", "pl", "es"]),
-    help="plan, section: language of labels; en without it.",
+    help="plan, section, elevation: language of labels; en without it.",
+)
+@click.option(
+    "--light",
+    metavar="AZIMUTH,ALTITUDE",
+    help="relief: where the light comes from, degrees: on the wall clockwise from above, and over "
+    "its plane; 315,25 (top left) without it.",
+)
+@click.option(
+    "--base-url",
+    metavar="URL",
+    help="iiif: where the folder will be handed out, e.g. https://example.org/room; "
+    "http://localhost:8000 without it.",
 )
 @click.option(
     "--colour",

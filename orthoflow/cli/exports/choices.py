@@ -38,6 +38,8 @@ class Choices:
         through: where sections are cut, `x,y,x,y`.
         dimensions: with lengths beside the lines of plans and sections.
         language: of labels.
+        light: azimuth and altitude of a raking light, `315,25`.
+        base_url: where an IIIF folder will be handed out.
     """
 
     cell: str | None = None
@@ -61,3 +63,5 @@ class Choices:
     through: tuple[str, ...] = ()
     dimensions: bool = False
     language: Language | None = None
+    light: str | None = None
+    base_url: str | None = None

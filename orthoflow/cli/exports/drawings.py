@@ -14,6 +14,12 @@ from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.cad_pictures import write_cad_picture
 from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
+from orthoflow.files.drawings.elevations import (
+    ElevationWall,
+    elevation_scale,
+    unfolded,
+    write_elevation,
+)
 from orthoflow.files.drawings.geojson import (
     write_room_geojson,
     write_seams_geojson,
@@ -31,10 +37,18 @@ from orthoflow.files.drawings.papers import (
     placed_views,
 )
 from orthoflow.files.drawings.printed_pictures import stretch_of
+from orthoflow.files.drawings.qgis import PROJECT, ProjectLayer, write_project
+from orthoflow.files.drawings.relief import (
+    Light,
+    write_contours,
+    write_depth_figure,
+    write_relief,
+)
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, room_lines
 from orthoflow.files.drawings.sheet_contents import MarkedArea, Sheet, SheetText, WallDrawing
 from orthoflow.files.drawings.sheets import axes_of, write_sheet
 from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
+from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Orthoimage, Orthoimages
 from orthoflow.records.runs import Run
 from orthoflow.records.wall_results import RoomResults, WallResult, content_digest, room_results
@@ -217,6 +231,97 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     crs = next((wall.frame.map_crs for wall in results.walls if wall.frame.map_crs), None)
     write_room_geojson(folder / "room.geojson", lines, crs)
     return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
+
+
+def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `elevation_<n>.pdf`."""
+    results = room_results(run, chosen.cell)
+    walls = [
+        ElevationWall(
+            name=wall.name,
+            frame=wall.frame,
+            raster=next(
+                wall.rasters[kind]
+                for kind in ("ortho", "intensity", "depth")
+                if kind in wall.rasters
+            ),
+        )
+        for wall in results.walls
+        if wall.frame.raster_axes == "wall"
+    ]
+    if results.planes is None or not walls:
+        raise ArgumentError(
+            f"the run {run.record.run_id} shows no upright wall, so there is nothing to unfold"
+        )
+    up = results.planes.up
+    order, is_inside = unfolded(walls, up)
+    scale, paper, sheets = elevation_scale(order, up, chosen.scale, chosen.paper)
+    make_empty(folder)
+    origin = f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}"
+    for number, shown in enumerate(sheets, start=1):
+        path = folder / f"elevation_{number}.pdf"
+        write_elevation(path, shown, up, (scale, paper), (origin, chosen.language or "en"))
+    side = "inside" if is_inside else "outside"
+    return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
+        len(sheets), "sheet"
+    )
+
+
+def export_relief(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `wall_<k>_relief.tif`, `wall_<k>_relief.png` and `wall_<k>_contours.geojson`."""
+    light = _light(chosen.light)
+    results = room_results(run, chosen.cell, chosen.wall)
+    walls = [wall for wall in _chosen_walls(results, chosen) if "depth" in wall.rasters]
+    if not walls:
+        raise ArgumentError(f"the run {run.record.run_id} has no depths of walls")
+    make_empty(folder)
+    intervals = []
+    for wall in walls:
+        depth, stem = wall.rasters["depth"], folder / f"wall_{wall.number}"
+        frame, _ = placed_raster(depth)
+        write_relief(depth, Path(f"{stem}_relief.tif"), light)
+        write_depth_figure(depth, Path(f"{stem}_relief.png"), light)
+        interval_m = write_contours(depth, frame, Path(f"{stem}_contours.geojson"))
+        intervals.append(f"{wall.name} {1e3 * interval_m:g} mm")
+    return f"{counted(len(walls), 'wall')}, contour lines every: {', '.join(intervals)}"
+
+
+def _light(text: str | None) -> Light:
+    if text is None:
+        return Light()
+    try:
+        azimuth, altitude = (float(word) for word in text.split(","))
+    except ValueError:
+        azimuth = altitude = math.nan
+    if not (-360.0 <= azimuth <= 360.0 and 0.0 < altitude <= 90.0):
+        raise ArgumentError(
+            f"--light takes two numbers in degrees with a comma between, the azimuth on the wall "
+            f"clockwise from above and the altitude over its plane (0 to 90), got {text!r}"
+        )
+    return Light(azimuth_deg=azimuth, altitude_deg=altitude)
+
+
+def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `walls.qgs` and a virtual raster per layer."""
+    results = room_results(run, chosen.cell)
+    walls = [wall for wall in results.walls if wall.frame.raster_axes == "wall"]
+    if not walls:
+        raise ArgumentError(f"the run {run.record.run_id} shows no upright wall")
+    layers = []
+    for wall in walls:
+        kinds = [kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters]
+        layers += [
+            ProjectLayer(
+                wall=wall.name,
+                kind=kind,
+                raster=wall.rasters[kind].resolve(),
+                is_shown=kind == kinds[0],
+            )
+            for kind in kinds
+        ]
+    make_empty(folder)
+    write_project(folder, run.record.name, layers)
+    return f"{PROJECT}: {counted(len(walls), 'wall')} side by side, Y is the height"
 
 
 def _images(run: Run, address: str) -> Sequence[Orthoimage]:

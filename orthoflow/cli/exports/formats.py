@@ -131,6 +131,30 @@ FORMATS: Final[Mapping[str, Format]] = {
         options=_SECTION_OPTIONS | {"through"},
         takes_rasters=True,
     ),
+    "elevation": Format(
+        writer="drawings:export_elevations",
+        summary="the walls of the room unfolded on one sheet, at their true heights, as PDF",
+        options=frozenset({"cell", "scale", "paper", "language"}),
+        takes_rasters=True,
+    ),
+    "relief": Format(
+        writer="drawings:export_relief",
+        summary="each wall in raking light, with contour lines and depths in colour",
+        options=frozenset({"cell", "wall", "light"}),
+        takes_rasters=True,
+    ),
+    "qgis": Format(
+        writer="drawings:export_qgis",
+        summary="a QGIS project in which the walls stand side by side at their heights",
+        options=frozenset({"cell"}),
+        takes_rasters=True,
+    ),
+    "iiif": Format(
+        writer="viewers:export_iiif",
+        summary="an IIIF manifest with the pictures of each wall as layers, and their tiles",
+        options=frozenset({"cell", "wall", "base_url"}),
+        takes_rasters=True,
+    ),
     "prov": Format(
         writer="results:export_prov",
         summary="W3C PROV-JSON: which products came of which, by which method of which software",
@@ -174,6 +198,8 @@ FLAGS: Final = {
     "through": "--through",
     "dimensions": "--dimensions",
     "language": "--language",
+    "light": "--light",
+    "base_url": "--base-url",
 }
 
 

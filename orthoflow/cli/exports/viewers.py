@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import (
@@ -15,13 +17,24 @@ from orthoflow.cli.exports.products import (
 )
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.relief import Light, write_relief
 from orthoflow.files.gltf import write_page, write_room
 from orthoflow.files.ortho_files import OrthoFile, ortho_files
+from orthoflow.files.sidecars import placed_raster
+from orthoflow.files.tiles.iiif import MANIFEST, Canvas, Layer, write_manifest
 from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
 from orthoflow.products import Planes
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import require_unchanged
-from orthoflow.records.wall_results import room_results
+from orthoflow.records.wall_results import WallResult, room_results
+
+_LOCAL: Final = "http://localhost:8000"
+_LAYERS: Final = {
+    "ortho": "orthoimage",
+    "intensity": "intensity",
+    "depth": "depth",
+    "relief": "raking light",
+}
 
 
 def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
@@ -63,6 +76,40 @@ def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
     n_tiles = sum(write_tiles(folder, name, ortho) for name, ortho in images.items())
     write_viewer(folder, images)
     return f"{PAGE}: {counted(len(orthos), 'wall')} in {counted(n_tiles, 'tile')} of {address}"
+
+
+def export_iiif(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `manifest.json` and the tiles of each wall's pictures."""
+    results = room_results(run, chosen.cell, chosen.wall)
+    walls = {wall.number: wall for wall in results.walls}
+    if chosen.wall is not None:
+        walls = {chosen.wall: wanted_wall(chosen.wall, walls, results.address, "shows")}
+    make_empty(folder)
+    with tempfile.TemporaryDirectory() as scratch:
+        canvases = [_canvas(wall, Path(scratch)) for wall in walls.values()]
+        base = chosen.base_url or _LOCAL
+        n_tiles = write_manifest(folder, run.record.name, canvases, base)
+    return f"{MANIFEST}: {counted(len(walls), 'wall')} in {counted(n_tiles, 'tile')} below {base}"
+
+
+def _canvas(wall: WallResult, scratch: Path) -> Canvas:
+    """The pictures of a wall; its relief is made for it."""
+    rasters = dict(wall.rasters)
+    if "depth" in rasters:
+        rasters["relief"] = scratch / f"wall_{wall.number}_relief.tif"
+        write_relief(rasters["depth"], rasters["relief"], Light())
+    known = [kind for kind in _LAYERS if kind in rasters]
+    frames = {kind: placed_raster(rasters[kind])[0] for kind in known if kind != "relief"}
+    shape = frames[known[0]].shape
+    same = [kind for kind in known if kind == "relief" or frames[kind].shape == shape]
+    return Canvas(
+        label=wall.name,
+        summary="; ".join(wall.accuracy) or "accuracy not checked",
+        layers=[
+            Layer(label=_LAYERS[kind], raster=rasters[kind], stem=f"wall_{wall.number}_{kind}")
+            for kind in same
+        ],
+    )
 
 
 def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:

@@ -76,7 +76,10 @@ def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet) -> None:
         StoreError: it cannot be written.
     """
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder, _canvas(path, sheet) as canvas:
+        with (
+            tempfile.TemporaryDirectory(dir=path.parent) as folder,
+            sheet_canvas(path, sheet.paper) as canvas,
+        ):
             canvas.setTitle(shown(f"{drawing.text.block.project} {drawing.text.name}".strip()))
             canvas.setAuthor(shown(drawing.text.block.author))
             canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
@@ -93,7 +96,7 @@ def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet) -> None:
 
 
 @contextmanager
-def _canvas(path: Path, sheet: Sheet) -> Iterator[Canvas]:
+def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
     """A page whose unit is the millimetre, with a font that has the letters of Europe."""
     import matplotlib as mpl
     from reportlab import rl_config
@@ -106,7 +109,7 @@ def _canvas(path: Path, sheet: Sheet) -> Iterator[Canvas]:
     fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
     registerFont(TTFont(FONT, str(fonts / "DejaVuSans.ttf")))
     registerFont(TTFont(f"{FONT}-Bold", str(fonts / "DejaVuSans-Bold.ttf")))
-    size = (sheet.paper.width_mm * POINTS_PER_MM, sheet.paper.height_mm * POINTS_PER_MM)
+    size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
     canvas = Canvas(str(path), pagesize=size, pageCompression=1, invariant=1)
     canvas.setCreator("orthoflow")
     yield canvas

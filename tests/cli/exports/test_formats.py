@@ -32,6 +32,8 @@ GIVEN: Final[Mapping[str, object]] = {
     "through": ("0,0,1,1",),
     "dimensions": True,
     "language": "de",
+    "light": "90,20",
+    "base_url": "https://example.org/room",
 }
 
 

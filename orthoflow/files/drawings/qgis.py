@@ -1,0 +1,150 @@
+"""A QGIS project that opens the walls of a room side by side, each at its true height.
+
+Every wall has a coordinate system of its own, which no other can be transformed into. So each
+raster is opened through a GDAL virtual raster beside the project that shifts X alone: Y stays the
+height.
+"""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from uuid import NAMESPACE_URL, uuid5
+
+import numpy as np
+
+from orthoflow.files.geotiff import RasterParts
+from orthoflow.files.sidecars import write_text
+
+PROJECT: Final = "walls.qgs"
+_VERSION: Final = "3.22.0"
+_GAP_M: Final = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectLayer:
+    """A raster of a wall.
+
+    Attributes:
+        wall: name of the wall.
+        kind: what the raster shows: `ortho`, `intensity`, `depth`, `error`.
+        raster: its GeoTIFF.
+        is_shown: it is visible when the project opens.
+    """
+
+    wall: str
+    kind: str
+    raster: Path
+    is_shown: bool
+
+
+def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> None:
+    """Write `walls.qgs` and a virtual raster per layer, walls from left to right in their order.
+
+    Raises:
+        InputError: a raster cannot be read.
+        StoreError: a file cannot be written.
+    """
+    places = _places(layers)
+    root = ET.Element("qgis", {"projectname": title, "version": _VERSION})
+    ET.SubElement(root, "title").text = title
+    tree = ET.SubElement(root, "layer-tree-group")
+    holder = ET.SubElement(root, "projectlayers")
+    groups: dict[str, ET.Element] = {}
+    boxes = []
+    for number, layer in enumerate(layers):
+        vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
+        boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
+        # Ids need to be unique in the project; the same run gives the same project.
+        identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
+        group = groups.get(layer.wall)
+        if group is None:
+            group = ET.SubElement(tree, "layer-tree-group", {"name": layer.wall})
+            groups[layer.wall] = group
+        ET.SubElement(
+            group,
+            "layer-tree-layer",
+            {
+                "id": identity,
+                "name": f"{layer.wall}: {layer.kind}",
+                "checked": "Qt::Checked" if layer.is_shown else "Qt::Unchecked",
+                "providerKey": "gdal",
+                "source": f"./{vrt.name}",
+            },
+        )
+        described = ET.SubElement(holder, "maplayer", {"type": "raster"})
+        for name, text in (
+            ("id", identity),
+            ("datasource", f"./{vrt.name}"),
+            ("layername", f"{layer.wall}: {layer.kind}"),
+            ("provider", "gdal"),
+        ):
+            ET.SubElement(described, name).text = text
+    extent = np.array(boxes)
+    canvas = ET.SubElement(root, "mapcanvas", {"name": "theMapCanvas"})
+    ET.SubElement(canvas, "units").text = "meters"
+    box = ET.SubElement(canvas, "extent")
+    corners = (*extent[:, :2].min(axis=0), *extent[:, 2:].max(axis=0))
+    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True):
+        ET.SubElement(box, name).text = f"{value:.6f}"
+    properties = ET.SubElement(root, "properties")
+    paths = ET.SubElement(properties, "Paths")
+    ET.SubElement(paths, "Absolute", {"type": "bool"}).text = "false"
+    ET.indent(root)
+    head = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+    write_text(folder / PROJECT, head + ET.tostring(root, encoding="unicode") + "\n")
+
+
+def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
+    """What is added to X of each wall."""
+    found: dict[str, float] = {}
+    right = 0.0
+    for layer in layers:
+        if layer.wall not in found:
+            with RasterParts(layer.raster) as raster:
+                found[layer.wall] = right - raster.corner_m[0]
+                right += raster.shape[1] * raster.gsd_m + _GAP_M
+    return found
+
+
+def _write_virtual(path: Path, raster: Path, shift_m: float) -> tuple[float, float, float, float]:
+    """Write a virtual raster that shifts X; return left, bottom, right and top."""
+    import rasterio
+
+    with RasterParts(raster) as parts:
+        rows, columns = parts.shape
+        left, top, gsd_m = parts.corner_m[0] + shift_m, parts.corner_m[1], parts.gsd_m
+    with rasterio.open(raster) as dataset:
+        types, nodata = dataset.dtypes, dataset.nodata
+        is_masked = any("per_dataset" in flag.name for flag in dataset.mask_flag_enums[0])
+    root = ET.Element("VRTDataset", {"rasterXSize": str(columns), "rasterYSize": str(rows)})
+    ET.SubElement(root, "GeoTransform").text = f"{left!r}, {gsd_m!r}, 0, {top!r}, 0, {-gsd_m!r}"
+    where = os.path.relpath(raster, path.parent)
+    size = {"xOff": "0", "yOff": "0", "xSize": str(columns), "ySize": str(rows)}
+
+    def add_band(parent: ET.Element, kind: str, source_band: str, attributes: object) -> None:
+        given = attributes if isinstance(attributes, dict) else {}
+        band = ET.SubElement(parent, "VRTRasterBand", {"dataType": kind, **given})
+        if nodata is not None:
+            ET.SubElement(band, "NoDataValue").text = "nan" if np.isnan(nodata) else f"{nodata:g}"
+        if len(types) >= 3 and given.get("band", "").isdigit():
+            colour = ("Red", "Green", "Blue", "Alpha")[int(given["band"]) - 1]
+            ET.SubElement(band, "ColorInterp").text = colour
+        source = ET.SubElement(band, "SimpleSource")
+        ET.SubElement(source, "SourceFilename", {"relativeToVRT": "1"}).text = where
+        ET.SubElement(source, "SourceBand").text = source_band
+        ET.SubElement(source, "SrcRect", size)
+        ET.SubElement(source, "DstRect", size)
+
+    kinds = {"uint8": "Byte", "uint16": "UInt16", "float32": "Float32", "int16": "Int16"}
+    for number, kind in enumerate(types, start=1):
+        add_band(root, kinds.get(kind, "Float32"), str(number), {"band": str(number)})
+    if is_masked:
+        add_band(ET.SubElement(root, "MaskBand"), "Byte", "mask,1", {})
+    ET.indent(root)
+    write_text(path, ET.tostring(root, encoding="unicode") + "\n")
+    return left, top - rows * gsd_m, left + columns * gsd_m, top

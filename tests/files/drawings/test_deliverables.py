@@ -1,0 +1,162 @@
+"""Relief, elevations, QGIS projects and IIIF of walls whose depths and places are known."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pdfplumber
+import pytest
+import rasterio
+from click.testing import CliRunner
+from PIL import Image
+
+from orthoflow.cli.program import program
+from orthoflow.files.drawings.elevations import ElevationWall, elevation_scale, unfolded
+from orthoflow.files.drawings.relief import NOTHING, Light, shaded
+from orthoflow.geometry.frames import frame_over
+from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_planes, write_drawing_run
+from tests.optional import skip
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drawing_run(tmp_path_factory.mktemp("deliverables") / "run")
+
+
+def export(run: Path, target: str, folder: Path, *more: str) -> str:
+    done = CliRunner().invoke(
+        program, ["export", str(run), "--to", target, "-o", str(folder), *more]
+    )
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+@pytest.mark.parametrize("slope", [-0.6, 0.0, 0.3])
+def test_shading_is_the_cosine_between_surface_and_light(slope: float) -> None:
+    gsd_m = 0.01
+    depths = np.tile(slope * gsd_m * np.arange(20.0), (10, 1))  # rises to the right
+    light = Light(azimuth_deg=90.0, altitude_deg=30.0)  # from the right
+    normal = np.array([-slope, 0.0, 1.0]) / np.hypot(slope, 1.0)
+    towards = np.array([np.cos(np.radians(30.0)), 0.0, np.sin(np.radians(30.0))])
+    wanted = 1.0 + 254.0 * max(0.0, float(normal @ towards))
+    assert np.abs(shaded(depths, gsd_m, light).astype(float) - wanted).max() <= 1.0
+
+
+def test_light_from_above_meets_what_looks_up() -> None:
+    depths = np.tile(-0.005 * np.arange(20.0)[:, None], (1, 10))  # recedes downwards: looks down
+    above, below = (shaded(depths, 0.01, Light(azimuth_deg=a)) for a in (0.0, 180.0))
+    assert below.min() > above.max()
+    depths[5, 5] = np.nan
+    assert shaded(depths, 0.01, Light())[5, 5] == NOTHING
+
+
+def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
+    export(run, "relief", tmp_path / "out", "--light", "90,20")
+    depth = next((run / "products").rglob(f"wall_{WALL}_depth.tif"))
+    with (
+        rasterio.open(depth) as given,
+        rasterio.open(tmp_path / "out" / f"wall_{WALL}_relief.tif") as made,
+    ):
+        assert (made.transform, made.crs, made.shape) == (given.transform, given.crs, given.shape)
+        assert np.array_equal(made.read(1) == NOTHING, ~np.isfinite(given.read(1)))
+    lines = json.loads((tmp_path / "out" / f"wall_{WALL}_contours.geojson").read_text())
+    assert lines["type"] == "FeatureCollection"
+    with Image.open(tmp_path / "out" / f"wall_{WALL}_relief.png") as figure:
+        assert figure.width > 600
+    refused = CliRunner().invoke(
+        program, ["export", str(run), "--to", "relief", "--light", "90", "-o", str(tmp_path / "no")]
+    )
+    assert refused.exit_code == 2
+
+
+def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
+    planes = box_planes()
+    walls = [
+        ElevationWall(
+            name=planes.names[k],
+            frame=frame_over(planes.corners[k], planes.normal[k], gsd_m=0.05),
+            raster=Path("none.tif"),
+        )
+        for k in (2, 3, 4, 5)
+    ]
+    order, is_inside = unfolded([walls[2], walls[0], walls[3], walls[1]], UP)
+    assert is_inside
+    names = [wall.name for wall in order]
+    # Walls 2 (y = 3 m), 3 (x = 4 m), 4 (y = 0), 5 (x = 0) follow each other clockwise.
+    start = names.index("wall 2")
+    assert names[start:] + names[:start] == ["wall 2", "wall 3", "wall 4", "wall 5"]
+    scale, paper, sheets = elevation_scale(order, UP, 50, None)
+    assert scale == 50
+    assert len(sheets) == 1
+    assert paper.width_mm >= sum(1000 * wall.size_m[0] / 50 for wall in order)
+
+
+def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> None:
+    export(run, "elevation", tmp_path / "out", "--scale", "25", "--language", "fr")
+    with pdfplumber.open(tmp_path / "out" / "elevation_1.pdf") as pdf:
+        (page,) = pdf.pages
+        (image,) = page.images
+        assert "1:25" in page.extract_text()
+    in_mm = 25.4 / 72.0
+    assert (image["x1"] - image["x0"]) * in_mm == pytest.approx(
+        1000 * (SIZE_M[0] - 0.2) / 25, abs=0.1
+    )
+
+
+def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
+    export(run, "qgis", tmp_path / "out")
+    project = (tmp_path / "out" / "walls.qgs").read_text()
+    virtual = sorted((tmp_path / "out").glob("*_ortho.vrt"))
+    assert virtual
+    for path in virtual:
+        assert f"./{path.name}" in project
+        given = next((run / "products").rglob(f"{path.stem.partition('_')[2]}.tif"))
+        with rasterio.open(path) as shifted, rasterio.open(given) as raster:
+            assert shifted.transform.f == raster.transform.f
+            assert shifted.transform.a == pytest.approx(GSD_M)
+            assert np.array_equal(shifted.read(), raster.read())
+            assert np.array_equal(shifted.dataset_mask(), raster.dataset_mask())
+
+
+@pytest.mark.filterwarnings("default")  # the validator's own models
+def test_the_models_of_iiif_take_the_manifest(run: Path, tmp_path: Path) -> None:
+    if find_spec("iiif_prezi3") is None:
+        skip("program", "iiif-prezi3, which asks for an older Pillow")
+    from iiif_prezi3 import Manifest
+
+    export(run, "iiif", tmp_path / "out")
+    manifest = Manifest(**json.loads((tmp_path / "out" / "manifest.json").read_text()))
+    assert len(manifest.items) == 1
+
+
+def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
+    run: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+    export(run, "iiif", folder, "--base-url", "https://example.org/room/")
+    text = (folder / "manifest.json").read_text()
+    manifest = json.loads(text)
+    (canvas,) = manifest["items"]
+    assert canvas["service"][0]["physicalScale"] == pytest.approx(1000 * GSD_M)
+    stem = f"wall_{WALL}_ortho"
+    info = json.loads((folder / stem / "info.json").read_text())
+    assert info["id"] == f"https://example.org/room/{stem}"
+    with rasterio.open(next((run / "products").rglob(f"{stem}.tif"))) as raster:
+        assert (info["height"], info["width"]) == raster.shape
+        wanted = np.moveaxis(raster.read(), 0, 2)[:, :, :3].astype(int)
+        shown = raster.dataset_mask() > 0
+    made = np.zeros_like(wanted)
+    for top in range(0, info["height"], 512):
+        for left in range(0, info["width"], 512):
+            wide, high = min(512, info["width"] - left), min(512, info["height"] - top)
+            tile = folder / stem / f"{left},{top},{wide},{high}" / f"{wide},{high}" / "0"
+            made[top : top + high, left : left + wide] = np.asarray(
+                Image.open(tile / "default.jpg")
+            )
+    # JPEG keeps grey levels to a few.
+    assert np.abs(made - wanted)[shown].mean() < 6
