@@ -103,7 +103,7 @@ def drawn_wall(planes: Planes, *, is_known: bool) -> DrawnWall:
     )
 
 
-def box_products() -> dict[str, Product]:
+def box_products(image: Orthoimage | None = None) -> dict[str, Product]:
     """What the steps of the run give."""
     planes = box_planes()
     frame = wall_frame(planes)
@@ -116,7 +116,7 @@ def box_products() -> dict[str, Product]:
             buffer_front_m=0.3,
             buffer_behind_m=0.3,
         ),
-        "mosaic": Orthoimages(images=(_image(frame),)),
+        "mosaic": Orthoimages(images=(image or box_image(),)),
         "openings": box_openings(),
         "check": _inspection(frame),
         "points": _checkpoints(frame),
@@ -152,9 +152,9 @@ def box_openings() -> Openings:
     )
 
 
-def publish_box(folder: Path) -> tuple[PublishedFile, ...]:
+def publish_box(folder: Path, image: Orthoimage | None = None) -> tuple[PublishedFile, ...]:
     """Write `products/` of a run folder, and say what lies there."""
-    products = box_products()
+    products = box_products(image)
     for step, publish in (
         ("plane", publish_planes),
         ("wall", publish_walls),
@@ -175,11 +175,13 @@ def publish_box(folder: Path) -> tuple[PublishedFile, ...]:
     )
 
 
-def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False) -> Path:
+def write_drawing_run(
+    folder: Path, *, gains: str = "none", differ: bool = False, image: Orthoimage | None = None
+) -> Path:
     """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
     folder.mkdir(parents=True)
     shelf = ProductShelf(folder)
-    given = {step: _recorded(shelf, product) for step, product in box_products().items()}
+    given = {step: _recorded(shelf, product) for step, product in box_products(image).items()}
     taken = {
         "wall": {"planes": "plane"},
         "mosaic": {"walls": "wall"},
@@ -200,7 +202,7 @@ def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False
         )
         for step in ("points", "plane", "wall", "openings", "mosaic", "check")
     ]
-    made = record(cells, name="box", published=publish_box(folder), environments=())
+    made = record(cells, name="box", published=publish_box(folder, image), environments=())
     write_record(folder / "run.h5", made, shelf.find)
     return folder
 
@@ -240,8 +242,9 @@ def _wall(frame: WallFrame) -> Wall:
     )
 
 
-def _image(frame: WallFrame) -> Orthoimage:
+def box_image() -> Orthoimage:
     """Red grows to the right, green downwards; the ten rightmost columns show nothing."""
+    frame = wall_frame(box_planes())
     rows, columns = np.indices(frame.shape)
     mask = np.full(frame.shape, OrthoMask.PAINTED, dtype=np.uint8)
     mask[:, -10:] = OrthoMask.NONE

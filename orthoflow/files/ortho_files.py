@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.sidecars import placed_raster
+from orthoflow.files.sidecars import accuracy_words, placed_raster
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import eight_bits
 
@@ -31,6 +31,7 @@ class OrthoFile:
         name: what the run calls the wall.
         frame: where its cells lie.
         digest: of the product, empty where the sidecar does not say it.
+        accuracy: what is known of this image's, for people.
     """
 
     path: Path
@@ -38,6 +39,7 @@ class OrthoFile:
     name: str
     frame: WallFrame
     digest: str
+    accuracy: str = ""
 
     def shrunk(self, longest_px: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Colours (r, c, 3) and what is shown (r, c), averaged to at most so many pixels a side.
@@ -94,4 +96,5 @@ def _opened(path: Path, wall: int) -> OrthoFile:
         name=name if isinstance(name, str) else f"wall {wall}",
         frame=frame,
         digest=digest if isinstance(digest, str) else "",
+        accuracy=accuracy_words(content.get("accuracy")),
     )

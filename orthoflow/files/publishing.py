@@ -6,6 +6,7 @@ for the same product. The `k` in file names is the place of the wall's plane in 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, fields
@@ -60,6 +61,10 @@ from orthoflow.products import (
 
 # Letters of a source that its file is called after.
 _LONGEST_SOURCE: Final = 100
+ERROR_CONTENT: Final = (
+    "expected error of a place measured in the orthoimage, one standard deviation along u and "
+    "along v, metres, by pose, depth and parallax between photos; NaN = not assessed"
+)
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
     "photo",
@@ -118,6 +123,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
             "plane_index": wall.plane_index,
             "intensity_source": product.intensity_source,
             "buffer": {"front_m": slab.front_m, "behind_m": slab.behind_m},
+            "includes_walls": list(product.included[index]) if product.included else [],
         }
         publish = partial(_publish_raster, wall=wall, about=about, digest=digest)
         depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
@@ -167,6 +173,10 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
             icc_profile=product.icc_profile,
         )
         write_text(folder / f"{stem}.tfw", world_file_text(place))
+        if image.error_m is not None:
+            error_tags = tags | {"content": ERROR_CONTENT, "unit": "m"}
+            error_path = folder / f"wall_{image.number}_error.tif"
+            write_raster(error_path, image.error_m, place=place, tags=error_tags)
         mask_tags = tags | {"content": "mask of the orthoimage"}
         mask_path = folder / f"{stem}_mask.tif"
         write_raster(mask_path, image.mask, place=place, tags=mask_tags)
@@ -353,10 +363,23 @@ def _write_ortho_sidecars(
         "mask_counts": _counts(image.mask),
         "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
         "mask_raster": f"{stem}_mask.tif",
+        "accuracy": accuracy_json(image),
         "product_digest": digest,
     }
     write_json(folder / f"{stem}.json", {**content, **about})
     write_json(folder / f"{stem}_mask.json", content | {"content": "mask of the orthoimage"})
+
+
+def accuracy_json(image: Orthoimage) -> dict[str, JsonValue]:
+    """What is known of the accuracy of one orthoimage, by evidence on its own wall alone."""
+    median, high = image.expected_mm
+    is_assessed = math.isfinite(median)
+    return {
+        "expected_mm_median": number(median),
+        "expected_mm_p95": number(high),
+        "n_check_points": image.n_check_points,
+        "assessed": is_assessed,
+    }
 
 
 def _counts(mask: NDArray[np.uint8]) -> JsonValue:

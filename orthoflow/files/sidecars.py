@@ -244,6 +244,22 @@ def raster_tags(
     }
 
 
+def accuracy_words(accuracy: object) -> str:
+    """Say in words what `accuracy` of an orthoimage's sidecar holds."""
+    told = accuracy if isinstance(accuracy, dict) else {}
+    median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
+    count = told.get("n_check_points")
+    if told.get("assessed") is not True or not all(
+        isinstance(value, float) for value in (median, high)
+    ):
+        return "accuracy not checked"
+    return (
+        f"expected error of a point measured in this image {median:.1f} mm, 95 % below {high:.1f} "
+        f"mm (one standard deviation, by orientation, depth and parallax; {count} check points on "
+        "this wall)"
+    )
+
+
 def mask_meanings(
     meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
 ) -> JsonValue:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 
+# Percentiles of larger rasters are told from some of their rows.
+_CELLS_ASKED: Final = 1 << 25
 # What the intensity of a wall is: of the laser; the grey of the colours instead; or there is none.
 IntensitySource = Literal["laser", "luminance", "none"]
 
@@ -122,6 +124,8 @@ class Walls(Product):
         buffers_m: the same of each wall, in front and behind; empty where all walls have these.
         percentiles: which percentiles (0..100) of the depths in a cell each `Wall.percentiles_m`
             has, in its order; empty if none were wanted.
+        included: numbers of the planes that each wall shows, so that they are no walls of their
+            own; empty where nobody says.
         details: what else the method says, JSON.
     """
 
@@ -147,6 +151,7 @@ class Walls(Product):
     buffer_behind_m: float
     buffers_m: tuple[tuple[float, float], ...] = ()
     percentiles: tuple[float, ...] = ()
+    included: tuple[tuple[int, ...], ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -154,6 +159,8 @@ class Walls(Product):
             raise ProductError(
                 f"{len(self.walls)} walls need a buffer each or none, got {len(self.buffers_m)}"
             )
+        if self.included and len(self.included) != len(self.walls):
+            raise ProductError(f"included must tell of {len(self.walls)} walls, or of none")
         for wall in self.walls:
             rasters = wall.percentiles_m
             if rasters is not None and rasters.shape[2:] != (len(self.percentiles),):
@@ -286,6 +293,9 @@ class Orthoimage:
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.
         plane_index: position of the wall's plane in `Planes`; None where nobody says.
+        error_m: float32 expected error of a place measured in the image, one standard deviation of
+            u and of v, metres; NaN where it is not known. None where nothing is known of it.
+        n_check_points: how many independent points check the photos on this wall.
     """
 
     frame: WallFrame
@@ -296,9 +306,26 @@ class Orthoimage:
     source: NDArray[np.int16]
     sources: tuple[str, ...]
     plane_index: int | None = None
+    error_m: NDArray[np.float32] | None = None
+    n_check_points: int = 0
 
     def __post_init__(self) -> None:
-        _check_rasters(self, f"orthoimage {self.name}", "rgb mask source")
+        _check_rasters(self, f"orthoimage {self.name}", "rgb mask source error_m")
+
+    @property
+    def expected_mm(self) -> tuple[float, float]:
+        """Median and 95th percentile of the expected error, millimetres; NaN where none is known.
+
+        Of large images, told from some of their rows.
+        """
+        if self.error_m is None:
+            return math.nan, math.nan
+        some = self.error_m[:: max(1, self.error_m.size // _CELLS_ASKED)]
+        known = some[np.isfinite(some)]
+        if not known.size:
+            return math.nan, math.nan
+        median, high = np.percentile(known, (50.0, 95.0))
+        return 1e3 * float(median), 1e3 * float(high)
 
     @property
     def number(self) -> int:
@@ -321,6 +348,7 @@ class Orthoimages(Product):
     encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rgb": Tolerance(limit=2, unit="grey"),
+        "error_m": Tolerance(limit=1e-4, unit="m"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
     }
     items: ClassVar[str] = "images"

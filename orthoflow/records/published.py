@@ -18,6 +18,7 @@ from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import StoreError
 from orthoflow.geometry.threads import in_order
+from orthoflow.records.deliverables import write_walls_json
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 
 PRODUCTS_FOLDER: Final = "products"
@@ -57,6 +58,7 @@ def publish_products(
             if cell.status == "ok":
                 folder = path_below(target, cell_file_name(cell.address))
                 expected |= _publish_cell(folder, cell, files_of)
+        write_walls_json(target, cells)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
         published = _digested(run_folder, target)

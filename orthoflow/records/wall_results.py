@@ -15,7 +15,7 @@ from orthoflow_provenance.reader import open_record
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.sidecars import placed_raster, read_sidecar
+from orthoflow.files.sidecars import accuracy_words, placed_raster, read_sidecar
 from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, Inspection, Opening, Openings, Planes, Walls
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
@@ -43,12 +43,6 @@ _COUNTED: Final = {
     "n_3d": ("check point", "check points"),
 }
 
-# The same of the photos, all walls together.
-_PHOTOS: Final = {
-    "sigma_wall_mm_worst": "expected error of its orientation against the scan",
-    "check_rmse_mm_worst": "ties that only check, RMS over both axes of the photo",
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class WallResult:
@@ -60,8 +54,8 @@ class WallResult:
         plane_index: its plane's place in `planes.json`, or None where nothing says it.
         frame: where the largest of its rasters lies.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, those that are there.
-        accuracy: sentences of the inspections of this wall, its plane's noise, and what the
-            orientation of the photos expects and checked.
+        accuracy: sentences on the expected error of its orthoimage, its plane's noise, and what
+            inspections of this wall found; all by evidence on this wall alone.
         colours: what was done to the colours of the photos; empty without an orthoimage.
     """
 
@@ -190,11 +184,10 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
     }
     kept = Planes.from_payload(run.payload(*planes)) if planes else None
     colours = _colours(run, address)
-    oriented = tuple(_photo_accuracy(run, upstream))
     return RoomResults(
         address=address,
         walls=tuple(
-            replace(result, accuracy=(*(measured or unmeasured), *result.accuracy, *oriented))
+            replace(result, accuracy=(*result.accuracy, *(measured or unmeasured)))
             for number in ([wall] if wall in files else sorted(files))
             for measured in [tuple(_accuracy(inspections, number))]
             for unmeasured in [
@@ -318,11 +311,12 @@ def _wall_result(
     for kind, path in rasters.items():
         _check_kind(kind, path)
     frame, content = placed_raster(first)
+    error = first.with_name(first.name.replace("_ortho.tif", "_error.tif"))
     about = read_sidecar(rasters["depth"].with_suffix(".json")) if "depth" in rasters else {}
     index = about.get("plane_index", number)
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
-    said = []
+    said = [accuracy_words(content.get("accuracy"))] if error.exists() else []
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         said.append(
@@ -361,34 +355,18 @@ def _unmeasured(run: Run) -> str:
 def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:
     for address, inspection in inspections.items():
         own = {item.name: item.value for item in inspection.findings if item.wall == wall}
-        everywhere = {item.name: item.value for item in inspection.findings if item.wall < 0}
-        for values, whose in ((own, ""), (everywhere, " (all walls)")):
-            said = [
-                text.format(f"{values[first]:.1f}", f"{values[second]:.1f}")
-                + _of_how_many(values, counts)
-                for first, second, text, counts in _ACCURACY
-                if first in values and second in values
-            ]
-            if said:
-                yield f"{address}: {'; '.join(said)}{whose}"
-                break
+        said = [
+            text.format(f"{own[first]:.1f}", f"{own[second]:.1f}") + _of_how_many(own, counts)
+            for first, second, text, counts in _ACCURACY
+            if first in own and second in own
+        ]
+        if said:
+            yield f"{address}: {'; '.join(said)}"
 
 
 def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> str:
     name = next((name for name in counts if name in values), "")
     return f" of {values[name]:.0f} {_COUNTED[name][values[name] != 1]}" if name else ""
-
-
-def _photo_accuracy(run: Run, upstream: tuple[str, ...]) -> Iterator[str]:
-    """What the last orientation behind the pictures says of its worst photo."""
-    for address in upstream:
-        own = {metric.name: metric.value for metric in run.cells[address].metrics}
-        said = [f"{text} {own[name]:.1f} mm" for name, text in _PHOTOS.items() if name in own]
-        if said:
-            yield (
-                f"{address}, worst photo: {', '.join(said)}; errors of depth and scan add to these"
-            )
-            return
 
 
 def _colours(run: Run, address: str) -> str:

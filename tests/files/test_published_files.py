@@ -169,6 +169,7 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
         "plane_index": 2,
         "intensity_source": "laser",
         "buffer": {"front_m": 0.3, "behind_m": 0.2},
+        "includes_walls": [],
         "content": content,
         "name": "north",
         "mask": {
@@ -261,6 +262,12 @@ def test_orthoimages_are_told_completely(
         "mask_counts": {"0": 1, "1": 2, "2": 1, "3": 1, "4": 1},
         "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
         "mask_raster": "wall_7_ortho_mask.tif",
+        "accuracy": {
+            "expected_mm_median": None,
+            "expected_mm_p95": None,
+            "n_check_points": 0,
+            "assessed": False,
+        },
         "product_digest": DIGEST,
     }
     content = f"orthoimage, {colours}"

@@ -145,7 +145,7 @@ def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
 
 
 def _sheet_text(run: Run, wall: WallResult, block: TitleBlock, digest: str) -> SheetText:
-    notes = [f"accuracy: {'; '.join(wall.accuracy)}" if wall.accuracy else "accuracy: not measured"]
+    notes = [f"accuracy: {'; '.join(wall.accuracy)}" if wall.accuracy else "accuracy not checked"]
     if wall.colours:
         notes.append(wall.colours)
     notes.append(f"cells of {1e3 * wall.frame.gsd_m:g} mm")

@@ -188,4 +188,5 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "down": frame.raster_down,
         "axes": "E, N" if frame.map_crs else "X, H" if frame.raster_axes == "wall" else "X, Y",
         "crs": frame.crs,
+        "accuracy": ortho.accuracy,
     }

@@ -33,6 +33,7 @@ class SourceErrors:
         displacement_m: (rows, cols, 2) along u and v, cell - place that its colour is of; NaN
             where no oriented photo painted or its pixel looks at nothing.
         traced: (rows, cols) bool, cells that an oriented photo painted.
+        expected_m: (rows, cols) the error that the orthoimage states; None where it states none.
         steps: (rows, cols) bool, within 2 cells of a true depth step.
         ghosts: (rows, cols) bool, the pixel looks at a free-standing object.
         n_seen_by_both: cells of those of which is asked who sees them, whose true surface a
@@ -47,6 +48,7 @@ class SourceErrors:
     ghosts: NDArray[np.bool_]
     n_seen_by_both: int
     n_seen_painted: int
+    expected_m: NDArray[np.float32] | None = None
 
     def kept(self, name: str, allocate: Allocate) -> SourceErrors:
         """The same with its arrays in files."""
@@ -115,6 +117,7 @@ def trace_sources(
         ghosts=ghosts,
         n_seen_by_both=int(np.count_nonzero(both)),
         n_seen_painted=int(np.count_nonzero(both & (image.mask == OrthoMask.PAINTED))),
+        expected_m=image.error_m,
     )
 
 
@@ -156,11 +159,30 @@ def source_findings(
         ("ghost_share", n_ghosts / n_traced, "1"),
         ("n_ghost_cells", float(n_ghosts), "1"),
     ]
+    numbers += _shares_within(errors)
     n_both = sum(item.n_seen_by_both for item in errors)
     if n_both:
         n_painted = sum(item.n_seen_painted for item in errors)
         numbers.append(("completeness_seen_by_both", n_painted / n_both, "1"))
     return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+
+
+def _shares_within(errors: Sequence[SourceErrors]) -> list[tuple[str, float, str]]:
+    """Shares of coordinates whose error is within once and twice what the orthoimage states."""
+    counts = np.zeros(3)
+    for item in errors:
+        if item.expected_m is None:
+            continue
+        chosen = item.traced & ~item.steps & ~item.ghosts & np.isfinite(item.expected_m)
+        chosen &= np.isfinite(item.displacement_m).all(axis=2)
+        sigmas = np.abs(item.displacement_m[chosen]) / item.expected_m[chosen][:, None]
+        counts += [sigmas.size, (sigmas <= 1.0).sum(), (sigmas <= 2.0).sum()]
+    if not counts[0]:
+        return []
+    return [
+        ("within_1_sigma_share", float(counts[1] / counts[0]), "1"),
+        ("within_2_sigma_share", float(counts[2] / counts[0]), "1"),
+    ]
 
 
 def counted_once(bands: Sequence[SourceErrors]) -> tuple[SourceErrors, ...]:

@@ -90,6 +90,7 @@ _OF_WALLS: Final = (
     *("step_colour_rmse_grey", "gross_colour_share", "ghost_colour_share", "ghost_share"),
     *("completeness", "completeness_filled", "completeness_seen_by_both", "unseen_painted_share"),
     *("n_traced", "far_source_share", "n_ghost_cells"),
+    *("within_1_sigma_share", "within_2_sigma_share"),
     *("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"),
 )
 

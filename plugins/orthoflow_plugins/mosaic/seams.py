@@ -43,6 +43,7 @@ from orthoflow_plugins.mosaic.agreement import (
 )
 from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
 from orthoflow_plugins.mosaic.drawn_seams import read_seams, seams_of
+from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
     SeamRule,
@@ -94,7 +95,7 @@ class MosaicSeams(Method):
     """
 
     id: ClassVar[str] = "mosaic.seams"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_orthoimages",
@@ -117,6 +118,9 @@ class MosaicSeams(Method):
         "overlap_v_rms_cells",
         "overlap_u_rms_mm",
         "overlap_v_rms_mm",
+        # Of the walls that were checked, all together.
+        "expected_mm_median",
+        "expected_mm_p95",
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4)",
@@ -196,7 +200,13 @@ class MosaicSeams(Method):
                 number=inputs.layers.number(index),
             )
             verdict = _join(group, name, params, surroundings, allocate)
-            image = replace(verdict.image, plane_index=inputs.layers.number(index))
+            image = _with_errors(
+                replace(verdict.image, plane_index=inputs.layers.number(index)),
+                verdict.shifts_cells,
+                surroundings,
+                inputs.cameras,
+                allocate,
+            )
             verdicts.append(replace(verdict, image=image))
             _show(ctx, image, inputs.cameras)
         _report(ctx, verdicts)
@@ -328,6 +338,32 @@ def _join(
     )
 
 
+def _with_errors(
+    image: Orthoimage,
+    shifts_cells: NDArray[np.float64],
+    surroundings: _Surroundings,
+    cameras: Cameras | None,
+    allocate: Allocate,
+) -> Orthoimage:
+    """Add the expected error of each cell, where ties lie on the wall that tell of it."""
+    n_control, n_check = ties_on(cameras, image.number)
+    if surroundings.wall is None or not surroundings.cameras:
+        return image
+    if n_control + n_check == 0:
+        unknown = np.asarray(allocate("error_m", image.frame.shape, np.float32), np.float32)
+        unknown[...] = np.nan
+        return replace(image, error_m=unknown)
+    errors_m = expected_errors_m(
+        surroundings.wall,
+        image.source,
+        image.sources,
+        surroundings.cameras,
+        shifts_cells,
+        allocate=allocate,
+    )
+    return replace(image, error_m=errors_m, n_check_points=n_check)
+
+
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
     return {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
 
@@ -437,7 +473,19 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         if any(item.balance is not None for item in verdicts):
             untouched = np.concatenate([item.untouched.delta_e for item in verdicts])
             ctx.metric("seam_step_untouched_delta_e", float(untouched.mean()), "1")
+    _report_errors(ctx, [item.image for item in verdicts])
     _report_gains(ctx, verdicts)
+
+
+def _report_errors(ctx: StepContext, images: Sequence[Orthoimage]) -> None:
+    known = [
+        image.error_m[np.isfinite(image.error_m)] for image in images if image.error_m is not None
+    ]
+    errors_m = np.concatenate([np.empty(0, np.float32), *known])
+    if errors_m.size:
+        median, high = 1e3 * np.percentile(errors_m, (50.0, 95.0))
+        ctx.metric("expected_mm_median", float(median), "mm")
+        ctx.metric("expected_mm_p95", float(high), "mm")
 
 
 def _report_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:

@@ -243,7 +243,7 @@ class RasterGrid(Method):
         cloud.require_points(3)
         points = sampled(cloud)
         extent_of = _extents(points, planes, params, ctx)
-        crops = _crops(planes, params, extent_of, ctx)
+        crops, covered = _crops(planes, params, extent_of, ctx)
         slabs = _slabs(params, crops, extent_of)
         rule = _raster_rule(params, threads=ctx.cores)
         rasters: list[WallRaster] = []
@@ -284,6 +284,10 @@ class RasterGrid(Method):
                 buffer_behind_m=max(slab.behind_m for slab in slabs.values()),
                 buffers_m=tuple((slab.front_m, slab.behind_m) for slab in slabs.values()),
                 percentiles=params.percentiles,
+                included=tuple(
+                    tuple(index for index, by in covered.items() if by == wall.plane_index)
+                    for wall in walls
+                ),
                 details={
                     "surface": params.surface,
                     "scan_step_m": [raster.scan_step_m for raster in rasters],
@@ -337,8 +341,8 @@ def _log_cuts(
 
 def _crops(
     planes: Planes, params: RasterGrid.Params, extent_of: ExtentOf, ctx: StepContext
-) -> dict[int, CroppedFrame]:
-    """Grid of each chosen plane by its index, the whole or a part.
+) -> tuple[dict[int, CroppedFrame], dict[int, int]]:
+    """Grid of each chosen plane by its index, the whole or a part; and what is left out for which.
 
     Raises:
         MethodError: there is no such plane, or no wall has the part that is wanted.
@@ -353,7 +357,8 @@ def _crops(
         near=params.near,
     )
     chosen = chosen_planes(planes, choice)
-    warn_of_covered(ctx, planes.names, covered_planes(planes, choice, chosen))
+    covered = covered_planes(planes, choice, chosen)
+    warn_of_covered(ctx, planes.names, covered)
     for index, wall in chosen_relief(planes, choice, chosen).items():
         ctx.warn(
             f"near takes {planes.names[index]}, which is relief of {planes.names[wall]}: where "
@@ -379,7 +384,7 @@ def _crops(
                 "away: check the point, its unit and the planes"
             )
     if params.crop is None:
-        return {index: CroppedFrame(frame=frame) for index, frame in frames.items()}
+        return {index: CroppedFrame(frame=frame) for index, frame in frames.items()}, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
     crops = {index: part for index, part in parts.items() if part is not None}
     if not crops:
@@ -393,7 +398,7 @@ def _crops(
         ctx.warn(
             f"crop cuts the same part out of {len(frames)} walls; choose one with near or ranks"
         )
-    return crops
+    return crops, covered
 
 
 def _slabs(

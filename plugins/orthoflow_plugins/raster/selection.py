@@ -81,11 +81,22 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
         if choice.skip_covered and any(_covers(planes, wall, index, choice) for wall in chosen):
             continue
         chosen.append(index)
-    return chosen
+    if not choice.skip_covered:
+        return chosen
+    # A larger wall of less support may show one that was chosen before it, too.
+    return [
+        index
+        for index in chosen
+        if index == chosen[0]
+        or not any(
+            _is_larger(planes, wall, index) and _covers(planes, wall, index, choice)
+            for wall in chosen
+        )
+    ]
 
 
 def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
-    """Planes left out though they have more support than a chosen one -> the wall they lie on.
+    """Planes left out, of those up to the last that was looked at -> the wall they lie on.
 
     Args:
         planes: by support.
@@ -95,11 +106,16 @@ def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) ->
     if not choice.skip_covered or choice.ranks or choice.near:
         return {}
     found: dict[int, int] = {}
-    for index in sorted(set(range(max(chosen))) - set(chosen)):
+    for index in sorted(set(range(len(planes))) - set(chosen)):
         is_large = area_m2(planes.corners[index]) >= choice.min_area_m2
         if not is_large or not _fits(planes, index, choice.constraint):
             continue
-        walls = (wall for wall in chosen if wall < index and _covers(planes, wall, index, choice))
+        walls = (
+            wall
+            for wall in chosen
+            if (wall < index or _is_larger(planes, wall, index))
+            and _covers(planes, wall, index, choice)
+        )
         if (wall := next(walls, None)) is not None:
             found[index] = wall
     return found
@@ -185,6 +201,10 @@ def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:
     extent_m = inner.max(axis=0) - inner.min(axis=0)
     share = np.clip(shared_m, 0.0, None).prod() / max(float(extent_m.prod()), 1e-12)
     return bool(share >= _COVERED_SHARE)
+
+
+def _is_larger(planes: Planes, wall: int, index: int) -> bool:
+    return area_m2(planes.corners[wall]) > area_m2(planes.corners[index])
 
 
 def _fits(planes: Planes, index: int, constraint: Constraint) -> bool:

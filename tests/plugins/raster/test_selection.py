@@ -92,15 +92,25 @@ def test_a_plane_inside_a_walls_buffer_is_its_relief(
     assert chosen == ([0] if is_covered else [0, 1])
 
 
-def test_covered_planes_with_more_support_than_a_wall_are_named_with_what_shows_them() -> None:
+def test_covered_planes_are_named_with_the_wall_that_shows_them() -> None:
     relief, other, small = (0.08, 1.0, 3.0, 0.0), (0.0, 6.0, 3.0, 0.0), (0.1, 2.0, 1.0, 0.0)
     four = planes(MAIN, relief, other, small)
     chosen = chosen_planes(four, CHOICE)
     assert chosen == [0, 2]
-    assert covered_planes(four, CHOICE, chosen) == {1: 0}
+    assert covered_planes(four, CHOICE, chosen) == {1: 0, 3: 0}
     # Two that are too small for a wall, or not asked for, are no riddle.
     assert covered_planes(four, replace(CHOICE, min_area_m2=6.5), chosen) == {}
     assert covered_planes(four, replace(CHOICE, ranks=(0, 2)), [0, 2]) == {}
+
+
+def test_a_plane_that_a_larger_one_of_less_support_shows_is_no_wall_of_its_own() -> None:
+    # The second is seen at one end of the third, which is larger and has fewer points.
+    three = planes((0.0, 0.0, 3.0, -90.0), (0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
+    chosen = chosen_planes(three, CHOICE)
+    assert chosen == [0, 2]
+    assert covered_planes(three, CHOICE, chosen) == {1: 2}
+    # The best supported plane stays a wall in any case.
+    assert chosen_planes(planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0)), CHOICE) == [0, 1]
 
 
 def test_covered_planes_are_kept_when_asked_for() -> None:

@@ -1,0 +1,201 @@
+"""The expected error of a place that is measured in an orthoimage, cell by cell.
+
+Three causes move what a cell shows along the wall, each independent of the others: the photo's pose
+(its covariance, carried onto the wall), the depth of the cell (times the tangent of the view), and
+what neither explains of how far photos of an overlap lie apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.bands import Allocate, row_bands
+from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.robust import NMAD_FACTOR
+from orthoflow.products import Camera, Cameras, SurfaceMask, TieRole, Wall
+
+if TYPE_CHECKING:
+    from orthoflow.geometry import WallFrame
+
+# Errors of poses are smooth: they are computed on so many nodes a side and are linear between.
+_NODES: Final = 48
+# Phase correlation is good to about a tenth of a cell (`agreement`), which says nothing of photos.
+_PARALLAX_NOISE_CELLS: Final = 0.1
+_LEAST_OVERLAPS: Final = 10
+# A view flatter than 84 degrees paints nothing.
+_MOST_TANGENT: Final = 10.0
+# Interpolated depths are about so much worse than measured ones beside them (`docs/accuracy.md`).
+_RECOVERED_TIMES: Final = 2.0
+
+
+def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
+    """Count the ties that hold the photos on a wall, and those that check them there.
+
+    Args:
+        cameras: orientations, with the ties that they kept.
+        number: of the wall.
+    """
+    ties = None if cameras is None else cameras.ties
+    if ties is None:
+        return 0, 0
+    numbers = np.array([ties.number(index) for index in range(int(ties.wall.max(initial=-1)) + 1)])
+    known = ties.wall >= 0
+    mine = np.zeros(len(ties.wall), dtype=np.bool_)
+    mine[known] = numbers[ties.wall[known]] == number
+    return (
+        int(np.count_nonzero(mine & (ties.role == TieRole.CONTROL))),
+        int(np.count_nonzero(mine & (ties.role == TieRole.CHECK))),
+    )
+
+
+def expected_errors_m(
+    wall: Wall,
+    source: NDArray[np.int16],
+    sources: Sequence[str],
+    cameras: Mapping[str, Camera],
+    shifts_cells: NDArray[np.float64],
+    *,
+    allocate: Allocate,
+) -> NDArray[np.float32]:
+    """Predict the error of cells: one standard deviation of u and of v, metres.
+
+    Args:
+        wall: its surface.
+        source: (rows, cols) index of the photo that paints each cell, -1 for none.
+        sources: names of the photos.
+        cameras: of oriented photos, by name; only those with a covariance say how wrong they are.
+        shifts_cells: (n, 2) how far photos of overlaps lie apart.
+        allocate: gives the array.
+
+    Returns:
+        (rows, cols), NaN where nothing is painted, or nothing known of its photo.
+    """
+    frame = wall.frame
+    errors_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
+    errors_m[...] = np.nan
+    step = max(1, -(-max(frame.shape) // _NODES))
+    nodes = _node_places(frame, step)
+    depths_m = np.nan_to_num(
+        wall.depth_m[
+            np.minimum(nodes[..., 1].astype(np.intp), frame.height - 1),
+            np.minimum(nodes[..., 0].astype(np.intp), frame.width - 1),
+        ].astype(np.float64)
+    )
+    noise_m = depth_noise_m(wall.depth_m)
+    total, count = 0.0, 0
+    for index, name in enumerate(sources):
+        camera = cameras.get(name)
+        if camera is None or camera.covariance is None:
+            continue
+        of_pose = _pose_variances(camera, frame, nodes, depths_m)
+        if of_pose is None:
+            continue
+        centre = frame.wall_from_world(camera.viewing().centre_world[None])[0]
+        for rows in row_bands(frame.shape):
+            mine = source[rows] == index
+            down, across = np.nonzero(mine)
+            if not len(down):
+                continue
+            down = down + rows.start
+            variances = _between(of_pose, down, across, step)
+            variances += _depth_variances(wall, down, across, centre, noise_m)
+            errors_m[down, across] = np.sqrt(variances)
+            total, count = total + float(variances.sum()), count + len(variances)
+    if count:
+        unexplained = _parallax_variance(shifts_cells, frame.gsd_m) - total / count
+        if unexplained > 0.0:
+            for rows in row_bands(frame.shape):
+                errors_m[rows] = np.sqrt(errors_m[rows] ** 2 + np.float32(unexplained))
+    return errors_m
+
+
+def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
+    """Columns and rows (r, c, 2) of the nodes: the middles of blocks of cells."""
+    rows, columns = ((np.arange(-(-size // step)) + 0.5) * step for size in frame.shape)
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def _pose_variances(
+    camera: Camera, frame: WallFrame, nodes: NDArray[np.float64], depths_m: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Variances (r, c) of a coordinate on the wall by a photo's orientation, metres squared."""
+    from orthoflow.geometry.lenses import LensFreedom, linearised
+    from orthoflow.geometry.resection import moved_origin, pixels_by_point
+
+    if camera.covariance is None:
+        return None
+    viewing, middle = camera.viewing(), frame.origin_world
+    # About the wall: at survey coordinates turns and shifts would cancel each other.
+    to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
+    covariance = to_local @ camera.covariance @ to_local.T
+    near = viewing.shifted(middle)
+    points = frame.world_from_wall(nodes.reshape(-1, 2), depths_m.ravel()) - middle
+    pixels = near.project(points)[:, :2]
+    in_front = (points @ near.rotation[2] + near.translation[2]) > 0.0
+    shown = np.isfinite(pixels).all(axis=1) & in_front
+    if not shown.any():
+        return None
+    variances = np.full(len(points), np.nan)
+    axes = np.array([frame.u_world, frame.v_world])
+    by_pose = linearised(near, points[shown], LensFreedom()).by_parameters
+    wall_by_pixel = np.linalg.pinv(pixels_by_point(near, points[shown]) @ axes.T)
+    by_pose = wall_by_pixel @ by_pose
+    variances[shown] = 0.5 * np.einsum("nij,jk,nik->n", by_pose, covariance, by_pose)
+    inside = near.sees(pixels) & shown
+    if camera.sigma_wall_m is not None and inside.any():
+        # An estimated lens adds to the pose; what it adds on the wall is stated with it.
+        stated = camera.sigma_wall_m**2 / float(np.median(variances[inside]))
+        variances *= max(1.0, stated)
+    known = np.isfinite(variances)
+    variances[~known] = variances[known].max()
+    return variances.reshape(nodes.shape[:2])
+
+
+def _between(
+    values: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp], step: int
+) -> NDArray[np.float64]:
+    """Values (n,) at cells, linear between the nodes, level beyond the outermost."""
+    places, shares = [], []
+    for cells, size in zip((rows, columns), values.shape, strict=True):
+        place = np.clip((cells + 0.5) / step - 0.5, 0.0, size - 1.0)
+        first = np.minimum(place.astype(np.intp), max(0, size - 2))
+        places.append((first, np.minimum(first + 1, size - 1)))
+        shares.append(place - first)
+    (top, bottom), (left, right) = places
+    down, across = shares
+    upper = values[top, left] * (1.0 - across) + values[top, right] * across
+    lower = values[bottom, left] * (1.0 - across) + values[bottom, right] * across
+    return np.asarray(upper * (1.0 - down) + lower * down, dtype=np.float64)
+
+
+def _depth_variances(
+    wall: Wall,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    centre: NDArray[np.float64],
+    noise_m: float,
+) -> NDArray[np.float64]:
+    """Variances (n,) of a coordinate by the depth of cells, seen from a centre (3,)."""
+    gsd_m = wall.frame.gsd_m
+    across = gsd_m * (columns + 0.5 - centre[0])
+    down = gsd_m * (rows + 0.5 - centre[1])
+    depth_m = np.nan_to_num(wall.depth_m[rows, columns].astype(np.float64))
+    before = np.maximum(centre[2] - depth_m, 1e-3)
+    squares = np.minimum((across**2 + down**2) / before**2, _MOST_TANGENT**2)
+    n_points = np.maximum(1.0, wall.count[rows, columns].astype(np.float64))
+    spread = np.nan_to_num(wall.sigma_m[rows, columns].astype(np.float64)) / np.sqrt(n_points)
+    sigma_m = np.maximum(noise_m, spread)
+    sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] *= _RECOVERED_TIMES
+    return np.asarray(0.5 * squares * sigma_m**2, dtype=np.float64)
+
+
+def _parallax_variance(shifts_cells: NDArray[np.float64], gsd_m: float) -> float:
+    """Variance of a coordinate of one photo, by how far two lie apart; 0 where that is noise."""
+    if len(shifts_cells) < _LEAST_OVERLAPS:
+        return 0.0
+    spread = NMAD_FACTOR * float(np.median(np.abs(shifts_cells)))
+    return 0.5 * gsd_m**2 * max(0.0, spread**2 - _PARALLAX_NOISE_CELLS**2)
