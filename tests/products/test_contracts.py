@@ -55,7 +55,7 @@ TOLERANCES = {
         "residual_px": "0.05 px",
     },
     "layers": {"rgb": "2 grey", "quality": "0.001 1", "origin_world": "0.001 m"},
-    "orthoimages": {"rgb": "2 grey", "origin_world": "0.001 m"},
+    "orthoimages": {"rgb": "2 grey", "error_m": "0.0001 m", "origin_world": "0.001 m"},
     "checkpoints": {},
     "truth": {},
     "openings": dict.fromkeys(("outline_m", "outline_world", "side_sigma_m", "depth_m"), "0.001 m"),

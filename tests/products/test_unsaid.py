@@ -38,7 +38,8 @@ def test_no_other_product_has_numbers_of_its_own() -> None:
         if is_dataclass(cls := getattr(products, name)) and name not in UNSAID
     }
     assert {name: found for name, found in numbers.items() if found} == {
-        "Planes": {"tolerance_m": 0.05}
+        "Planes": {"tolerance_m": 0.05},
+        "Orthoimage": {"n_check_points": 0},
     }
 
 
