@@ -1,14 +1,17 @@
 """Cache keys: which ingredients decide a cell's result, and nothing else.
 
-Paths, step names, cores, timeouts, package versions and time stamps stay out on purpose. Digests
-of source code stand for a version wherever code is not a released install.
+Paths, step names, cores, timeouts and time stamps stay out on purpose. The code of a method and the
+versions of the libraries that it may use go in for every method, without the author's doing.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib import metadata
@@ -16,7 +19,7 @@ from pathlib import Path
 from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
-from orthoflow.catalog.distributions import package_path, source_files
+from orthoflow.catalog.distributions import canonical_name, package_path, source_files
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.kernels import kernel_sources
@@ -35,6 +38,17 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 # What a method's result can depend on in the framework; engine and command line cannot change it.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _FRAMEWORK: Final = "orthoflow."
+_CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
+# What we require and no result depends on: command line, files of runs, pages, drawings, metadata.
+_WITHOUT_EFFECT: Final = frozenset(
+    {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
+    | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
+    | {"ruamel-yaml", "segno"}
+)
+_OUR_OWN: Final = frozenset({"orthoflow", "orthoflow_plugins", "orthoflow_provenance"})
+_REQUIREMENT: Final = re.compile(r"[\w.-]+")
+_IMPORTED: Final = re.compile(r"^\s*(?:import|from)\s+([A-Za-z_]\w*)", re.MULTILINE)
+_MADE_BY_PYTHON: Final = frozenset({"__pycache__", ".pyc", ".nbi", ".nbc"})
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
 
 # Path, size and time of files.
@@ -47,8 +61,8 @@ class MethodFacts(MethodIdentity):
 
     Attributes:
         target: import string of the class.
-        tools: external libraries whose version changes results.
-        code: digests of source code that is not a released install; empty when all is released.
+        tools: libraries whose version may change results, with their versions.
+        code: digests of the code of the plugin and of the framework.
         compiled_digest: names the folder for compiled kernels.
         inputs: port -> product type.
         outputs: port -> product type.
@@ -90,7 +104,10 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     entry = catalog.method(method_id)
     cls: type[Method] = entry.load()
     distribution = entry.distribution
-    sources = unreleased_code(entry)
+    sources = _code_files(entry)
+    is_ours = entry.spec.target.startswith(f"{_BUILT_IN_PACKAGE}.")
+    libraries = library_versions(distribution.name, () if is_ours else entry.source_files())
+    unaffected = frozenset(map(canonical_name, cls.unaffected_by))
     return MethodFacts(
         method=method_id,
         target=entry.spec.target,
@@ -99,7 +116,10 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         citations=tuple(cls.citations),
         distribution=distribution.name,
         distribution_version=distribution.version,
-        tools=_tools(cls),
+        tools={
+            **{name: version for name, version in libraries.items() if name not in unaffected},
+            **_tools(cls),
+        },
         code={name: files_digest(files) for name, files in sources.items()},
         sources=sources,
         compiled_digest=compiled_digest(entry),
@@ -131,7 +151,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
         "v": _KEY_VERSION,
         "method": facts.method,
         "result_version": facts.result_version,
-        "code": dict(facts.code) or None,
+        "code": dict(facts.code),
         "params": dict(cell.params),
         "seed": None if facts.determinism == "exact" else cell.seed,
         "tools": dict(facts.tools),
@@ -179,21 +199,51 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 
 
 @cache
-def is_framework_released() -> bool:
-    """Whether the framework came from an index, so that its version stands for its code."""
+def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mapping[str, str]:
+    """Return the versions of the libraries on which results of a plugin's methods may depend.
+
+    They are what its distribution and ours require, and what its sources import besides; those that
+    are not installed are left out. What only shows or keeps results is none of them.
+
+    Args:
+        distribution: of the plugin.
+        sources: its Python files, where it is not one of ours.
+    """
+    names = {*_CORE, *_required(DISTRIBUTION), *_required(distribution), *_imported(sources)}
+    versions: dict[str, str] = {}
+    for name in sorted(names - _WITHOUT_EFFECT - {DISTRIBUTION, canonical_name(distribution)}):
+        with suppress(metadata.PackageNotFoundError, ValueError, KeyError):
+            versions[name] = metadata.version(name)
+    return versions
+
+
+def _required(distribution: str) -> set[str]:
+    """Canonical names of what a distribution requires itself, without its extras."""
     try:
-        distribution = metadata.distribution(DISTRIBUTION)
-    except metadata.PackageNotFoundError:
-        return False
-    if distribution.read_text("direct_url.json") is not None:
-        return False
-    return _ROOT.is_relative_to(Path(str(distribution.locate_file(""))).resolve())
+        stated = metadata.requires(distribution) or []
+    except (metadata.PackageNotFoundError, ValueError):
+        return set()
+    found = (_REQUIREMENT.match(text) for text in stated if "extra ==" not in text)
+    return {canonical_name(match[0]) for match in found if match}
+
+
+def _imported(sources: Iterable[Path]) -> set[str]:
+    """Canonical names of the distributions whose modules Python files import anywhere."""
+    modules = {
+        name
+        for path in sources
+        for name in _IMPORTED.findall(path.read_text(encoding="utf-8", errors="replace"))
+        if name not in sys.stdlib_module_names
+    }
+    modules -= {path.stem for path in sources} | {path.parent.name for path in sources} | _OUR_OWN
+    if not modules:
+        return set()
+    known = metadata.packages_distributions()
+    return {canonical_name(name) for module in modules for name in known.get(module, ())}
 
 
 def framework_tag() -> str:
-    """What stands for the framework's code: the version of a release, else the digest."""
-    if is_framework_released():
-        return metadata.version(DISTRIBUTION)
+    """What stands for the framework's code."""
     return files_digest(framework_files())
 
 
@@ -204,9 +254,8 @@ def publisher_tag(entry: ProductEntry) -> str:
         return ""
     if module.startswith(_FRAMEWORK):
         return framework_tag()
-    own = entry.distribution
-    files = source_files((own.source_folder, package_path(module)))
-    return f"{framework_tag()} {own if own.is_released else files_digest(files)}"
+    files = source_files((entry.distribution.source_folder, package_path(module)))
+    return f"{framework_tag()} {files_digest(files)}"
 
 
 @cache
@@ -219,27 +268,30 @@ def framework_files() -> tuple[Path, ...]:
 
 
 def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
-    """The code that a method belongs to.
+    """The code that a method belongs to, and the data in the same packages.
 
     For the built-in methods that is the package of their kind, since one kind never imports
     another; for all others everything their distribution's packages hold.
     """
     files = entry.source_files()
     module = entry.spec.target.partition(":")[0]
-    if not module.startswith(f"{_BUILT_IN_PACKAGE}."):
-        return files
-    place = f"/{_BUILT_IN_PACKAGE}/{module.split('.')[1]}"
-    return tuple(file for file in files if file.as_posix().partition(place)[2][:1] in ("/", "."))
+    if module.startswith(f"{_BUILT_IN_PACKAGE}."):
+        place = f"/{_BUILT_IN_PACKAGE}/{module.split('.')[1]}"
+        return tuple(f for f in files if f.as_posix().partition(place)[2][:1] in ("/", "."))
+    packages = {file.parent for file in files if file.name == "__init__.py"}
+    found = {
+        path
+        for package in packages
+        if package.parent not in packages
+        for path in package.rglob("*")
+        if path.is_file() and not _MADE_BY_PYTHON.intersection((path.suffix, path.parent.name))
+    }
+    return tuple(sorted(found.union(files)))
 
 
-def unreleased_code(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
-    """Files whose content decides a method's results, where no version stands for them."""
-    code: dict[str, tuple[Path, ...]] = {}
-    if not entry.distribution.is_released:
-        code["plugin"] = plugin_files(entry)
-    if not is_framework_released():
-        code["framework"] = framework_files()
-    return code
+def _code_files(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
+    """Files whose content decides a method's results, whatever version their distribution says."""
+    return {"plugin": plugin_files(entry), "framework": framework_files()}
 
 
 def compiled_digest(entry: MethodEntry) -> str:

@@ -154,6 +154,8 @@ class Method:
         metric_labels: what metrics of its own are called in tables, and what makes them good:
             name, with wildcards as above -> label. What it says nothing of keeps its name.
         citations: where the method comes from: DOI, title or URL.
+        unaffected_by: distributions whose version does not change results, although the method's
+            own distribution requires them; all others are part of a result's key.
         Params: parameters.
         In: input ports.
         Out: output ports.
@@ -168,6 +170,7 @@ class Method:
     metrics: ClassVar[tuple[str, ...]] = ()
     metric_labels: ClassVar[Mapping[str, MetricLabel]] = {}
     citations: ClassVar[tuple[str, ...]] = ()
+    unaffected_by: ClassVar[tuple[str, ...]] = ()
     Params: ClassVar[type[MethodParams]]
     In: ClassVar[type[Ports]]
     Out: ClassVar[type[Ports]]
@@ -237,7 +240,7 @@ class Method:
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """External libraries whose version changes results, with their versions."""
+        """Return versions besides those of the libraries that the distribution requires."""
         return {}
 
 

@@ -6,16 +6,11 @@ import dataclasses
 import hashlib
 import json
 import os
-import re
-from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from orthoflow.catalog.catalog import ProductEntry
-from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.engine import keys, method_versions
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.garbage import collect_garbage
@@ -24,7 +19,6 @@ from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef, RecordedFile
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
-from orthoflow.sdk.hooks import ProductSpec
 from orthoflow.system import usable_cores
 from orthoflow.workflow.cells import Cell, WorkflowInput
 from tests.engine_world import World, forget_toys
@@ -79,55 +73,6 @@ CELL = Cell(address="step", step="step", method="work.noise", params={"amount": 
 LEFT = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:" + "1" * 64)
 RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
 INPUTS = {"left": LEFT, "right": RIGHT}
-
-
-@pytest.mark.parametrize(
-    ("site", "direct_url", "is_released"),
-    [
-        (keys._ROOT.parent, None, True),
-        (keys._ROOT.parent, "{}", False),
-        (keys._ROOT.parent / "elsewhere", None, False),
-        (None, None, False),
-    ],
-    ids=["from an index", "from a folder", "in front of a release", "not installed"],
-)
-def test_a_release_stands_for_its_code_and_nothing_else_does(
-    monkeypatch: pytest.MonkeyPatch, site: Path | None, direct_url: str | None, is_released: bool
-) -> None:
-    def distribution(_name: str) -> SimpleNamespace:
-        if site is None:
-            raise metadata.PackageNotFoundError
-        return SimpleNamespace(read_text=lambda _: direct_url, locate_file=lambda _: site)
-
-    monkeypatch.setattr(keys.metadata, "distribution", distribution)
-    monkeypatch.setattr(keys.metadata, "version", lambda _: "1.2.3")
-    assert keys.is_framework_released.__wrapped__() is is_released
-    monkeypatch.setattr(keys, "is_framework_released", keys.is_framework_released.__wrapped__)
-    tag = keys.framework_tag()
-    assert tag == "1.2.3" if is_released else re.fullmatch(r"(sha256:)?[0-9a-f]{64}", tag)
-
-
-@pytest.mark.parametrize(
-    ("publisher", "is_released", "tag"),
-    [
-        ("", False, ""),
-        ("orthoflow.files.publishing:publish_cloud", False, "F"),
-        ("toys:publish", True, "F toys 1.5"),
-        ("orthoflow_toys:publish", False, f"F {keys.files_digest([])}"),
-    ],
-    ids=["none", "framework", "released", "source"],
-)
-def test_a_publisher_is_known_by_its_version_or_its_code(
-    monkeypatch: pytest.MonkeyPatch, publisher: str, is_released: bool, tag: str
-) -> None:
-    monkeypatch.setattr(keys, "framework_tag", lambda: "F")
-    entry = ProductEntry(
-        spec=ProductSpec(type_name="t", target="toys:T", summary="", publisher=publisher),
-        distribution=DistributionInfo(
-            name="toys", version="1.5", is_released=is_released, source_folder=None
-        ),
-    )
-    assert keys.publisher_tag(entry) == tag
 
 
 def test_code_that_changed_or_went_is_not_the_one_in_the_keys(tmp_path: Path) -> None:
@@ -443,14 +388,6 @@ def test_changed_code_of_an_unreleased_plugin_counts(world: World) -> None:
     assert world.status(CHAIN)["first"] == ("will run", "code changed")
 
 
-def test_changed_code_of_a_released_plugin_does_not_count(world: World) -> None:
-    run(world, CHAIN)
-    works = world.site / "toy_plugin" / "works.py"
-    works.write_text(works.read_text() + "\n# A comment.\n")
-    forget_toys()
-    assert set(statuses(world, CHAIN).values()) == {"cached"}
-
-
 def test_a_raised_result_version_counts(world: World) -> None:
     run(world, CHAIN)
     makes = world.site / "toy_plugin" / "makes.py"
@@ -458,7 +395,7 @@ def test_a_raised_result_version_counts(world: World) -> None:
         makes.read_text().replace('"make.range"', '"make.range"\n    result_version = 2')
     )
     forget_toys()
-    assert world.status(CHAIN)["first"] == ("will run", "result_version 1 -> 2")
+    assert world.status(CHAIN)["first"] == ("will run", "code changed, result_version 1 -> 2")
 
 
 def test_a_changed_publisher_writes_its_files_anew(world: World) -> None:
