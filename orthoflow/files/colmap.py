@@ -2,76 +2,58 @@
 
 COLMAP counts pixels as orthoflow does, the centre of the first one at (0.5, 0.5), and has the same
 camera axes, so nothing is converted. The points written are the ties that the orientation kept.
+Models are read by pycolmap.
 """
 
 from __future__ import annotations
 
-import math
-import struct
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from io import TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import ArgumentError, InputError
+from orthoflow.errors import ArgumentError, InputError, PluginError
 from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
+    MOST_MODEL_BYTES,
     GivenCamera,
-    bare_name,
-    bytes_of,
     checked_lens,
     damaged,
-    lines_of,
-    numbers_of,
+    lens_or_reason,
+    nearest_lens,
+    normalised_grid,
+    photo_path,
+    rotation_of,
 )
+from orthoflow.files.images import MOST_PIXELS
+from orthoflow.files.panoramas import face_lens
+from orthoflow.files.regular_files import open_file, reading
 from orthoflow.files.sidecars import write_text
-from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_quaternion
+from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 
-# COLMAP's numbers of its models, with how many parameters each has.
-_MODELS: Final = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+# Our names of the parameters of models that OpenCV's hold; COLMAP's own differ for one.
+_NAMES: Final = {"k": "k1"}
+_BROWN: Final = frozenset(
+    {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 )
-# Parameters of those that OpenCV's model holds, in COLMAP's order.
-_COLUMNS: Final = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        *("k3", "k4", "k5", "k6"),
-    ),
-}
-# Of those that bend as OpenCV's fisheyes do.
-_FISHEYES: Final = {
-    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-}
-# More than a camera of any model has.
-_MOST_WORDS: Final = 30
-# u, v and the number of the point.
+_FISHEYES: Final = frozenset(
+    {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
+)
+# What a model consists of; rigs and frames since version 3.12. Its points are not needed.
+COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
-
-_Lens: TypeAlias = Intrinsics | FisheyeLens | str
+_POSE_BYTES: Final = 64
+_WORDS_OF_IMAGE: Final = 10
+_MAX_SAID: Final = 90
+_UNDISTORT: Final = "undistort the model with COLMAP (image_undistorter), or refine it as OPENCV"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,170 +176,159 @@ def _points_text(seen: _KeptTies) -> str:
     return "\n".join(lines) + "\n"
 
 
-def read_colmap_model(cameras: Path, images: Path) -> tuple[GivenCamera, ...]:
-    """Read the orientations of a model, as text or binary.
+def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
+    """Read the orientations of a model by pycolmap, as text or binary, with rigs where it has them.
 
     Args:
-        cameras: `cameras.txt` or `cameras.bin`.
-        images: `images.txt` or `images.bin`.
+        parts: `cameras`, `images` and, where there are such, `rigs` and `frames`, all `.txt` or
+            all `.bin`.
 
     Raises:
         InputError: the model is damaged.
+        PluginError: pycolmap is missing.
     """
-    is_binary = images.suffix.lower() == ".bin"
-    lenses = (_binary_lenses if is_binary else _text_lenses)(cameras)
-    found = []
-    poses = (_binary_images if is_binary else _text_images)(images)
-    for name, camera_id, pose in islice(poses, MOST_CAMERAS + 1):
-        if camera_id not in lenses:
-            raise damaged(images, f"{name} has camera {camera_id}, which {cameras.name} has not")
-        lens, length = lenses[camera_id], float(np.linalg.norm(pose[:4]))
-        if not (math.isfinite(length) and length > 0.0 and all(map(math.isfinite, pose))):
-            raise damaged(images, f"the pose of {name} must be finite numbers")
-        if isinstance(lens, str):
-            found.append(GivenCamera(name=bare_name(name), reason=lens))
-            continue
-        found.append(
-            GivenCamera(
-                name=bare_name(name),
-                lens=lens,
-                rotation=rotation_from_quaternion(np.array(pose[:4]) / length),
-                translation=np.array(pose[4:]),
-            )
-        )
-    if not found:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise PluginError(
+            f"reading the COLMAP model of {parts[0].name} needs pycolmap: pip install pycolmap"
+        ) from error
+    images = next(path for path in parts if path.stem.lower() == "images")
+    suffix = images.suffix.lower()
+    for path in parts:
+        with reading(path, MOST_MODEL_BYTES, "a file of cameras"):
+            pass
+    if suffix == ".bin":
+        _require_whole(images)
+    with tempfile.TemporaryDirectory() as folder:
+        for path in parts:
+            (Path(folder) / f"{path.stem.lower()}{suffix}").symlink_to(path.absolute())
+        # Points are many, and not needed.
+        (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        try:
+            model = pycolmap.Reconstruction(folder)
+        except Exception as error:  # pycolmap raises what its checks in C++ become
+            # After the place in its sources.
+            said = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
+            raise damaged(images, f"pycolmap cannot read the COLMAP model ({said})") from error
+    if not model.images:
         raise damaged(images, "the model has no images")
-    return tuple(found)
-
-
-def _text_lenses(path: Path) -> dict[int, _Lens]:
-    lenses: dict[int, _Lens] = {}
-    for number, line in enumerate(lines_of(path), start=1):
-        words = line.split(maxsplit=_MOST_WORDS)
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < 5:
-            raise damaged(path, "expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", number)
-        camera_id, width, height, *params = numbers_of(
-            [words[0], *words[2:]], path, "a camera's parameters", number
+    if len(model.images) > MOST_CAMERAS or len(model.cameras) > MOST_CAMERAS:
+        raise InputError(f"{images.name} holds more than {MOST_CAMERAS} cameras: split it")
+    lenses = {number: _lens_of(camera, images) for number, camera in model.cameras.items()}
+    by_number = sorted(model.images.items())
+    names = _whole_names(images) if suffix == ".txt" else {}
+    return tuple(
+        given
+        for number, image in by_number
+        for given in _given(
+            image, names.get(number, image.name), *lenses[image.camera_id], path=images
         )
-        lenses[int(camera_id)] = _lens_of(words[1], (int(width), int(height)), params, path)
-        _check_count(lenses, path)
-    return lenses
+    )
 
 
-def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
-    lines = enumerate(lines_of(path), start=1)
-    for number, line in lines:
-        words = line.split(maxsplit=9)
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < 10:
-            raise damaged(
-                path, "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", number
-            )
-        pose = numbers_of(words[1:8], path, "a pose", number)
-        yield words[9].strip(), int(numbers_of([words[8]], path, "CAMERA_ID", number)[0]), pose
-        # The points of the image stand in a line of their own, which may be empty.
-        next(lines, None)
+def _require_whole(images: Path) -> None:
+    """Refuse binary images that end early, or state more points than they have bytes for.
+
+    pycolmap makes room for as many as are stated.
+    """
+    content = images.read_bytes()
+    at, count = 8, int.from_bytes(content[:8], "little")
+    for _ in range(min(count, len(content))):
+        at = content.find(b"\0", at + _POSE_BYTES) + 1
+        if at <= 0:
+            break
+        at += 8 + _OBSERVATION_BYTES * int.from_bytes(content[at : at + 8], "little")
+        if at > len(content):
+            break
+    else:
+        if len(content) >= 8 and count <= len(content):
+            return
+    raise damaged(images, "it ends too early, it is cut off")
 
 
-def _binary_lenses(path: Path) -> dict[int, _Lens]:
-    data = _Bytes(path)
-    lenses: dict[int, _Lens] = {}
-    for _ in range(data.count()):
-        camera_id, model, width, height = data.values("<IiQQ")
-        if not 0 <= model < len(_MODELS):
-            raise damaged(path, f"camera {camera_id} is of the unknown model {model}")
-        name, n_params = _MODELS[model]
-        params = list(data.values(f"<{n_params}d"))
-        lenses[camera_id] = _lens_of(name, (width, height), params, path)
-        _check_count(lenses, path)
-    return lenses
+def _whole_names(images: Path) -> dict[int, str]:
+    """Names of photos by the numbers of their images in a text, which pycolmap ends at a space."""
+    names: dict[int, str] = {}
+    with open_file(images) as content:
+        stream = TextIOWrapper(content, encoding="utf-8", errors="replace")
+        for line in stream:
+            words = line.split(maxsplit=9)
+            if words and not words[0].startswith("#"):
+                if len(words) == _WORDS_OF_IMAGE and words[0].isdecimal():
+                    names[int(words[0])] = words[9].strip()
+                # The points of the image stand in a line of their own, which may be empty.
+                next(stream, None)
+    return names
 
 
-def _check_count(lenses: dict[int, _Lens], path: Path) -> None:
-    if len(lenses) > MOST_CAMERAS:
-        raise InputError(f"{path.name} holds more than {MOST_CAMERAS} cameras: split it")
+def _given(
+    image: Any, whole_name: str, lens: Intrinsics | FisheyeLens | str, note: str, *, path: Path
+) -> list[GivenCamera]:
+    """The camera of an image; of a panorama those of its faces."""
+    name = photo_path(whole_name)
+    if isinstance(lens, str):
+        return [GivenCamera(name=name, reason=lens)]
+    if not image.has_pose:
+        return [GivenCamera(name=name, reason="COLMAP did not register it")]
+    seen = image.cam_from_world()
+    matrix = np.asarray(seen.matrix(), dtype=np.float64)
+    if not np.isfinite(matrix).all() or not np.any(seen.rotation.quat):
+        raise damaged(path, f"the pose of {name} must be finite numbers")
+    given = GivenCamera(
+        name=name,
+        lens=lens,
+        rotation=rotation_of(matrix[:, :3].ravel().tolist(), path, name),
+        translation=matrix[:, 3],
+        note=note,
+    )
+    return given.panorama_faces() if image.camera.is_spherical() else [given]
 
 
-def _binary_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
-    data = _Bytes(path)
-    for _ in range(data.count()):
-        _image_id, *pose, camera_id = data.values("<I7dI")
-        name = data.text()
-        data.skip(_OBSERVATION_BYTES * data.count())
-        yield name, camera_id, pose
-
-
-class _Bytes:
-    """A binary file of COLMAP's, read from the front."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._at, self._content = path, 0, bytes_of(path)
-
-    def values(self, form: str) -> tuple[Any, ...]:
-        """The next values."""
-        start = self._at
-        self.skip(struct.calcsize(form))
-        return struct.unpack_from(form, self._content, start)
-
-    def count(self) -> int:
-        """How many items follow; each has at least one byte."""
-        (count,) = self.values("<Q")
-        if count > len(self._content):
-            raise damaged(self._path, f"it states {count} items, more than it has bytes")
-        return int(count)
-
-    def text(self) -> str:
-        """The text up to the next zero."""
-        end = self._content.find(b"\0", self._at)
-        text = self._content[self._at : end].decode("utf-8", errors="replace")
-        self.skip(max(end, len(self._content)) + 1 - self._at if end < 0 else end + 1 - self._at)
-        return text
-
-    def skip(self, count: int) -> None:
-        """Go on by so many bytes."""
-        self._at += count
-        if self._at > len(self._content):
-            raise damaged(self._path, "it ends too early, it is cut off")
-
-
-def _lens_of(model: str, size: tuple[int, int], params: list[float], path: Path) -> _Lens:
-    """A camera's lens, or why there is none."""
-    columns = _COLUMNS.get(model) or _FISHEYES.get(model)
-    if columns is None:
-        return (
-            f"its camera is of the model {model}, which OpenCV's has not: undistort the model "
-            "with COLMAP (image_undistorter), or refine it as OPENCV"
-        )
-    if len(params) != len(columns):
-        raise damaged(path, f"a camera {model} has {len(columns)} parameters, got {len(params)}")
-    values = dict(zip(columns, params, strict=True))
-    fx, fy = (values[name if name in values else "f"] for name in ("fx", "fy"))
+def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
+    """A camera's lens with what it leaves out, or why there is none."""
+    if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
+        raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
+    if camera.is_spherical():
+        return face_lens(camera.width), ""
+    words = [word.strip() for word in camera.params_info.split(",")]
+    values = {
+        _NAMES.get(word, word): float(value)
+        for word, value in zip(words, camera.params, strict=True)
+    }
+    fx, fy = (values[name] if name in values else values["f"] for name in ("fx", "fy"))
+    terms = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
+    model = str(camera.model_name)
+    is_rational = any(values.get(name, 0.0) for name in ("k4", "k5", "k6"))
     if model in _FISHEYES:
+        radial = tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
         return FisheyeLens(
-            width=size[0],
-            height=size[1],
+            width=int(camera.width),
+            height=int(camera.height),
             fx=fx,
             fy=fy,
             cx=values["cx"],
             cy=values["cy"],
-            radial=tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")),
-        )
-    if any(values.get(name, 0.0) for name in ("k4", "k5", "k6")):
-        return "its camera has k4, k5 or k6, which orthoflow does not take: refine it as OPENCV"
+            radial=radial,
+        ), ""
+    is_exact = model in _BROWN and not is_rational
     lens = Intrinsics(
-        width=size[0],
-        height=size[1],
+        width=int(camera.width),
+        height=int(camera.height),
         fx=fx,
         fy=fy,
         cx=values["cx"],
         cy=values["cy"],
-        distortion=tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")),
+        distortion=terms if is_exact else (0.0,) * 5,
         source="given",
     )
-    return checked_lens(lens, path, f"a camera {model}")
+    lens = checked_lens(lens, path, f"a camera {model}")
+    if is_exact:
+        return lens, ""
+    pixels = normalised_grid(lens) * [fx, fy] + [lens.cx, lens.cy]
+    rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64)
+    nearest, worst_px = nearest_lens(lens, rays, pixels)
+    return lens_or_reason(f"its camera of the model {model}", nearest, worst_px, _UNDISTORT)
 
 
 def _words(values: list[float] | NDArray[np.float64]) -> str:

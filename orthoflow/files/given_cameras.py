@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +23,8 @@ from orthoflow.errors import InputError
 from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
 from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.json_texts import parse_json
-from orthoflow.files.regular_files import open_file, open_text, reading, text_of_file
+from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_name
+from orthoflow.files.regular_files import open_text, reading, text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
@@ -35,6 +37,13 @@ MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _FULL_FRAME_MM: Final = 36.0
 _ORTHONORMAL: Final = 1e-4
+# A lens that is so near to another one is the same to any matcher; beyond the other limit its
+# error shows in an orthoimage.
+NEGLIGIBLE_PX: Final = 0.05
+MAX_LEFT_OUT_PX: Final = 0.5
+_FEWEST_DIRECTIONS: Final = 30
+_FAR_PX: Final = 1e4
+_WIDEST_FITTED_DEG: Final = 355.0
 # Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
 _FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
@@ -47,20 +56,22 @@ class CentredLens:
         focal_px: focal length in pixels, or None where it is said by the photo's longer side.
         focal_share: focal length as a share of the photo's longer side, or None.
         off_middle: principal point from the middle, right and down, in shares of that side.
-        radial: k1, k2, k3.
+        radial: k1, k2, k3, k4.
+        tangential: two terms whose order and signs the file does not define; they are left out.
     """
 
     focal_px: float | None = None
     focal_share: float | None = None
     off_middle: tuple[float, float] = (0.0, 0.0)
-    radial: tuple[float, float, float]
+    radial: tuple[float, ...]
+    tangential: tuple[float, ...] = (0.0, 0.0)
 
-    def of_size(self, width: int, height: int) -> Intrinsics:
-        """Give the lens of a photo of so many pixels."""
+    def of_size(self, width: int, height: int) -> tuple[Intrinsics | FisheyeLens, float]:
+        """Return the lens of a photo of so many pixels, and how many at most are left out."""
         longest = max(width, height)
         focal = self.focal_px or (self.focal_share or 0.0) * longest
-        k1, k2, k3 = self.radial
-        return Intrinsics(
+        k1, k2, k3, k4 = (*self.radial, 0.0, 0.0)[:4]
+        plain = Intrinsics(
             width=width,
             height=height,
             fx=focal,
@@ -70,6 +81,16 @@ class CentredLens:
             distortion=(k1, k2, 0.0, 0.0, k3),
             source="given",
         )
+        corner2 = (width * width + height * height) / (4.0 * focal * focal)
+        left_out_px = 3.0 * focal * corner2 * math.hypot(*self.tangential)
+        if not k4:
+            return plain, left_out_px
+        xy = normalised_grid(plain)
+        r2 = (xy * xy).sum(axis=1, keepdims=True)
+        bent = xy * (1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))))
+        rays = np.column_stack([xy, np.ones(len(xy))])
+        lens, worst_px = nearest_lens(plain, rays, focal * bent + [plain.cx, plain.cy])
+        return lens, worst_px + left_out_px
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,12 +98,14 @@ class GivenCamera:
     """The orientation of one photo as a file has it.
 
     Attributes:
-        name: of the photo, without folders; some programs leave out its suffix.
+        name: of the photo, with the folders that the file states, separated by slashes; some
+            programs leave out its suffix.
         lens: interior orientation, where the file says it.
         rotation: (3, 3) camera_from_world; None where the file only says why there is none.
         translation: (3,) camera_from_world, in the unit of the file.
         sigma_wall_m: predicted error on the wall, where the file says it.
         reason: why the photo has no orientation; empty where it has one.
+        note: what of it could not be taken over exactly, or was converted; empty without such.
     """
 
     name: str
@@ -91,6 +114,7 @@ class GivenCamera:
     translation: NDArray[np.float64] | None = None
     sigma_wall_m: float | None = None
     reason: str = ""
+    note: str = ""
 
     def of_face(self, face: str) -> GivenCamera:
         """Give the camera of a face of the cube that a fisheye's photo becomes."""
@@ -111,6 +135,21 @@ class GivenCamera:
             rotation=axes @ self.rotation,
             translation=axes @ np.asarray(self.translation, dtype=np.float64),
         )
+
+    def panorama_faces(self) -> list[GivenCamera]:
+        """Return the cameras of a panorama's faces; itself where it has no pose."""
+        if self.rotation is None or self.translation is None:
+            return [self]
+        stem = str(PurePosixPath(self.name).with_suffix(""))
+        return [
+            replace(
+                self,
+                name=face_name(stem, face),
+                rotation=axes @ PANORAMA_FROM_CAMERA @ self.rotation,
+                translation=axes @ PANORAMA_FROM_CAMERA @ self.translation,
+            )
+            for face, axes in FACES.items()
+        ]
 
 
 def text_of(path: Path) -> str:
@@ -136,19 +175,90 @@ def lines_of(path: Path) -> Iterator[str]:
             yield line.rstrip("\n")
 
 
-def bytes_of(path: Path) -> bytes:
-    """Content of a binary model.
+def photo_path(text: str) -> str:
+    """Path of a photo with slashes, whichever way those of its program lean."""
+    return PureWindowsPath(text.strip()).as_posix()
 
-    Raises:
-        InputError: it cannot be read, or is larger than any such file.
+
+def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
+    """Places (n, 2) in front of a lens, as x / z and y / z, that cover its image."""
+    u, v = np.meshgrid(np.linspace(0, lens.width, 25), np.linspace(0, lens.height, 19))
+    return np.column_stack([(u.ravel() - lens.cx) / lens.fx, (v.ravel() - lens.cy) / lens.fy])
+
+
+def nearest_lens(
+    start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
+) -> tuple[Intrinsics | FisheyeLens, float]:
+    """Return the lens of ours that is nearest to another program's, and by how many pixels not.
+
+    Args:
+        start: focal length, principal point and size of the other lens.
+        rays: (n, 3) directions that cover its image.
+        pixels: (n, 2) where it sees them.
+
+    Returns:
+        OpenCV's model, or its fisheye where that is too far off; the worst deviation.
     """
-    with reading(path, MOST_MODEL_BYTES, _WHAT), open_file(path) as stream:
-        return stream.read(MOST_MODEL_BYTES)
+    from scipy.optimize import least_squares
+
+    seen = np.isfinite(rays).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    rays, pixels = rays[seen], pixels[seen]
+    if len(pixels) < _FEWEST_DIRECTIONS:
+        return start, math.inf
+
+    def brown(v: NDArray[np.float64]) -> Intrinsics:
+        fx, fy, cx, cy, *terms = v.tolist()
+        return replace(start, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(terms))
+
+    def fisheye(v: NDArray[np.float64]) -> FisheyeLens:
+        fx, fy, cx, cy, *terms = v.tolist()
+        return FisheyeLens(
+            width=start.width,
+            height=start.height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            radial=tuple(terms[:4]),
+            tangential=tuple(terms[4:]),
+            field_of_view_deg=_WIDEST_FITTED_DEG,
+        )
+
+    def off_brown(v: NDArray[np.float64]) -> NDArray[np.float64]:
+        off = brown(v).posed().project(rays)[:, :2] - pixels
+        return np.nan_to_num(off, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
+
+    def off_fisheye(v: NDArray[np.float64]) -> NDArray[np.float64]:
+        off = fisheye(v).project(rays) - pixels
+        return np.nan_to_num(off, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
+
+    focal = [start.fx, start.fy, start.cx, start.cy]
+    fits: list[tuple[float, Intrinsics | FisheyeLens]] = []
+    with np.errstate(all="ignore"):
+        if (rays[:, 2] > 0.2 * np.linalg.norm(rays, axis=1)).all():
+            found = least_squares(off_brown, [*focal, *[0.0] * 5], x_scale="jac")
+            fits.append((_worst_px(found.fun), brown(found.x)))
+        if not fits or fits[0][0] > MAX_LEFT_OUT_PX:
+            found = least_squares(off_fisheye, [*focal, *[0.0] * 6], x_scale="jac")
+            fits.append((_worst_px(found.fun), fisheye(found.x)))
+    worst_px, lens = min(fits, key=lambda fit: fit[0])
+    return lens, worst_px
 
 
-def bare_name(text: str) -> str:
-    """Name of a photo without folders, whichever way its program's slashes lean."""
-    return PureWindowsPath(text).name
+def _worst_px(residuals: NDArray[np.float64]) -> float:
+    return float(np.hypot(residuals[::2], residuals[1::2]).max())
+
+
+def lens_or_reason(
+    whose: str, lens: Intrinsics | FisheyeLens, worst_px: float, way_out: str
+) -> tuple[Intrinsics | FisheyeLens | str, str]:
+    """Return a lens with a note of what it leaves out, or the reason why it cannot be taken."""
+    if worst_px <= NEGLIGIBLE_PX:
+        return lens, ""
+    size = f"{worst_px:.2g} pixels" if worst_px < _FAR_PX else "more than any pixels"
+    if worst_px > MAX_LEFT_OUT_PX:
+        return f"{whose} differs from the nearest lens of OpenCV by up to {size}: {way_out}", ""
+    return lens, f"{whose} is taken as OpenCV's nearest lens, up to {size} off"
 
 
 def damaged(path: Path, what: str, line: int | None = None) -> InputError:
@@ -261,6 +371,19 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
     )
 
 
+def bundler_count(path: Path) -> int:
+    """Return how many cameras a file of Bundler states.
+
+    Raises:
+        InputError: it does not.
+    """
+    words = list(islice(_words_of(path), 2))
+    counts = numbers_of(words, path, "the counts of cameras and points")
+    if len(counts) < 2 or not 0.0 <= counts[0] <= MOST_CAMERAS:
+        raise damaged(path, "it states no count of cameras")
+    return int(counts[0])
+
+
 def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     """Read Bundler's file: f, k1, k2, R and t of each camera, with the axes of OpenGL.
 
@@ -275,14 +398,6 @@ def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     """
     # What follows the cameras are points, which may be many.
     words = list(islice(_words_of(path), 2 + 15 * len(names)))
-    counts = numbers_of(words[:2], path, "the counts of cameras and points")
-    if len(counts) < 2 or counts[0] != len(names):
-        raise damaged(
-            path,
-            f"it states {counts[0]:.0f} cameras, but the list names {len(names)} photos"
-            if counts
-            else "it is empty",
-        )
     found = []
     for index, name in enumerate(names):
         values = numbers_of(words[2 + 15 * index : 17 + 15 * index], path, f"camera {index}")
@@ -309,58 +424,74 @@ def _words_of(path: Path) -> Iterator[str]:
             yield from line.split()
 
 
+_ANGLES: Final = ("x", "y", "alt", "heading", "pitch", "roll")
+
+
 def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
     """Read RealityCapture's "internal/external camera parameters" (CSV).
 
     The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
     principal point in shares of that side from the middle; heading is clockwise from north (y),
-    pitch 0 looks straight down.
+    pitch 0 looks straight down. Terms that are not in the list are zero; lines of comment may
+    stand anywhere.
 
     Raises:
-        InputError: it is damaged, or has tangential distortion, whose sign it does not say.
+        InputError: it is damaged.
     """
-    lines = text_of(path).lstrip("# ").splitlines()
-    try:
-        return tuple(_of_rows(csv.DictReader(lines), path))
-    except csv.Error as error:
-        raise damaged(path, f"it is no table: {error}") from error
-
-
-def _of_rows(table: csv.DictReader[str], path: Path) -> Iterator[GivenCamera]:
-    wanted = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3")
-    missing = [name for name in ("name", *wanted) if name not in (table.fieldnames or ())]
+    lines = text_of(path).splitlines()
+    heads = (
+        (number, line.lstrip("# "))
+        for number, line in enumerate(lines)
+        if {"name", "heading"} <= {word.strip() for word in re.split("[,;\t]", line.lstrip("# "))}
+    )
+    number, head = next(heads, (0, ""))
+    columns = [word.strip() for word in re.split("[,;\t]", head)]
+    missing = [name for name in ("name", *_ANGLES) if name not in columns]
     if missing:
         raise damaged(
             path,
             f"the column {missing[0]} is missing: expected RealityCapture's internal/external "
             "camera parameters, #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
         )
-    for row in islice(table, MOST_CAMERAS + 1):
-        line, name = table.line_num, bare_name(row["name"] or "")
-        x, y, z, heading, pitch, roll, focal, px, py, k1, k2, k3 = numbers_of(
-            [row[key] or "" for key in wanted], path, "the parameters", line
+    separator = next(mark for mark in ",;\t" if mark in head)
+    rows = csv.reader(lines[number + 1 :], delimiter=separator)
+    try:
+        return tuple(
+            _of_row(dict(zip(columns, row, strict=False)), path, number + 1 + rows.line_num)
+            for row in islice(rows, MOST_CAMERAS + 1)
+            if any(row) and not row[0].lstrip().startswith("#")
         )
-        if not focal > 0.0:
-            raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
-        others = [row.get(key) or "0" for key in ("k4", "t1", "t2")]
-        if any(numbers_of(others, path, "k4, t1 and t2", line)):
-            raise damaged(
-                path,
-                f"{name} has k4 or tangential distortion, which orthoflow does not take from this "
-                "list: align with the model Brown3, or export a COLMAP model",
-                line,
-            )
-        rotation = _FROM_OPENGL @ _world_from_angles(heading, pitch, roll).T
-        yield GivenCamera(
+    except csv.Error as error:
+        raise damaged(path, f"it is no table: {error}") from error
+
+
+def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
+    name = photo_path(row["name"])
+    pose = numbers_of([row.get(key, "") for key in _ANGLES], path, "the parameters", line)
+    terms = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+    px, py, *radial, t1, t2 = numbers_of(
+        [row.get(key) or "0" for key in terms], path, "the parameters", line
+    )
+    if not row.get("f"):
+        return GivenCamera(
             name=name,
-            lens=CentredLens(
-                focal_share=focal / _FULL_FRAME_MM,
-                off_middle=(px, py),
-                radial=(k1, k2, k3),
-            ),
-            rotation=rotation,
-            translation=-rotation @ np.array([x, y, z]),
+            reason="the list has no focal length f: export internal/external camera parameters",
         )
+    (focal,) = numbers_of([row["f"]], path, "the focal length", line)
+    if not focal > 0.0:
+        raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
+    rotation = _FROM_OPENGL @ _world_from_angles(*pose[3:]).T
+    return GivenCamera(
+        name=name,
+        lens=CentredLens(
+            focal_share=focal / _FULL_FRAME_MM,
+            off_middle=(px, py),
+            radial=tuple(radial),
+            tangential=(t1, t2),
+        ),
+        rotation=rotation,
+        translation=-rotation @ np.array(pose[:3]),
+    )
 
 
 def _world_from_angles(

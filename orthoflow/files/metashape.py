@@ -3,15 +3,19 @@
 Metashape has our axes (x right, y down, z forward) and our pixels (the centre of the first one at
 (0.5, 0.5)), its principal point counts from the middle of the photo, and what it calls P1 and P2
 is p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's matrix leads
-from it to the chunk, whose own transform leads to the world.
+from it to the chunk, whose own transform leads to the world: of a chunk with a geographic or
+projected coordinate system to geocentric metres, from where poses are converted into that system.
+The cameras of a rig other than its master have no matrix but the master's, and their sensor says
+where it stands in the master's axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
@@ -23,20 +27,25 @@ from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     GivenCamera,
-    bare_name,
     checked_lens,
     damaged,
+    lens_or_reason,
+    nearest_lens,
+    normalised_grid,
     numbers_of,
+    photo_path,
     rotation_of,
     text_of,
 )
 from orthoflow.files.images import MOST_PIXELS
-from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_lens, face_name
+from orthoflow.files.panoramas import face_lens
 from orthoflow.products import Intrinsics
 
 MOST_TAGS: Final = 2_000_000
-_UNKNOWN_TERMS: Final = ("k4", "p3", "p4")
-_UNKNOWN_TO_FISHEYES: Final = ("p3", "p4")
+_RADIAL: Final = ("k1", "k2", "k3", "k4")
+_SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"
+# Half the step in metres by which a coordinate system's axes are found at a place.
+_STEP_M: Final = 50.0
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
 
@@ -73,23 +82,90 @@ def _root(path: Path) -> ET.Element:
 
 
 def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
-    lenses = {
-        sensor.get("id", ""): _lens(sensor, path) for sensor in chunk.findall("sensors/sensor")
+    sensors = {
+        element.get("id", ""): _Sensor(element, path) for element in chunk.findall("sensors/sensor")
     }
     worlds = {
         component.get("id", ""): _Similarity(component.find("transform"), path)
         for component in chunk.findall("components/component")
     }
     whole = _Similarity(chunk.find("transform"), path)
-    panoramas = {
-        sensor.get("id", "")
-        for sensor in chunk.findall("sensors/sensor")
-        if sensor.get("type") == "spherical"
-    }
-    for camera in [*chunk.findall("cameras/camera"), *chunk.findall("cameras/group/camera")]:
-        world = worlds.get(camera.get("component_id", ""), whole)
-        given = _camera(camera, lenses, world, path)
-        yield from _faces(given) if camera.get("sensor_id", "") in panoramas else [given]
+    site = _site(chunk.findtext("reference", ""), path)
+    elements = [*chunk.findall("cameras/camera"), *chunk.findall("cameras/group/camera")]
+    masters = {element.get("id", ""): element for element in elements}
+    is_off = chunk.get("enabled", "true") in _OFF
+    for element in elements:
+        world = worlds.get(element.get("component_id", ""), whole)
+        if is_off or element.get("enabled", "true") in _OFF:
+            what = "chunk" if is_off else "camera"
+            name = photo_path(element.get("label", ""))
+            yield GivenCamera(name=name, reason=f"its {what} is disabled in Metashape")
+            continue
+        sensor = sensors.get(element.get("sensor_id", ""))
+        given = _camera(element, masters, sensor, world, path)
+        if site is not None and given.rotation is not None:
+            given = site(given)
+        is_panorama = sensor is not None and sensor.is_panorama
+        yield from given.panorama_faces() if is_panorama else [given]
+
+
+_OFF: Final = ("false", "0")
+
+
+def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
+    """What leads from geocentric metres to the chunk's coordinate system; None where it has none.
+
+    Raises:
+        InputError: the system is in degrees, or not known.
+    """
+    if not wkt.strip() or wkt.lstrip().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
+        return None
+    import pyproj
+
+    try:
+        stated = pyproj.CRS.from_wkt(wkt)
+        # Metashape leaves out parameters of projections that a code stands for.
+        code = stated.to_json_dict().get("id", {})
+        crs = pyproj.CRS.from_authority(code["authority"], code["code"]) if code else stated
+        if crs.is_geocentric:
+            return None
+        if crs.is_geographic:
+            raise InputError(
+                f"{path.name} is in degrees ({crs.name}): set a projected coordinate system of "
+                "the scan for the chunk in Metashape and export again"
+            )
+        metres = crs.axis_info[0].unit_conversion_factor
+        convert = pyproj.Transformer.from_crs(
+            pyproj.CRS.from_epsg(_GEOCENTRIC), crs, always_xy=True
+        ).transform
+    except pyproj.exceptions.ProjError as error:
+        raise damaged(path, f"its coordinate system is not known ({error})") from error
+
+    def to_site(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack(convert(*points.T), axis=-1) * [metres, metres, 1.0]
+
+    def converted(given: GivenCamera) -> GivenCamera:
+        rotation, shift = np.asarray(given.rotation), np.asarray(given.translation)
+        centre = -rotation.T @ shift
+        places = centre + _STEP_M * np.vstack([np.eye(3), -np.eye(3)])
+        there = to_site(np.vstack([centre, places]))
+        if not np.isfinite(there).all():
+            raise damaged(path, f"{given.name} is nowhere in {crs.name}")
+        # The axes of the system at the camera; what is left of its scale and shear is dropped.
+        left, _, right = np.linalg.svd((there[1:4] - there[4:]).T / (2.0 * _STEP_M))
+        turned = rotation @ (left @ right).T
+        return replace(
+            given,
+            rotation=turned,
+            translation=-turned @ there[0],
+            note=given.note
+            or f"poses are converted from geocentric metres to {crs.name}, heights as in there",
+        )
+
+    return converted
+
+
+_GEOCENTRIC: Final = 4978
 
 
 class _Similarity:
@@ -112,31 +188,99 @@ class _Similarity:
             raise damaged(path, f"the scale of the chunk must be positive, got {self.scale:g}")
 
 
-def _some(words: list[str], count: int, path: Path, what: str) -> list[float]:
+def _some(
+    words: list[str], count: int, path: Path, what: str, whose: str = "the chunk"
+) -> list[float]:
     if len(words) != count:
-        raise damaged(path, f"the {what} of the chunk must be {count} numbers, got {len(words)}")
-    return numbers_of(words, path, f"the {what} of the chunk")
+        raise damaged(path, f"the {what} of {whose} must be {count} numbers, got {len(words)}")
+    return numbers_of(words, path, f"the {what} of {whose}")
 
 
-def _lens(sensor: ET.Element, path: Path) -> Intrinsics | FisheyeLens | str:
-    """A sensor's lens, or why there is none."""
-    label = sensor.get("label", sensor.get("id", ""))
-    kind = sensor.get("type", "frame")
-    if kind == "spherical":
-        return face_lens(_size(sensor, label, path)[0])
-    if kind not in ("frame", "fisheye"):
-        return f"its sensor {label} is of type {kind}; orthoflow takes frame, fisheye and spherical"
-    calibrations = sensor.findall("calibration")
-    adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
-    if not calibrations:
-        return f"its sensor {label} has no calibration"
-    calibration = (adjusted or calibrations)[-1]
-    values = {child.tag: child.text or "" for child in calibration}
-    if "f" not in values:
-        return f"its sensor {label} has no focal length f ({_SINCE})"
-    has_own_size = calibration.find("resolution") is not None
-    size = _size(calibration if has_own_size else sensor, label, path)
-    return (_fisheye if kind == "fisheye" else _intrinsics)(values, size, path, label)
+class _Sensor:
+    """A sensor: its lens or why there is none, and where it stands in its rig."""
+
+    def __init__(self, element: ET.Element, path: Path) -> None:
+        self.label = element.get("label", element.get("id", ""))
+        self.is_panorama = element.get("type") == "spherical"
+        self.lens, self.note = self._lens(element, path)
+        self.rotation, self.location = np.eye(3), np.zeros(3)
+        rotation = element.findtext("rotation", "").split()
+        location = (element.findtext("location") or element.findtext("translation") or "").split()
+        if rotation:
+            numbers = _some(rotation, 9, path, "rotation", f"sensor {self.label}")
+            self.rotation = rotation_of(numbers, path, f"sensor {self.label}")
+        if location:
+            whose = f"sensor {self.label}"
+            self.location = np.array(_some(location, 3, path, "location", whose))
+        self.has_rolling_shutter = element.findtext("rolling_shutter", "0").strip() not in (
+            *("", "0"),
+            *_OFF,
+        )
+
+    def _lens(self, element: ET.Element, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
+        kind = element.get("type", "frame")
+        if self.is_panorama:
+            return face_lens(_size(element, self.label, path)[0]), ""
+        if kind not in ("frame", "fisheye"):
+            return (
+                f"its sensor {self.label} is of type {kind}; orthoflow takes frame, fisheye and "
+                "spherical"
+            ), ""
+        calibrations = element.findall("calibration")
+        adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
+        if not calibrations:
+            return f"its sensor {self.label} has no calibration", ""
+        calibration = (adjusted or calibrations)[-1]
+        values = {child.tag: child.text or "" for child in calibration}
+        if "f" not in values:
+            return f"its sensor {self.label} has no focal length f ({_SINCE})", ""
+        has_own_size = calibration.find("resolution") is not None
+        size = _size(calibration if has_own_size else element, self.label, path)
+        value = _Terms(values, path, self.label)
+        exact = (_fisheye if kind == "fisheye" else _intrinsics)(value, size)
+        if isinstance(exact, Intrinsics):
+            exact = checked_lens(exact, path, f"sensor {self.label}")
+        unknown = ("p3", "p4") if kind == "fisheye" else ("k4", "p3", "p4")
+        if not any(value(name) for name in unknown):
+            return exact, ""
+        return self._nearest(value, exact, is_fisheye=kind == "fisheye")
+
+    def _nearest(
+        self, value: _Terms, exact: Intrinsics | FisheyeLens, *, is_fisheye: bool
+    ) -> tuple[Intrinsics | FisheyeLens | str, str]:
+        """The lens of ours that is nearest to one with terms that ours has not."""
+        start = Intrinsics(
+            width=exact.width,
+            height=exact.height,
+            fx=exact.fx,
+            fy=exact.fy,
+            cx=exact.cx,
+            cy=exact.cy,
+            source="given",
+        )
+        xy = normalised_grid(start)
+        rays = np.column_stack([xy, np.ones(len(xy))])
+        if is_fisheye:
+            # A place of the grid is an angle off the axis here.
+            theta = np.hypot(*xy.T)[:, None]
+            scale = np.sinc(theta / np.pi)
+            rays = np.column_stack([xy * scale, np.cos(theta)])
+        pixels = _projected(value, start, xy)
+        lens, worst_px = nearest_lens(start, rays, pixels)
+        return lens_or_reason(f"the lens of sensor {self.label}", lens, worst_px, _SINCE_EXPORT)
+
+
+def _projected(value: _Terms, start: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of places (n, 2) by the whole formula of Metashape's manual."""
+    x, y = xy.T
+    r2 = x * x + y * y
+    radial = np.polynomial.polynomial.polyval(r2, [1.0, *map(value, _RADIAL)])
+    p1, p2 = value("p1"), value("p2")
+    further = 1.0 + value("p3") * r2 + value("p4") * r2 * r2
+    bent_x = x * radial + (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) * further
+    bent_y = y * radial + (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) * further
+    u = start.cx + bent_x * start.fx + bent_y * value("b2")
+    return np.column_stack([u, start.cy + bent_y * start.fy])
 
 
 def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
@@ -159,42 +303,25 @@ class _Terms:
         what = f"{name} of sensor {self._label}"
         return numbers_of([self._values.get(name, "0")], self._path, what)[0]
 
-    def unknown(self, names: Sequence[str]) -> str:
-        """What is said of terms that our lenses have not; empty where there are none."""
-        there = ", ".join(name for name in names if self(name) != 0.0)
-        return there and (
-            f"its sensor {self._label} has {there}, which OpenCV's model has not: "
-            "optimise the cameras without them and export again"
-        )
 
-
-def _fisheye(
-    values: Mapping[str, str], size: tuple[int, int], path: Path, label: str
-) -> FisheyeLens | str:
-    value = _Terms(values, path, label)
+def _fisheye(value: _Terms, size: tuple[int, int]) -> FisheyeLens:
     focal = value("f")
-    return value.unknown(_UNKNOWN_TO_FISHEYES) or FisheyeLens(
+    return FisheyeLens(
         width=size[0],
         height=size[1],
         fx=focal + value("b1"),
         fy=focal,
         cx=0.5 * size[0] + value("cx"),
         cy=0.5 * size[1] + value("cy"),
-        radial=(value("k1"), value("k2"), value("k3"), value("k4")),
+        radial=tuple(map(value, _RADIAL)),
         tangential=(value("p2"), value("p1")),
         skew=value("b2"),
     )
 
 
-def _intrinsics(
-    values: Mapping[str, str], size: tuple[int, int], path: Path, label: str
-) -> Intrinsics | str:
-    value = _Terms(values, path, label)
-    unknown = value.unknown(_UNKNOWN_TERMS)
-    if unknown:
-        return unknown
+def _intrinsics(value: _Terms, size: tuple[int, int]) -> Intrinsics:
     focal = value("f")
-    lens = Intrinsics(
+    return Intrinsics(
         width=size[0],
         height=size[1],
         fx=focal + value("b1"),
@@ -205,49 +332,71 @@ def _intrinsics(
         source="given",
         skew=value("b2") or None,
     )
-    return checked_lens(lens, path, f"sensor {label}")
-
-
-def _faces(given: GivenCamera) -> list[GivenCamera]:
-    """The cameras of a panorama's faces; where it has none, itself with the reason."""
-    if given.rotation is None or given.translation is None:
-        return [given]
-    return [
-        replace(
-            given,
-            name=face_name(PurePath(given.name).stem, face),
-            rotation=axes @ PANORAMA_FROM_CAMERA @ given.rotation,
-            translation=axes @ PANORAMA_FROM_CAMERA @ given.translation,
-        )
-        for face, axes in FACES.items()
-    ]
 
 
 def _camera(
-    camera: ET.Element,
-    lenses: Mapping[str, Intrinsics | FisheyeLens | str],
+    element: ET.Element,
+    masters: Mapping[str, ET.Element],
+    sensor: _Sensor | None,
     world: _Similarity,
     path: Path,
 ) -> GivenCamera:
-    name = bare_name(camera.get("label", ""))
-    lens = lenses.get(camera.get("sensor_id", ""), "it names no sensor")
-    words = camera.findtext("transform", "").split()
-    if isinstance(lens, str) or not words:
-        return GivenCamera(
-            name=name, reason=lens if isinstance(lens, str) else "Metashape did not align it"
-        )
-    values = numbers_of(words, path, f"the transform of {name}")
-    if len(values) != 16:
-        raise damaged(path, f"the transform of {name} must be 16 numbers, got {len(values)}")
-    chunk_from_camera = np.array(values).reshape(4, 4)
+    name = photo_path(element.get("label", ""))
+    if sensor is None:
+        return GivenCamera(name=name, reason="it names no sensor")
+    if isinstance(sensor.lens, str):
+        return GivenCamera(name=name, reason=sensor.lens)
+    master = masters.get(element.get("master_id", ""), element)
+    chunk_from_camera = _matrix(element, name, path)
+    if chunk_from_camera is None and master is not element:
+        chunk_from_camera = _matrix(master, name, path)
+        if chunk_from_camera is not None:
+            offset = np.eye(4)
+            offset[:3, :3], offset[:3, 3] = sensor.rotation, sensor.location
+            chunk_from_camera = chunk_from_camera @ offset
+    if chunk_from_camera is None:
+        return GivenCamera(name=name, reason="Metashape did not align it")
     turn = rotation_of(chunk_from_camera[:3, :3].ravel().tolist(), path, name)
     centre: NDArray[np.float64] = (
         world.scale * world.rotation @ chunk_from_camera[:3, 3] + world.shift
     )
     rotation = (world.rotation @ turn).T
+    note = sensor.note
+    if sensor.has_rolling_shutter or element.find("rolling_shutter") is not None:
+        note = _rolling_shutter(element, sensor)
     return GivenCamera(
         name=name,
-        lens=lens,
+        lens=sensor.lens,
         rotation=rotation,
         translation=-rotation @ centre,
+        note=note,
     )
+
+
+def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
+    """What a rolling shutter that Metashape compensates for moves, where the file says how much."""
+    words = element.findtext("rolling_shutter", "").split()
+    moved = ""
+    try:
+        matrix = np.array([float(word) for word in words])
+    except ValueError:
+        matrix = np.empty(0)
+    if matrix.size in (12, 16) and np.isfinite(matrix).all() and sensor.lens is not None:
+        turn = matrix.reshape(-1, 4)[:3, :3]
+        cosine = float(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))
+        focal = 0.0 if isinstance(sensor.lens, str) else sensor.lens.fx
+        moved = f" by up to {0.5 * focal * math.acos(cosine):.2g} pixels"
+    return (
+        f"sensor {sensor.label} has a rolling shutter, for which Metashape compensates and "
+        f"orthoflow does not: places near the first and last rows are off{moved}"
+    )
+
+
+def _matrix(element: ET.Element, name: str, path: Path) -> NDArray[np.float64] | None:
+    words = element.findtext("transform", "").split()
+    if not words:
+        return None
+    values = numbers_of(words, path, f"the transform of {name}")
+    if len(values) != 16:
+        raise damaged(path, f"the transform of {name} must be 16 numbers, got {len(values)}")
+    return np.array(values).reshape(4, 4)

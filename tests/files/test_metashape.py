@@ -5,14 +5,20 @@ That cameras project as Metashape's manual says stands in test_given_cameras.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
+import pyproj
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import InputError
 from orthoflow.files.fisheyes import FisheyeLens
-from orthoflow.files.given_cameras import GivenCamera
+from orthoflow.files.given_cameras import MAX_LEFT_OUT_PX, GivenCamera
 from orthoflow.files.metashape import read_metashape_xml
 from orthoflow.products import Intrinsics
 
@@ -83,10 +89,6 @@ def test_the_last_calibration_holds_an_adjusted_one_before_others(
         (SENSOR.replace(ADJUSTED, ""), "its sensor NIKON has no calibration"),
         (SENSOR.replace("<f>500</f>", "<k1>0</k1>"), "has no focal length f (Metashape 1.2 or"),
         (SENSOR.replace('"frame"', '"rpc"', 1), "orthoflow takes frame, fisheye and spherical"),
-        (
-            SENSOR.replace('"frame"', '"fisheye"', 1).replace("</f>", "</f><p3>1e-3</p3>"),
-            "its sensor NIKON has p3, which OpenCV's model has not",
-        ),
         (SENSOR.replace(' label="NIKON"', "").replace(ADJUSTED, ""), "its sensor 0 has no calib"),
         ("", "it names no sensor"),
     ],
@@ -94,7 +96,6 @@ def test_the_last_calibration_holds_an_adjusted_one_before_others(
         "no-calibration",
         "no-focal-length",
         "satellite",
-        "fisheye-terms",
         "no-label",
         "no-sensor",
     ],
@@ -203,3 +204,163 @@ def test_what_contradicts_itself_ends_in_one_sentence(
 def test_a_sensor_of_one_pixel_is_a_sensor(tmp_path: Path) -> None:
     lens = lens_of(tmp_path, SENSOR.replace("640", "1").replace("480", "1"))
     assert (lens.width, lens.height) == (1, 1)
+
+
+# Terms that OpenCV's lenses have not, against the formula of the manual.
+
+
+def formula(
+    xy: NDArray[np.float64], f: float, k: Sequence[float], p: Sequence[float]
+) -> NDArray[np.float64]:
+    x, y = xy.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
+    further = 1 + p[2] * r2 + p[3] * r2 * r2
+    u = x * radial + (p[0] * (r2 + 2 * x * x) + 2 * p[1] * x * y) * further
+    v = y * radial + (p[1] * (r2 + 2 * y * y) + 2 * p[0] * x * y) * further
+    return np.asarray(f * np.column_stack([u, v]) + [320, 240])
+
+
+@pytest.mark.parametrize(
+    ("k", "p"),
+    [
+        ((-0.05, 0.02, -0.01, 0.03), (0, 0, 0, 0)),
+        ((-0.05, 0.02, 0, 0), (1e-3, -5e-4, 0.1, -0.05)),
+        ((-0.1, 0.05, -0.02, 0.2), (1e-3, -5e-4, 0.02, 0)),
+    ],
+)
+def test_further_terms_are_taken_over_by_the_others(
+    tmp_path: Path, k: Sequence[float], p: Sequence[float]
+) -> None:
+    terms = {f"k{i}": value for i, value in enumerate(k, 1)} | {
+        f"p{i}": value for i, value in enumerate(p, 1)
+    }
+    text = "".join(f"<{name}>{value}</{name}>" for name, value in terms.items())
+    lens = lens_of(tmp_path, SENSOR.replace("</f>", f"</f>{text}"))
+    xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (50, 2))
+    ours = lens.posed().project(np.column_stack([xy, np.ones(50)]))[:, :2]
+    assert np.abs(ours - formula(xy, 500.0, k, p)).max() < MAX_LEFT_OUT_PX
+
+
+def test_what_cannot_be_taken_over_is_stated_in_pixels(tmp_path: Path) -> None:
+    sensor = SENSOR.replace("</f>", "</f><p1>0.01</p1><p3>20</p3><p4>-60</p4>")
+    (given,) = read(tmp_path, document(sensors=sensor))
+    assert given.rotation is None
+    assert re.search(r"the lens of sensor NIKON differs .* by up to [\d.]+ pixels", given.reason)
+
+
+# Rigs, disabled cameras, rolling shutters, coordinate systems.
+
+MATRIX = np.eye(4)
+MATRIX[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+MATRIX[:3, 3] = [1.0, 2.0, 3.0]
+
+
+def posed(label: str, matrix: NDArray[np.float64] = MATRIX, more: str = "") -> str:
+    numbers = " ".join(map(repr, matrix.ravel().tolist()))
+    return (
+        f'<camera id="{label}" sensor_id="0" label="{label}"{more}>'
+        f"<transform>{numbers}</transform></camera>"
+    )
+
+
+@pytest.mark.parametrize("is_chunk", [True, False])
+def test_what_is_disabled_is_left_out_with_the_reason(tmp_path: Path, is_chunk: bool) -> None:
+    text = document(cameras=posed("a.jpg", more="" if is_chunk else ' enabled="false"'))
+    if is_chunk:
+        text = text.replace("<chunk>", '<chunk enabled="false">')
+    (given,) = read(tmp_path, text)
+    assert given.rotation is None
+    assert "is disabled in Metashape" in given.reason
+
+
+def test_cameras_of_a_rig_stand_where_their_sensors_do(tmp_path: Path) -> None:
+    turn = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+    place = [0.1, -0.2, 0.05]
+    slave = SENSOR.replace('id="0"', 'id="1" master_id="0"').replace(
+        "</sensor>",
+        f"<rotation>{' '.join(map(repr, turn.ravel().tolist()))}</rotation>"
+        f"<location>{' '.join(map(str, place))}</location></sensor>",
+    )
+    cameras = posed("m.jpg") + '<camera id="9" sensor_id="1" master_id="m.jpg" label="s.jpg"/>'
+    master, given = read(tmp_path, document(sensors=SENSOR + slave, cameras=cameras))
+    assert master.rotation is not None
+    assert given.rotation is not None
+    np.testing.assert_allclose(given.rotation, turn.T @ master.rotation, atol=1e-12)
+    centre = -given.rotation.T @ np.asarray(given.translation)
+    np.testing.assert_allclose(centre, MATRIX[:3, :3] @ place + MATRIX[:3, 3], atol=1e-12)
+
+
+def test_a_rolling_shutter_is_named_with_its_size(tmp_path: Path) -> None:
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix()
+    numbers = " ".join(map(repr, turned.ravel().tolist()))
+    camera = posed("a.jpg").replace(
+        "</camera>", f"<rolling_shutter>{numbers}</rolling_shutter></camera>"
+    )
+    (given,) = read(tmp_path, document(cameras=camera))
+    assert given.rotation is not None
+    assert re.search(r"rolling shutter.* by up to 2\.5 pixels", given.note)
+
+
+UTM = (
+    'PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["World Geodetic System 1984",'
+    'SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]],'
+    'PROJECTION["Transverse_Mercator"],UNIT["metre",1],AUTHORITY["EPSG","32632"]]'
+)
+
+
+def test_a_georeferenced_chunk_leads_into_its_coordinate_system(tmp_path: Path) -> None:
+    # A camera at a place in zone 32, level, looking along grid north; three places that it sees.
+    place = np.array([440_123.4, 5_412_345.6, 310.5])
+    ahead = np.array([[0.0, 20.0, 0.0], [5.0, 20.0, 1.0], [-5.0, 30.0, -2.0]])
+    geocentric = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4978", always_xy=True).transform
+    centre = np.array(geocentric(*place))
+    axes = np.array([np.array(geocentric(*(place + step))) - centre for step in np.eye(3)])
+    world_from_grid = np.linalg.qr(axes.T)[0] * np.sign(np.diag(np.linalg.qr(axes.T)[1]))
+    grid_from_camera = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    matrix = np.eye(4)
+    # The chunk's own transform does a part of it, as Metashape has it.
+    chunk = Rotation.from_rotvec([0.4, 0.1, -0.7]).as_matrix()
+    matrix[:3, :3] = chunk.T @ world_from_grid @ grid_from_camera
+    transform = (
+        f"<transform><rotation>{' '.join(map(repr, chunk.ravel().tolist()))}</rotation>"
+        f"<translation>{' '.join(map(repr, centre.tolist()))}</translation>"
+        "<scale>1</scale></transform>"
+    )
+    text = document(cameras=posed("a.jpg", matrix), chunk=transform)
+    text = text.replace("</chunk>", f"<reference>{escape(UTM)}</reference></chunk>")
+    (given,) = read(tmp_path, text)
+    assert "converted from geocentric metres to WGS 84 / UTM zone 32N" in given.note
+    assert given.rotation is not None
+    found = -given.rotation.T @ np.asarray(given.translation)
+    np.testing.assert_allclose(found, place, atol=1e-4)
+    # Within the scale of the projection.
+    seen = (ahead + place - found) @ given.rotation.T
+    np.testing.assert_allclose(seen, ahead @ grid_from_camera, atol=30.0 * 5e-4)
+
+
+@pytest.mark.parametrize(
+    ("wkt", "message"),
+    [
+        (pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), "is in degrees"),
+        ("PROJCS[nonsense", "its coordinate system is not known"),
+    ],
+)
+def test_coordinate_systems_that_no_scan_is_in_are_refused(
+    tmp_path: Path, wkt: str, message: str
+) -> None:
+    text = document(cameras=posed("a.jpg"))
+    text = text.replace("</chunk>", f"<reference>{escape(wkt)}</reference></chunk>")
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, text)
+
+
+def test_a_local_coordinate_system_is_taken_as_it_is(tmp_path: Path) -> None:
+    wkt = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
+    text = document(cameras=posed("nadir/102MEDIA/0003.jpg"))
+    text = text.replace("</chunk>", f"<reference>{escape(wkt)}</reference></chunk>")
+    (given,) = read(tmp_path, text)
+    assert (given.name, given.note) == ("nadir/102MEDIA/0003.jpg", "")
+    np.testing.assert_allclose(given.rotation, MATRIX[:3, :3].T, atol=1e-12)

@@ -15,6 +15,7 @@ import shutil
 import signal
 import struct
 import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -138,6 +139,8 @@ class _Reading:
     def run(self) -> None:
         case_folder = self._folder / "case"
         os.chdir(case_folder)
+        # As a step has it, whose TMPDIR is its scratch folder.
+        tempfile.tempdir = str(case_folder)
         # What libraries print belongs to no protocol; of the last case it is kept.
         answers = os.dup(1)
         sys.stdout = os.fdopen(answers, "w")

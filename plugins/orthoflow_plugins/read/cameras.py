@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
 from typing import ClassVar
@@ -12,7 +13,7 @@ from pydantic import Field
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.fisheyes import FisheyeLens
-from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reason
 from orthoflow.files.panoramas import face_in
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
@@ -20,21 +21,24 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.scan import UNITS_M, Unit
 
 _NAMED = 3
+_EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
 
 
 class ReadCameras(Method):
     """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
 
     They must be in the frame of the scan; `orient.given` says when they show no wall. Photos are
-    found by their file names, with or without suffix. A photo that the files say nothing of, or
-    whose lens OpenCV's models have not, is not oriented, and the reason is said.
+    found by their file names, with or without suffix, and by their folders where several have one
+    name. A photo that the files say nothing of, that was disabled there, or whose lens differs
+    from OpenCV's models by more than half a pixel, is not oriented, and the reason is stated; what
+    differs by less is reported.
 
     The photo of a fisheye lens must have become the faces of a cube, as `read.photos` does it that
     knows the lens; each face has the pose of the whole.
     """
 
     id = "read.cameras"
-    result_version = 3
+    result_version = 4
     determinism = "exact"
     metrics = (
         "n_photos",
@@ -75,8 +79,9 @@ class ReadCameras(Method):
         ctx.progress(0.0, inputs.files.name)
         given = read_given_cameras(inputs.files.paths)
         photos = inputs.photos.photos
-        by_name = GivenByName(given)
-        cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit]) for photo in photos)
+        by_name = GivenByName(given, photos)
+        notes: dict[str, list[str]] = {}
+        cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit], notes) for photo in photos)
         n_oriented = sum(camera.status == "ok" for camera in cameras)
         if not n_oriented:
             names = ", ".join(item.name for item in given[:_NAMED])
@@ -86,6 +91,8 @@ class ReadCameras(Method):
                 f"{' ...' if len(given) > _NAMED else ''}; {cameras[0].status if cameras else ''}"
                 "; without these files, photos are oriented by matching with the scan"
             )
+        for note, of_photos in notes.items():
+            ctx.warn(f"{note} ({len(of_photos)} photos, such as {of_photos[0]})")
         for camera in cameras:
             if camera.status != "ok":
                 ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
@@ -100,21 +107,27 @@ class ReadCameras(Method):
         return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
 
 
-def _camera(photo: Photo, given: GivenByName, unit_m: float) -> Camera:
-    found = given.of_photo(photo.name)
+def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, list[str]]) -> Camera:
+    found = given.of_photo(photo.name, photo.folder)
     if found is None:
         return Camera(photo=photo.name, status="the files of given cameras say nothing of it")
     if found.lens is None or found.rotation is None or found.translation is None:
         return Camera(photo=photo.name, status=found.reason)
-    lens = found.lens
+    lens, note = found.lens, found.note
+    if isinstance(lens, CentredLens):
+        nearest, worst_px = lens.of_size(photo.width, photo.height)
+        taken, note = lens_or_reason("its lens", nearest, worst_px, _EXPORT_OTHERWISE)
+        if isinstance(taken, str):
+            return Camera(photo=photo.name, status=taken)
+        lens = taken
     if isinstance(lens, FisheyeLens):
         return Camera(
             photo=photo.name,
             status="its lens is a fisheye: wire the same files to read.photos as cameras, which "
             "makes photos of it that can be painted from",
         )
-    if isinstance(lens, CentredLens):
-        lens = lens.of_size(photo.width, photo.height)
+    if note:
+        notes.setdefault(note, []).append(photo.name)
     if (lens.width, lens.height) != (photo.width, photo.height):
         raise InputError(
             f"photo {photo.name} has {photo.width} x {photo.height} pixels, but its given camera "
@@ -141,49 +154,80 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float) -> Camera:
 class GivenByName:
     """Given cameras by the names of their photos."""
 
-    def __init__(self, given: Sequence[GivenCamera]) -> None:
+    def __init__(self, given: Sequence[GivenCamera], photos: Sequence[Photo] = ()) -> None:
+        """Take the cameras.
+
+        Args:
+            given: the cameras.
+            photos: all photos; of those that share a file name each needs its own camera.
+        """
         self._exact: dict[str, list[GivenCamera]] = {}
         self._lower: dict[str, list[GivenCamera]] = {}
-        self._fisheyes: dict[str, list[GivenCamera]] = {}
         for camera in given:
-            self._exact.setdefault(camera.name, []).append(camera)
-            self._lower.setdefault(camera.name.lower(), []).append(camera)
-            if isinstance(camera.lens, FisheyeLens):
-                stem = PurePath(camera.name).stem.lower()
-                self._fisheyes.setdefault(stem, []).append(camera)
+            name = _file_name(camera.name)
+            self._exact.setdefault(name, []).append(camera)
+            self._lower.setdefault(name.lower(), []).append(camera)
+        self._n_named = Counter(_file_name(photo.name).lower() for photo in photos)
 
-    def of_photo(self, name: str) -> GivenCamera | None:
-        """Give the camera of a photo: of its name, or else of its name without suffix.
+    def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
+        """Return the camera of a photo: of its name, or else of its name without suffix.
 
-        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye.
-
-        Raises:
-            InputError: several cameras have that name.
+        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye. Of several cameras
+        the one counts whose folders are most like the photo's; where they are alike, the camera
+        that is returned only has the reason why it is none.
         """
-        found, face = self._named(name), face_in(name)
-        if found is None and face is not None:
-            whole = self._of_stem(face[0])
-            return whole.of_face(face[1]) if whole is not None else None
-        return found
+        found, face = self._named(_file_name(name)), face_in(_file_name(name))
+        if not found and face is not None:
+            whole = [
+                camera for camera in self._of_stem(face[0]) if isinstance(camera.lens, FisheyeLens)
+            ]
+            nearest = _nearest(whole, folder, is_only=True)
+            return nearest.of_face(face[1]) if nearest is not None else None
+        is_only = self._n_named[_file_name(name).lower()] <= 1
+        return _nearest(found, folder, is_only=is_only)
 
-    def _of_stem(self, stem: str) -> GivenCamera | None:
-        """The fisheye camera of a photo that has this name but for its suffix."""
-        fisheyes = self._fisheyes.get(stem.lower(), [])
-        exact = [camera for camera in fisheyes if PurePath(camera.name).stem == stem]
-        return _only(exact or fisheyes, stem)
-
-    def _named(self, name: str) -> GivenCamera | None:
+    def _named(self, name: str) -> list[GivenCamera]:
         for wanted in (name, PurePath(name).stem):
             found = self._exact.get(wanted) or self._lower.get(wanted.lower(), [])
             if found:
-                return _only(found, name)
+                return found
+        return []
+
+    def _of_stem(self, stem: str) -> list[GivenCamera]:
+        """Cameras of a photo that has this name but for its suffix."""
+        named = {
+            name: cameras
+            for name, cameras in self._exact.items()
+            if PurePath(name).stem.lower() == stem.lower()
+        }
+        exact = [camera for name in named if PurePath(name).stem == stem for camera in named[name]]
+        return exact or [camera for cameras in named.values() for camera in cameras]
+
+
+def _file_name(path: str) -> str:
+    return path.rpartition("/")[2]
+
+
+def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> GivenCamera | None:
+    """The one of some cameras whose folders are most like a photo's.
+
+    Args:
+        found: cameras of the photo's file name.
+        folder: of the photo.
+        is_only: whether no other photo has its file name.
+    """
+    if not found:
         return None
-
-
-def _only(found: Sequence[GivenCamera], photo: str) -> GivenCamera | None:
-    if len(found) > 1:
-        raise InputError(
-            f"the files of given cameras have {len(found)} cameras {found[0].name}: photo {photo} "
-            "must have one"
-        )
-    return found[0] if found else None
+    posed = [camera for camera in found if camera.rotation is not None] or list(found)
+    own = {part.lower() for part in folder.split("/") if part}
+    scores = [len(own & {part.lower() for part in camera.name.split("/")[:-1]}) for camera in posed]
+    best = [camera for camera, score in zip(posed, scores, strict=True) if score == max(scores)]
+    if len(best) == 1 and (is_only or max(scores) > 0 or not own):
+        return best[0]
+    names = ", ".join(camera.name for camera in best[:_NAMED])
+    count = f"{len(best)} cameras of its name ({names})" if len(best) > 1 else f"only {names}"
+    return GivenCamera(
+        name=found[0].name,
+        reason=f"the files of given cameras have {count}, and folders do not decide which is "
+        "its own: give photos and cameras the same folders",
+    )

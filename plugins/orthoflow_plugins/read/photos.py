@@ -207,16 +207,16 @@ class _Cubes:
     given: GivenByName | None
     masks: Masks
 
-    def sources(self, path: Path) -> list[_Source]:
+    def sources(self, path: Path, folder: str) -> list[_Source]:
         """A photo of a file of its own, or its faces."""
         if any(fnmatchcase(path.name, pattern) for pattern in self.panoramas):
             return self._of_panorama(path)
-        lens = self._fisheye(path.name)
+        lens = self._fisheye(path.name, folder)
         return [_Source(name=path.name, content=path)] if lens is None else self._faces(path, lens)
 
-    def _fisheye(self, name: str) -> FisheyeLens | None:
+    def _fisheye(self, name: str, folder: str) -> FisheyeLens | None:
         """The lens of a photo where it is a fisheye: as the cameras say, else the calibration."""
-        camera = None if self.given is None else self.given.of_photo(name)
+        camera = None if self.given is None else self.given.of_photo(name, folder)
         if camera is not None and isinstance(camera.lens, FisheyeLens):
             return camera.lens
         if self.calibration is None:
@@ -320,7 +320,7 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     sources, others = [], []
     for path in photos:
         if path.suffix.lower() in PHOTO_SUFFIXES:
-            found = cubes.sources(path)
+            found = cubes.sources(path, folders[path])
         elif path.suffix.lower() == E57_SUFFIX:
             found = _inside_e57(path)
         else:
