@@ -185,7 +185,7 @@ def blocks(path: Path, language: str, start: str = "") -> list[str]:
 
 def written_files() -> dict[str, str]:
     """Files that documents show in full, by the names that their commands use."""
-    (rooms,) = blocks(ROOT / "README.md", "", "name,scan,photos")
+    (rooms,) = blocks(ROOT / "docs" / "own-data.md", "", "name,scan,photos")
     comparing = ROOT / "docs" / "comparing.md"
     (detectors,) = blocks(comparing, "yaml", "orthoflow:")
     (fine,) = blocks(comparing, "yaml", "plane.")

@@ -92,7 +92,7 @@ def readers_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_documents_have_the_commands_that_this_looks_at() -> None:
     commands = documented_commands()
-    assert len(commands) > 150
+    assert len(commands) > 120
     assert len({command.path for command in commands}) > 15
     assert sum(command.is_block for command in commands) > 60
     first = {command.words[0] for command in commands}
@@ -309,11 +309,11 @@ def test_every_piece_of_a_workflow_is_one(catalog: Catalog, readers_folder: Path
             (readers_folder / "block.yaml").write_text(text)
             load_workflow(readers_folder / "block.yaml", catalog)
     assert n_whole >= 2
-    assert n_pieces >= 4
+    assert n_pieces >= 2
 
 
-def test_the_calibration_of_the_readme_is_read(readers_folder: Path) -> None:
-    (block,) = blocks(ROOT / "README.md", "yaml", start="cameras:")
+def test_the_calibration_of_the_documents_is_read(readers_folder: Path) -> None:
+    (block,) = blocks(ROOT / "docs" / "own-data.md", "yaml", start="cameras:")
     (readers_folder / "shown.yaml").write_text(block)
     lens = lens_for(read_calibration(readers_folder / "shown.yaml"), "IMG_1.jpg", 6000, 4000)
     assert lens is not None
