@@ -240,7 +240,7 @@ def _metrics(catalog: Catalog) -> Iterator[str]:
     )
     said: dict[str, list[str]] = {}
     for name in sorted(catalog.methods):
-        for metric in describe_method(catalog, name).method.metrics:
+        for metric in (one.name for one in describe_method(catalog, name).method.metric_specs()):
             said.setdefault(metric, []).append(name)
     for kind in sorted({name.partition(".")[0] for names in said.values() for name in names}):
         yield f"## {kind}\n\n{_METRICS_HEAD}"

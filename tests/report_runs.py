@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from orthoflow_provenance.model import (
@@ -18,6 +19,7 @@ from orthoflow_provenance.model import (
     RunRecord,
 )
 
+from orthoflow.diagnostics import DiagnosticSpec, warning_texts
 from orthoflow.files.images import encode_png, encode_webp
 from orthoflow.products import (
     Camera,
@@ -81,6 +83,13 @@ def cell(address: str, **more: object) -> RecordedCell:
         "params_set": more.get("params", {}),
     }
     return RecordedCell(**{**wanted, **more})  # type: ignore[arg-type]
+
+
+def warned(*texts: str, code: str = "", subject: str = "", remedy: str = "") -> dict[str, Any]:
+    """What a cell holds that warned of something, of a code of its own or of none."""
+    spec = DiagnosticSpec(code=code or "warning", severity="warning", text="{text}", remedy=remedy)
+    reported = tuple(spec.of(subject, {"text": text}) for text in texts)
+    return {"diagnostics": reported, "warnings": warning_texts(reported)}
 
 
 def metrics(**values: float) -> tuple[Metric, ...]:
@@ -186,7 +195,7 @@ def compared_run(folder: Path) -> HeldRun:
                     ),
                 ),
                 metrics=metrics(rmse_u_mm=0.4 + shift, completeness=0.9931),
-                warnings=(f"the grid is <{mark}>",),
+                **warned(f"the grid is <{mark}>"),
             ),
             cell(
                 f"mosaic@plane={mark}",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Iterator, Mapping
-from fnmatch import fnmatchcase
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
@@ -18,7 +17,7 @@ from orthoflow.sdk.methods import (
     Determinism,
     Method,
     MethodParams,
-    MetricLabel,
+    MetricSpec,
     Ports,
     PortSpec,
     mapped_port,
@@ -100,8 +99,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     own_id: object = getattr(method, "id", None)
     version: object = method.result_version
     citations: object = method.citations
-    labels: object = method.metric_labels
-    strays = _undeclared(method)
+    metrics: object = method.metrics
     rules = {
         f"its class says id {own_id!r}": own_id == spec.id,
         "its Params must be a subclass of MethodParams": _is_subclass(
@@ -118,29 +116,13 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
         f"citations must be a tuple of texts, got {citations!r}": (
             isinstance(citations, tuple) and all(isinstance(item, str) for item in citations)
         ),
-        f"metric_labels must give names a MetricLabel each, got {labels!r}": (
-            isinstance(labels, Mapping)
-            and all(isinstance(label, MetricLabel) for label in labels.values())
+        f"metrics must be a tuple of MetricSpec, or of names, got {metrics!r}": (
+            isinstance(metrics, tuple)
+            and all(isinstance(one, MetricSpec | str) and one for one in metrics)
         ),
-        f"metric_labels names {', '.join(strays)}, which metrics does not declare": not strays,
         "it has no run": method.run is not Method.run or bool(method.maps_over),
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
-
-
-def _undeclared(method: type[Method]) -> list[str]:
-    """Labels of metrics that a method does not declare, where it declares any."""
-    declared: object = method.metrics
-    labels: object = method.metric_labels
-    if not (declared and isinstance(declared, tuple | list) and isinstance(labels, Mapping)):
-        return []
-    return [
-        f"{label}{did_you_mean(label, declared)}"
-        for label in map(str, labels)
-        # The same pattern with `[xy]` in it does not match itself.
-        if label not in declared
-        and not any(fnmatchcase(name, label) or fnmatchcase(label, name) for name in declared)
-    ]
 
 
 def product_complaint(cls: type[Product]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import os
@@ -241,7 +242,7 @@ def _method_json(entry: MethodEntry) -> dict[str, object]:
         "determinism": method.determinism,
         "maps_over": method.maps_over,
         "citations": list(method.citations),
-        "metrics": list(method.metrics),
+        "metrics": [dataclasses.asdict(one) for one in method.metric_specs()],
         "params": [
             {"name": name, "type": type_, "default": default, "unit": unit, "description": text}
             for name, type_, default, unit, text in _parameters(method.Params)
@@ -286,7 +287,7 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
     if method.maps_over:
         echo(f"in parts      over {method.maps_over}, where workers of a cluster are idle")
     if method.metrics:
-        echo(f"metrics       {', '.join(method.metrics)}")
+        echo(f"metrics       {', '.join(one.name for one in method.metric_specs())}")
     for citation in method.citations:
         echo(f"citation      {citation}")
     echo()

@@ -14,21 +14,20 @@ from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
-from orthoflow.alike import sense
 from orthoflow.cli.failures import say_error
 from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.tables import counted, duration
+from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.engine.events import (
     CellFinished,
     CellProgress,
+    CellReported,
     CellStarted,
-    CellWarned,
     RunEvent,
     RunStarted,
 )
 from orthoflow.foreign_text import shown
 from orthoflow.geometry.threads import start_beside
-from orthoflow.records.warnings import SettingNames
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -69,10 +68,8 @@ class RunState:
         self._jobs = jobs
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
-        self._senses: set[str] = set()
-        self._n_alike: Counter[str] = Counter()
-        self._calls = {item.cell.address: item.cell for item in cells}
-        self._names = SettingNames.of(self._calls.values())
+        self._reported: set[tuple[str, str]] = set()
+        self._n_similar: Counter[str] = Counter()
 
     def take(self, event: RunEvent) -> None:
         """Hear of an event."""
@@ -95,27 +92,27 @@ class RunState:
                 case _:
                     return
 
-    def is_new(self, warning: CellWarned) -> bool:
-        """Whether nothing of its sense was said before."""
+    def news(self, event: CellReported) -> str:
+        """A diagnostic in a line; empty for notes, and where its code was reported before."""
+        one = event.diagnostic
+        key = (one.code, one.text if one.code == PLAIN_WARNING.code else "")
         with self._lock:
-            n_before = len(self._senses)
-            self._senses.add(sense(warning.text))
-            is_new = len(self._senses) > n_before
-            self._n_alike[warning.address] += not is_new
-            return is_new
+            is_new = one.severity != "note" and key not in self._reported
+            self._reported.add(key)
+            self._n_similar[event.address] += one.severity != "note" and not is_new
+        if not is_new or one.severity == "note":
+            return ""
+        # The summary has the sentences.
+        about = f" ({one.subject})" if one.subject else ""
+        name = one.text if one.code == PLAIN_WARNING.code else f"{one.code}{about}"
+        return f"{event.address}: {one.severity}: {name}"
 
     def end(self, event: CellFinished) -> str:
-        """How a cell ended, and how many of its warnings were left out: others said the like."""
+        """How a cell ended, and how many of its warnings were left out as similar."""
         with self._lock:
-            n_alike = self._n_alike.pop(event.address, 0)
-        more = f", {counted(n_alike, 'warning')} like one above" if n_alike else ""
+            n_similar = self._n_similar.pop(event.address, 0)
+        more = f", {counted(n_similar, 'warning')} like one above" if n_similar else ""
         return f"{end_text(event)}{more}"
-
-    def told(self, warning: CellWarned) -> str:
-        """A warning in a line, with parameters as they are set."""
-        call = self._calls.get(warning.address)
-        text = warning.text if call is None else self._names.in_words(warning.text, call)
-        return f"{warning.address}: warning: {text}"
 
     def cells(self) -> dict[str, CellState]:
         """Give all cells, as they are now."""
@@ -150,7 +147,7 @@ class RunState:
 class PlainProgress:
     """Lines on standard error, fit for log files.
 
-    One per start and end and per sense of warnings; one about what runs where none came for long.
+    One per start and end and per code of warnings; one about what runs where none came for long.
     """
 
     def __init__(
@@ -177,8 +174,9 @@ class PlainProgress:
                 self._say(f"{start_text(event)}{', ' if left else ''}{left}")
             case CellStarted():
                 self._say(f"{event.address}: started")
-            case CellWarned() if self._state.is_new(event):
-                self._say(self._state.told(event))
+            case CellReported():
+                if line := self._state.news(event):
+                    self._say(line)
             case CellFinished():
                 self._say(f"{self._state.end(event)} ({self._state.n_ended} of {self._n_cells})")
             case _:
@@ -194,7 +192,7 @@ class PlainProgress:
 
 
 class NotebookProgress:
-    """A line per ended step and per sense of warnings, below them what runs: one output.
+    """A line per ended step and per code of warnings, below them what runs: one output.
 
     It is written anew every second, so that a notebook keeps its last state only: what ended.
     """
@@ -225,8 +223,8 @@ class NotebookProgress:
         match event:
             case RunStarted():
                 self._lines.append(start_text(event))
-            case CellWarned() if self._state.is_new(event):
-                self._lines.append(self._state.told(event))
+            case CellReported():
+                self._lines += filter(None, [self._state.news(event)])
             case CellFinished():
                 self._lines.append(self._state.end(event))
             case _:
@@ -288,7 +286,8 @@ def end_text(event: CellFinished) -> str:
     took = f" in {duration(result.wall_s)}" if result.started else ""
     if took and (result.compile_s or 0.0) >= _TOLD_COMPILE_S:
         took += f", besides {duration(result.compile_s or 0.0)} of loading and compiling"
-    why = f": {result.error_message}" if result.error_message else ""
+    # The summary says why something was skipped.
+    why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"
 
 
@@ -321,8 +320,11 @@ class LiveProgress:
         match event:
             case RunStarted():
                 self._print(start_text(event))
-            case CellWarned() if self._state.is_new(event):
-                self._print(self._state.told(event), style="yellow")
+            case CellReported():
+                if line := self._state.news(event):
+                    self._print(line, style="yellow")
+            case CellFinished() if event.result.status == "failed":
+                self._print(end_text(event), style=_STYLES["failed"])
             case _:
                 return
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +26,14 @@ from orthoflow.cli.tables import (
     counted,
     duration,
     echo,
-    echo_folded,
+    echo_diagnostics,
     echo_table,
-    echo_warnings,
 )
-from orthoflow.errors import DamageError, DiskSpaceError, StoreError
+from orthoflow.errors import ArgumentError, DamageError, DiskSpaceError, StoreError
+from orthoflow.foreign_text import shown_json
 
 if TYPE_CHECKING:
+    from orthoflow.engine.events import RunEvent, RunListener
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.scheduling import RunOutcome
     from orthoflow.engine.store import Store
@@ -52,6 +54,12 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Put everything into the record: also point clouds, photos and the input files.",
 )
+@click.option(
+    "--json-log",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write each diagnostic as a line of JSON: code, severity, step, subject, values, text, "
+    "remedy.",
+)
 def run(
     workflow: str,
     changes: Changes,
@@ -59,6 +67,7 @@ def run(
     store: Path,
     *,
     embed: bool,
+    json_log: Path | None,
     # Any: the fields of RunOptions, whose types click has checked.
     **choices: Any,
 ) -> int:
@@ -69,7 +78,7 @@ def run(
     products/ with the files for other programs.
     """
     with prepared(workflow, changes, output, store, embed=embed, **choices) as call:
-        return call.go()
+        return replace(call, json_log=json_log).go()
 
 
 @contextmanager
@@ -122,21 +131,21 @@ class Call:
     store: Store
     folder: Path | None
     embed: bool
+    json_log: Path | None = None
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
         from orthoflow.engine.run_folder import LOGS
         from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.workflow.doubts import doubts_about
 
         made = self.make()
         folder = made.run.folder
         report = folder / REPORT_FILE
-        _print_failures(made.run.record.cells, folder / LOGS)
+        _print_tracebacks(made.run.record.cells, folder / LOGS)
         if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
             say_error(f"with more room on the disk, the same command with -o {folder} goes on")
         try:
-            _print_summary(made, report, doubts_about(self.workflow))
+            _print_summary(made, report)
         except BrokenPipeError:
             # Nobody reads the summary any more; the exit code still says how the run went.
             silence_stdout()
@@ -181,14 +190,22 @@ class Call:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine.scheduling import execute
 
-        # Before minutes pass, and once more in the summary.
+        # Before minutes pass.
         say_doubts(self.workflow)
-        with make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress:
+        with (
+            make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
+            _json_log(self.json_log, self.plan) as log,
+        ):
+
+            def listen(event: RunEvent) -> None:
+                progress.tell(event)
+                log(event)
+
             return execute(
                 self.plan,
                 folder,
                 self.store,
-                progress.tell,
+                listen,
                 run_id=run_id,
                 on_interruption=partial(self._show_unfinished, folder),
             )
@@ -209,18 +226,44 @@ class Call:
             say_error(f"report of what there is so far: {report}")
 
 
-def _print_failures(cells: Iterable[RecordedCell], logs: Path) -> None:
-    """Write one sentence per failed cell to standard error, and where the traceback of a bug is."""
+@contextmanager
+def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
+    """Write the diagnostics of each cell as it ends, a line of JSON each; cached ones, too.
+
+    Raises:
+        ArgumentError: the file cannot be written.
+    """
+    from orthoflow.engine.events import CellFinished
+    from orthoflow.records.diagnostics import diagnostics_of
+
+    if path is None:
+        yield lambda _: None
+        return
+    steps = {item.cell.address: item.cell.step for item in plan.cells}
+    try:
+        file = path.open("w", encoding="utf-8", buffering=1)
+    except OSError as error:
+        raise ArgumentError(f"--json-log {path} cannot be written: {error.strerror}") from error
+    with file:
+
+        def listen(event: RunEvent) -> None:
+            if isinstance(event, CellFinished):
+                for one in diagnostics_of(event.result, steps[event.address], event.address):
+                    file.write(f"{shown_json(json.dumps(one, ensure_ascii=False))}\n")
+
+        yield listen
+
+
+def _print_tracebacks(cells: Iterable[RecordedCell], logs: Path) -> None:
+    """Write to standard error where the tracebacks of bugs are; why cells failed stands there."""
     from orthoflow.engine.run_folder import cell_file_name
 
     for cell in cells:
-        if cell.status == "failed":
-            is_bug = "Traceback (most recent call last)" in cell.log
-            where = f"; traceback: {logs / cell_file_name(cell.address)}.log" if is_bug else ""
-            say_error(f"{cell.address} failed: {cell.error_message}{where}")
+        if cell.status == "failed" and "Traceback (most recent call last)" in cell.log:
+            say_error(f"{cell.address}: traceback: {logs / cell_file_name(cell.address)}.log")
 
 
-def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> None:
+def _print_summary(made: WrittenRun, report: Path) -> None:
     """Write the table of cells, the warnings, and last the report, the record and the images."""
     run, cells = made.run, made.run.record.cells
     echo()
@@ -231,11 +274,9 @@ def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> Non
             for cell in cells
         ],
     )
-    if doubts or any(cell.warnings for cell in cells):
+    if any(cell.warnings for cell in cells):
         echo()
-    for doubt in doubts:
-        echo_folded(f"warning, workflow: {doubt}")
-    echo_warnings(cells)
+    echo_diagnostics(cells, run.folder)
     echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))

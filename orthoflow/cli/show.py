@@ -20,9 +20,9 @@ from orthoflow.cli.tables import (
     counted,
     duration,
     echo,
+    echo_diagnostics,
     echo_json,
     echo_table,
-    echo_warnings,
     first_rows,
     medians,
     number,
@@ -47,7 +47,7 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 @click.command(cls=RecordCommand)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--all", "is_whole", is_flag=True, help="Print every metric.")
+@click.option("--all", "is_whole", is_flag=True, help="Print every metric, warning and note.")
 @json_option
 def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
@@ -74,7 +74,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
         echo_json(_as_json(opened))
     else:
         _print_head(opened)
-        _print_cells(opened)
+        _print_cells(opened, is_whole=is_whole)
         is_compared = _print_comparison(opened)
         if is_whole or not is_compared:
             _print_metrics(opened, most=None if is_whole else ROWS_MOST)
@@ -109,7 +109,7 @@ def _status_text(run: Run) -> str:
     return f"{counted(len(run.record.cells), 'step')}, {', '.join(counts)}"
 
 
-def _print_cells(run: Run) -> None:
+def _print_cells(run: Run, *, is_whole: bool) -> None:
     echo()
     echo_table(
         ("step", "method", "status", "time", "memory"),
@@ -127,7 +127,7 @@ def _print_cells(run: Run) -> None:
     for cell in run.record.cells:
         if cell.error_message:
             echo(f"{cell.address} {cell.status}: {cell.error_message}")
-    echo_warnings(run.record.cells)
+    echo_diagnostics(run.record.cells, run.folder, is_whole=is_whole)
 
 
 def _cell_status(cell: RecordedCell) -> str:
@@ -234,8 +234,13 @@ def _print_files(run: Run) -> None:
 
 
 def _as_json(run: Run) -> dict[str, object]:
+    from orthoflow.records.diagnostics import diagnostics_of
+
     record = run.record
     values = dataclasses.asdict(dataclasses.replace(record, cells=()))
+    values["diagnostics"] = [
+        one for cell in record.cells for one in diagnostics_of(cell, cell.step, cell.address)
+    ]
     values["cells"] = [_cell_json(cell) for cell in record.cells]
     values["files"] = [str(file) for group in run.files.values() for file in group]
     return values

@@ -53,13 +53,24 @@ def folded(line: str, width: int) -> list[str]:
     )
 
 
-def echo_warnings(cells: Iterable[RecordedCell]) -> None:
-    """Print what limits the results of cells, a line per sense: the ones that help first."""
-    from orthoflow.alike import alike
-    from orthoflow.records.warnings import standing_warnings
+def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool = False) -> None:
+    """Print what limits the results of cells, the most harmful first, a line per code.
 
-    for item in alike(standing_warnings(cells)):
-        echo_folded(f"warning, {item.where}: {item.sentence}")
+    Args:
+        cells: of the run.
+        run: its folder, or its record, for the command that prints the rest.
+        is_whole: print all of them, and notes too.
+    """
+    from orthoflow.diagnostics import FIRST_SHOWN, grouped, standing
+
+    groups = [
+        group for group in grouped(standing(cells)) if is_whole or group.worst.severity != "note"
+    ]
+    for group in groups if is_whole else groups[:FIRST_SHOWN]:
+        echo_folded(f"{group.worst.severity}, {group.where}: {group.sentence}")
+    n_more = 0 if is_whole else len(groups) - FIRST_SHOWN
+    if n_more > 0:
+        echo(f"and {counted(n_more, 'more warning')}: orthoflow show {shlex.quote(str(run))} --all")
 
 
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import faulthandler
 import json
 import os
@@ -53,7 +54,7 @@ class ProgressPipe:
             # The method may have closed it, or put something else into its place.
             with suppress(AttributeError, OSError, ValueError):
                 sys.stderr.write(shown(event.text, keep="\n") + "\n")
-        self.send({"kind": event.kind, "text": event.text, "fraction": event.fraction})
+        self.send(dataclasses.asdict(event))
 
     def send(self, content: dict[str, object]) -> None:
         """Write one line; without a coordinator there is nobody to work for."""

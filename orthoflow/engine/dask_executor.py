@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.engine.dask_worker import (
     CANCEL_FILE,
     Order,
@@ -220,8 +221,12 @@ class DaskExecutor:
     def _hear(self, event: tuple[float, Any]) -> None:
         said = event[1]
         with suppress(KeyError, TypeError):
+            told = said.get("diagnostic")
             heard = StepEvent(
-                kind=said["kind"], text=str(said["text"]), fraction=float(said["fraction"])
+                kind=said["kind"],
+                text=str(said["text"]),
+                fraction=float(said["fraction"]),
+                diagnostic=told and Diagnostic(**{**told, "settled_by": tuple(told["settled_by"])}),
             )
             self._news.put((str(said["address"]), heard))
 

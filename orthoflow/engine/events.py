@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.engine.results import CellResult
 
 
@@ -49,11 +50,11 @@ class CellLogged:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellWarned:
-    """A running cell says something that limits its result."""
+class CellReported:
+    """A running cell reports something that deserves attention."""
 
     address: str
-    text: str
+    diagnostic: Diagnostic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ class CellFinished:
 
 
 RunEvent: TypeAlias = (
-    RunStarted | CellStarted | CellProgress | CellLogged | CellWarned | CellFinished
+    RunStarted | CellStarted | CellProgress | CellLogged | CellReported | CellFinished
 )
 RunListener: TypeAlias = Callable[[RunEvent], None]
 

@@ -18,6 +18,7 @@ from typing import Final, cast
 import numpy as np
 from pydantic import ValidationError
 
+from orthoflow.diagnostics import Diagnostic, warning_texts
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import is_broken, store_error, writing_to
 from orthoflow.engine.file_digests import file_identity, file_sha256
@@ -72,7 +73,7 @@ def run_task(
 
     Args:
         task: what to run; its folder exists.
-        listen: gets progress, log lines and warnings.
+        listen: gets progress, log lines and diagnostics.
         is_cancelled: asks whether to stop.
         has_own_process: whether this process ends with the task.
     """
@@ -97,7 +98,8 @@ def run_task(
         result,
         started=started,
         ended=now(),
-        warnings=tuple(call.warnings),
+        warnings=warning_texts(call.diagnostics),
+        diagnostics=tuple(call.diagnostics),
         **shared_fields(call.costs(), Costs),
     )
 
@@ -213,8 +215,8 @@ class _Call:
         )
 
     @property
-    def warnings(self) -> list[str]:
-        return self._context.warnings
+    def diagnostics(self) -> list[Diagnostic]:
+        return self._context.diagnostics
 
     def costs(self) -> Costs:
         """What the call took so far."""

@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
+from orthoflow.diagnostics import Diagnostic, DiagnosticSpec, placed, step_names, warning_texts
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import remove_tree, writing_to
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
     CellProgress,
+    CellReported,
     CellStarted,
-    CellWarned,
     RunListener,
     RunStarted,
     ignore,
@@ -60,8 +61,15 @@ from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.workflow.cells import Cell, CellOutput, compared_cells
 
 _POLL_S: Final = 0.25
-_CODE_CHANGED: Final = (
-    "the code of the method changed during the run: the result is not kept for other runs"
+_CODE_CHANGED: Final = DiagnosticSpec(
+    code="code-changed-while-running",
+    severity="warning",
+    text="the code of the method changed during the run: the result is not kept for other runs",
+)
+_STORED_RESULT_DAMAGED: Final = DiagnosticSpec(
+    code="stored-result-damaged",
+    severity="warning",
+    text="the stored result was damaged ({damage}) and was computed again",
 )
 # So often a failed cell is given another chance whose inputs were damaged when it failed.
 _MOST_REPEATS: Final = 3
@@ -213,6 +221,7 @@ class _Run:
         self._waiting = {item.cell.address: item for item in self._plan.cells}
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
+        self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
         self._compared = compared_cells(item.cell for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
@@ -325,8 +334,8 @@ class _Run:
             return None
         taken = self._store.take(key.key)
         if taken.damage:
-            text = f"the stored result was damaged ({taken.damage}) and is computed again"
-            self._listen(CellWarned(address=cell.address, text=text))
+            damaged = _STORED_RESULT_DAMAGED.of("", {"damage": taken.damage})
+            self._listen(CellReported(address=cell.address, diagnostic=damaged))
             self._journal.write(
                 CellDamaged(time=now(), address=cell.address, key=key.key, what=taken.damage)
             )
@@ -433,8 +442,9 @@ class _Run:
             self._failures.forget(task.key)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
-            self._listen(CellWarned(address=cell.address, text=_CODE_CHANGED))
-            result = _with_warning(result, _CODE_CHANGED)
+            changed = _CODE_CHANGED.of("", {})
+            self._listen(CellReported(address=cell.address, diagnostic=changed))
+            result = _reporting(result, changed)
         elif result.exit_code != CancelledStepError.exit_code:
             self._failures.remember(task.key, result.error_message)
         if self._has_other_inputs_now(cell, task):
@@ -465,8 +475,10 @@ class _Run:
         self._waiting.pop(cell.address, None)
         damage = self._journal.damaged.get(cell.address)
         if damage and result.status == "ok":
-            text = f"the stored result was damaged ({damage}) and was computed again"
-            result = _with_warning(result, text)
+            result = _reporting(result, _STORED_RESULT_DAMAGED.of("", {"damage": damage}))
+        # Their names are this workflow's, the result may be another's.
+        named = (placed(one, cell.setting, self._step_of) for one in result.diagnostics)
+        result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
         # What an equal cell gave a moment ago is as new as that.
         if is_cached and result.run_id != self._journal.run_id:
@@ -487,8 +499,9 @@ class _Run:
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 
 
-def _with_warning(result: CellResult, text: str) -> CellResult:
-    return dataclasses.replace(result, warnings=(*result.warnings, text))
+def _reporting(result: CellResult, *more: Diagnostic) -> CellResult:
+    reported = (*result.diagnostics, *more)
+    return dataclasses.replace(result, diagnostics=reported, warnings=warning_texts(reported))
 
 
 def _cores(cell: Cell, capacity: Capacity) -> int:
@@ -500,8 +513,8 @@ def _passing_on(listen: RunListener, splits: Splits) -> Tell:
         address, fraction = splits.said_by(task, event.fraction)
         if event.kind == "progress":
             listen(CellProgress(address=address, fraction=fraction, text=event.text))
-        elif event.kind == "warning":
-            listen(CellWarned(address=address, text=event.text))
+        elif event.diagnostic is not None:
+            listen(CellReported(address=address, diagnostic=event.diagnostic))
         else:
             listen(CellLogged(address=address, text=event.text))
 

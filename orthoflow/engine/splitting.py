@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+from orthoflow.diagnostics import unique
 from orthoflow.engine.durability import remove_tree, write_whole
 from orthoflow.engine.executors import TaskEnd
 from orthoflow.engine.keys import MethodFacts, read_preimage
@@ -139,6 +140,7 @@ class _Split:
             compile_s=round(sum(result.compile_s or 0.0 for result in results), 4),
             peak_rss_mib=max(result.peak_rss_mib for result in results),
             warnings=tuple(dict.fromkeys(text for result in results for text in result.warnings)),
+            diagnostics=tuple(unique(one for result in results for one in result.diagnostics)),
             log=log,
         )
 

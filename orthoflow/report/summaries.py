@@ -7,11 +7,10 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from orthoflow.alike import alike
+from orthoflow.diagnostics import DiagnosticGroup, grouped, standing
 from orthoflow.products import Orthoimages
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.records.warnings import standing_warnings
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
@@ -190,23 +189,22 @@ def _is_of_others(run: Run, address: str) -> bool:
 
 
 def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
-    """What limits the results: failures, combinations of different walls, then warnings by sense.
+    """What limits the results: failures, combinations of different walls, then diagnostics by code.
 
-    Of the warnings that no later step has settled what turns every picture over stands first; then
-    those that help, of them those of what was measured on the results, then the frequent ones, then
-    the baseline's. Behind them stands what speaks only of other planes than the one on show, last
-    what speaks only of planes of which no orthoimage was made.
+    Of the diagnostics that no later step has settled errors stand first. Behind the others stands
+    what is only about other planes than the one on show, last what is only about planes of which
+    no orthoimage was made.
 
     Args:
         run: the run.
         on_show: name of the plane whose picture stands beside them; empty where there is none.
     """
-    failures = alike(
-        (cell.address, cell.error_message) for cell in run.record.cells if cell.status == "failed"
-    )
+    failures: dict[str, list[str]] = {}
+    for cell in run.record.cells:
+        if cell.status == "failed":
+            failures.setdefault(cell.error_message, []).append(cell.address)
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
-    measuring = {cell.address for cell in by_baseline if cell.method.startswith("inspect.")}
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
@@ -218,29 +216,31 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
         if cell.status == "ok" and cell.method.startswith("orient.")
     ]
     settled = improved_on(run, oriented)
-    standing = [said for said in standing_warnings(by_baseline) if said[0] not in settled]
-    warnings = sorted(
-        alike(standing),
-        key=lambda item: (
-            not item.is_foremost,
-            _is_of_others_than(imaged, item.sentence),
-            _is_of_others_than(shown, item.sentence),
-            not item.is_advice,
-            measuring.isdisjoint(item.places),
+    groups = sorted(
+        grouped(
+            (address, one)
+            for address, one in standing(by_baseline)
+            if address not in settled and one.severity != "note"
+        ),
+        key=lambda group: (
+            group.worst.severity != "error",
+            _is_of_others_than(imaged, group),
+            _is_of_others_than(shown, group),
         ),
     )
     apart = unequal_walls(combinations_of(run))
     rastered = tuple(one.address for one in by_baseline if one.method.startswith("raster."))
     return (
-        *(Limit(text=item.sentence, cells=item.places, is_failure=True) for item in failures),
+        *(Limit(text=why, cells=tuple(where), is_failure=True) for why, where in failures.items()),
         *([Limit(text=apart, cells=rastered)] if apart else []),
-        *(Limit(text=item.sentence, cells=item.places) for item in warnings),
+        *(Limit(text=group.sentence, cells=group.places) for group in groups),
     )
 
 
-def _is_of_others_than(numbers: Collection[str], text: str) -> bool:
-    """Whether a sentence names planes, but none of these, where there are any."""
-    named = _PLANE.findall(text)
+def _is_of_others_than(numbers: Collection[str], group: DiagnosticGroup) -> bool:
+    """Whether diagnostics are about planes, but none of these, where there are any."""
+    about = (_PLANE.fullmatch(subject) for subject in (group.worst.subject, *group.subjects))
+    named = [plane[1] for plane in about if plane]
     return bool(numbers and named) and not any(number in numbers for number in named)
 
 

@@ -70,7 +70,9 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         return ""
     document["name"] = f"compare-{name}"
     # A pattern may have none that fits; a name is reported.
-    metrics = [one for one in sibling.load().metrics if one.isidentifier()][:_METRICS_MOST]
+    metrics = [one.name for one in sibling.load().metric_specs() if one.name.isidentifier()][
+        :_METRICS_MOST
+    ]
     asked = {"metrics": [f"{kind}.{one}" for one in metrics]} if metrics else {}
     document["compare"] = {"design": "product", **asked}
     return _dumped(document)
@@ -82,10 +84,10 @@ def _judged(
     """The numbers that say which method is the better one, of a recipe that measures them."""
     wanted = _JUDGED.get(kind, ())
     measured = {
-        metric: f"{name}.{metric}"
+        metric.name: f"{name}.{metric.name}"
         for name, node in steps.items()
         if "use" in node
-        for metric in catalog.method(node["use"]).load().metrics
+        for metric in catalog.method(node["use"]).load().metric_specs()
     }
     found = [measured[metric] for metric in wanted if metric in measured]
     return {"metrics": found} if found else {}

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
 
 if TYPE_CHECKING:
+    from orthoflow.diagnostics import Diagnostic, DiagnosticSpec
     from orthoflow.sdk.context import Metric, StepContext, StepEvent
     from orthoflow.sdk.methods import (
         Determinism,
         Method,
         MethodParams,
-        MetricLabel,
+        MetricSpec,
         Part,
         Ports,
         PortSpec,
@@ -22,12 +23,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Determinism",
+    "Diagnostic",
+    "DiagnosticSpec",
     "KindSpec",
     "Method",
     "MethodParams",
     "MethodSpec",
     "Metric",
-    "MetricLabel",
+    "MetricSpec",
     "Part",
     "PortSpec",
     "Ports",
@@ -41,21 +44,23 @@ __all__ = [
 # The hooks must load without numpy and pydantic, so that `plugins list` stays instant; these
 # names are looked up only when a method module asks for them.
 _HOMES = {
-    "Determinism": "methods",
-    "Method": "methods",
-    "MethodParams": "methods",
-    "MetricLabel": "methods",
-    "Part": "methods",
-    "PortSpec": "methods",
-    "Ports": "methods",
-    "port_specs": "methods",
-    "Metric": "context",
-    "StepContext": "context",
-    "StepEvent": "context",
+    "Diagnostic": "orthoflow.diagnostics",
+    "DiagnosticSpec": "orthoflow.diagnostics",
+    "Determinism": "orthoflow.sdk.methods",
+    "Method": "orthoflow.sdk.methods",
+    "MethodParams": "orthoflow.sdk.methods",
+    "MetricSpec": "orthoflow.sdk.methods",
+    "Part": "orthoflow.sdk.methods",
+    "PortSpec": "orthoflow.sdk.methods",
+    "Ports": "orthoflow.sdk.methods",
+    "port_specs": "orthoflow.sdk.methods",
+    "Metric": "orthoflow.sdk.context",
+    "StepContext": "orthoflow.sdk.context",
+    "StepEvent": "orthoflow.sdk.context",
 }
 
 
 def __getattr__(name: str) -> object:
     if name in _HOMES:
-        return getattr(import_module(f"orthoflow.sdk.{_HOMES[name]}"), name)
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'orthoflow.sdk' has no attribute {name!r}")

@@ -18,6 +18,13 @@ from orthoflow_provenance.errors import UnsafeFileError
 from orthoflow_provenance.inner_files import colliding, path_below
 from orthoflow_provenance.model import COSTS, Figure, Metric
 
+from orthoflow.diagnostics import (
+    PLAIN_WARNING,
+    TOO_MANY,
+    Diagnostic,
+    DiagnosticSpec,
+    warning_texts,
+)
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.files.plain_svg import MOST_BYTES, is_plain_svg
 from orthoflow.sdk.lines import is_name, one_line
@@ -31,7 +38,7 @@ _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "imag
 # Far above what a step can have to say; far below what a record or a terminal suffers from.
 _MOST_METRICS: Final = 20_000
 _MOST_FIGURES: Final = 2_000
-_MOST_WARNINGS: Final = 200
+_MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
 _SAID_WHERE: Final = re.compile(r" \([^()]+:\d+\)$")
 _Given = ParamSpec("_Given")
@@ -76,17 +83,19 @@ class DrawnFigure(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class StepEvent:
-    """Something a running step says.
+    """What a running step reports.
 
     Attributes:
-        kind: `progress`, `log` or `warning`.
+        kind: `progress`, `log` or `diagnostic`.
         text: one line.
         fraction: 0..1 for progress.
+        diagnostic: of that kind.
     """
 
-    kind: Literal["progress", "log", "warning"]
+    kind: Literal["progress", "log", "diagnostic"]
     text: str
     fraction: float = 0.0
+    diagnostic: Diagnostic | None = None
 
 
 def _ignore(event: StepEvent) -> None:
@@ -105,7 +114,7 @@ class StepContext:
         rng: generator seeded for this cell; the only source of randomness a method may use.
         cores: how many threads the method may use.
         scratch: existing empty folder, the only place a method may write to.
-        listen: where progress, log lines and warnings go as they happen.
+        listen: where progress, log lines and diagnostics go as they happen.
         is_cancelled: asks whether the step should stop.
         clock_s: seconds as `time.perf_counter`, which stand still while modules are loaded and
             kernels compiled: what a method measures of its own speed must not hang on what ran
@@ -114,7 +123,7 @@ class StepContext:
             those of loading and compiling: what is left to compare where others use the machine.
         metrics: what `metric` collected.
         figures: what `figure` collected.
-        warnings: what `warn` collected.
+        diagnostics: what `report` and `warn` collected.
     """
 
     rng: np.random.Generator
@@ -126,10 +135,10 @@ class StepContext:
     processor_s: Callable[[], float] = time.process_time
     metrics: list[Metric] = field(default_factory=list)
     figures: list[DrawnFigure] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    diagnostics: list[Diagnostic] = field(default_factory=list)
     _fraction: float = 0.0
     _named: set[str] = field(default_factory=set)
-    _n_warnings: int = 0
+    _n_diagnostics: int = 0
 
     @_names_the_line
     def metric(self, name: str, value: float, unit: str) -> None:
@@ -218,19 +227,37 @@ class StepContext:
         """Write one line to the step's log."""
         self.listen(StepEvent(kind="log", text=one_line(text)))
 
-    def warn(self, text: str) -> None:
-        """Tell the user something that limits the result; shown in terminal, record and report.
+    @_names_the_line
+    def report(self, spec: DiagnosticSpec, *, subject: str = "", **values: object) -> None:
+        """Report something that deserves attention; shown in terminal, record and report.
 
-        One line each; after the two hundredth, only their number is kept.
+        After the thousandth of a step, only their number is kept.
+
+        Args:
+            spec: what it is.
+            subject: what it is about, e.g. `scan 0` or `wall 3`; those of one spec are grouped.
+            values: numbers and texts that its sentences name.
+
+        Raises:
+            ProductError: a value is missing, or is no number and no text.
         """
-        self._n_warnings += 1
-        line = one_line(text)
-        if self._n_warnings <= _MOST_WARNINGS:
-            self.warnings.append(line)
-            self.listen(StepEvent(kind="warning", text=line))
+        one = spec.of(subject, values)
+        self._n_diagnostics += 1
+        if self._n_diagnostics <= _MOST_DIAGNOSTICS:
+            self.diagnostics.append(one)
+            self.listen(StepEvent(kind="diagnostic", text=one.text, diagnostic=one))
         else:
-            more = f"{self._n_warnings - _MOST_WARNINGS} more warnings, which are not kept"
-            self.warnings[_MOST_WARNINGS:] = [more]
+            n_more = self._n_diagnostics - _MOST_DIAGNOSTICS
+            self.diagnostics[_MOST_DIAGNOSTICS:] = [TOO_MANY.of("", {"n": n_more})]
+
+    def warn(self, text: str) -> None:
+        """Report a warning that has no code, one line; `report` serves readers better."""
+        self.report(PLAIN_WARNING, text=one_line(text))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts of the warnings and errors among the diagnostics."""
+        return list(warning_texts(self.diagnostics))
 
     def cancelled(self) -> bool:
         """Whether the step was asked to stop."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,9 +17,13 @@ from orthoflow.errors import MethodError, PluginError
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Metric, StepContext
 from orthoflow.sdk.lines import is_name, one_line
+from orthoflow.sdk.units import unit_of
 
 Determinism = Literal["exact", "seeded", "loose"]
-_GOOD_SIDES: Final = ("", "less", "more", "one")
+_BETTER: Final = ("", "lower", "higher", "one")
+_WILDCARD: Final = re.compile(r"(\*|\[[^\]]+\])")
+# As records of today name it.
+_GOOD: Final = {"": "", "lower": "less", "higher": "more", "one": "one"}
 
 
 class MethodParams(BaseModel):
@@ -110,29 +115,42 @@ class MappedPort:
     item_name: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class MetricLabel:
-    """What a report says of a metric beside its unit.
+@dataclass(frozen=True)
+class MetricSpec:
+    """A metric that a method may report.
 
     Attributes:
-        words: heading, e.g. `damp patches`.
-        good: which side is good, `less`, `more` or `one`; empty where none is: then it is shown,
-            and nobody is best in it.
+        name: of the metric; with the wildcards of file names (`*`, `[xy]`) where a part hangs on
+            the data.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares; empty where the name ends in it.
+        label: what reports call it, e.g. `damp patches`; its name where it is empty. `{0}`, `{1}`
+            stand for what the wildcards match.
+        better: `lower`, `higher` or `one`: which values are better; empty where none are: then it
+            is shown, and nobody is best in it.
+        description: a sentence on how it is measured.
     """
 
-    words: str
-    good: Literal["", "less", "more", "one"] = ""
+    name: str
+    unit: str = ""
+    label: str = ""
+    better: Literal["", "lower", "higher", "one"] = ""
+    description: str = ""
 
     def __post_init__(self) -> None:
-        if not is_name(self.words, also_of_file=False):
+        if not is_name(self.name) or (self.label and not is_name(self.label, also_of_file=False)):
             raise PluginError(
-                f"a metric's words must be one printable line of at most 200 bytes, got "
-                f"{one_line(ascii(self.words), 80)}"
+                f"name and label of a metric must be printable lines of at most 200 bytes, got "
+                f"{one_line(ascii(self.name), 80)} and {one_line(ascii(self.label), 80)}"
             )
-        if self.good not in _GOOD_SIDES:
+        if self.better not in _BETTER:
             raise PluginError(
-                f"a metric's good side must be less, more, one or empty, got {self.good!r}"
+                f"metric {self.name}: better must be lower, higher, one or empty, got "
+                f"{self.better!r}"
             )
+        if not (self.unit or unit_of(self.name)):
+            object.__setattr__(self, "unit", "1")
+        elif not self.unit:
+            object.__setattr__(self, "unit", unit_of(self.name))
 
 
 class Method:
@@ -148,11 +166,9 @@ class Method:
         result_version: raised by the author whenever results change for equal inputs.
         determinism: `exact` (same bits always), `seeded` (same bits for the same seed) or
             `loose` (equal within the products' tolerances).
-        metrics: names of all metrics that it may report, with the wildcards of file names (`*`,
-            `[xy]`) where a part hangs on the data. A comparison that asks for another one is
-            refused; empty where the author declares none: then nothing is refused.
-        metric_labels: what metrics of its own are called in tables, and what makes them good:
-            name, with wildcards as above -> label. What it says nothing of keeps its name.
+        metrics: all metrics that it may report: a `MetricSpec` each, or just its name. A
+            comparison that asks for another one is refused; empty where the author declares none:
+            then nothing is refused.
         citations: where the method comes from: DOI, title or URL.
         unaffected_by: distributions whose version does not change results, although the method's
             own distribution requires them; all others are part of a result's key.
@@ -167,8 +183,7 @@ class Method:
     id: ClassVar[str]
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = ()
-    metric_labels: ClassVar[Mapping[str, MetricLabel]] = {}
+    metrics: ClassVar[tuple[MetricSpec | str, ...]] = ()
     citations: ClassVar[tuple[str, ...]] = ()
     unaffected_by: ClassVar[tuple[str, ...]] = ()
     Params: ClassVar[type[MethodParams]]
@@ -236,7 +251,19 @@ class Method:
     @classmethod
     def may_report(cls, metric: str) -> bool:
         """Whether a metric is one of those declared; True where none are."""
-        return not cls.metrics or any(fnmatchcase(metric, name) for name in cls.metrics)
+        return not cls.metrics or cls.metric_spec(metric) is not None
+
+    @classmethod
+    def metric_specs(cls) -> tuple[MetricSpec, ...]:
+        """All metrics that it declares, a bare name as the spec of that name."""
+        return tuple(one if isinstance(one, MetricSpec) else MetricSpec(one) for one in cls.metrics)
+
+    @classmethod
+    def metric_spec(cls, metric: str) -> MetricSpec | None:
+        """The declaration of a metric by its name, by a pattern where no name is the same."""
+        specs = cls.metric_specs()
+        exact = next((spec for spec in specs if spec.name == metric), None)
+        return exact or next((spec for spec in specs if fnmatchcase(metric, spec.name)), None)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
@@ -301,12 +328,28 @@ def checked_part(method: Method, inputs: Any, items: range, params: Any, ctx: St
 
 
 def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, ...]:
-    """Give metrics what their method calls them, and their good side: records tell it to others."""
+    """Add to metrics what their method declares of them, so that records know it."""
     found = []
     for metric in metrics:
-        labels = method.metric_labels.items()
-        label = next((one for name, one in labels if fnmatchcase(metric.name, name)), None)
-        found.append(
-            replace(metric, words=label.words, good=label.good) if label is not None else metric
-        )
+        spec = method.metric_spec(metric.name)
+        if spec is not None and (spec.label or spec.better):
+            label = spec.label.format(*matched(spec.name, metric.name)) or metric.name
+            found.append(replace(metric, words=label, good=_GOOD[spec.better]))
+        else:
+            found.append(metric)
     return tuple(found)
+
+
+def matched(pattern: str, name: str) -> tuple[str, ...]:
+    """Return what the wildcards of a pattern match in a name, with `_` as spaces.
+
+    >>> matched("wall_*_rmse_[uv]_mm", "wall_3_rmse_u_mm")
+    ('3', 'u')
+    """
+    parts = _WILDCARD.split(pattern)
+    expression = "".join(
+        f"({'.*' if part == '*' else part})" if index % 2 else re.escape(part)
+        for index, part in enumerate(parts)
+    )
+    found = re.fullmatch(expression, name)
+    return tuple(part.replace("_", " ") for part in found.groups()) if found else ()

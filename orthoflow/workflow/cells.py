@@ -95,6 +95,12 @@ class Cell:
     timeout_s: float | None = None
     skip_reason: str = ""
 
+    @property
+    def setting(self) -> str:
+        """How its parameters are named where they are set: `step`, or `step.variant`."""
+        variant = self.assignment.get(self.step)
+        return f"{self.step}.{variant}" if variant else self.step
+
 
 def compared_cells(cells: Iterable[Cell]) -> frozenset[str]:
     """Give the addresses of cells whose times stand beside each other: variants and repeats.

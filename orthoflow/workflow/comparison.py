@@ -319,7 +319,10 @@ def _unknown_metric(metric: str, steps: Sequence[DraftStep]) -> str:
     if any(method.may_report(metric) for method in methods):
         return ""
     known = dict.fromkeys(
-        name for method in methods for name in method.metrics if not _has_wildcard(name)
+        spec.name
+        for method in methods
+        for spec in method.metric_specs()
+        if not _has_wildcard(spec.name)
     )
     names = " and ".join(step.name for step in steps)
     ids = ", ".join(dict.fromkeys(variant.call.method for variant in calls))

@@ -19,6 +19,7 @@ from orthoflow_provenance.encoding import (
     float_attribute,
     has_attribute,
     int_attribute,
+    parse_json,
     read_json,
     read_table,
     read_text,
@@ -30,7 +31,7 @@ from orthoflow_provenance.encoding import (
     write_texts,
 )
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import Stored
+from orthoflow_provenance.model import RecordedDiagnostic, Stored
 
 WORKFLOW: Final = "workflow"
 INPUTS: Final = "inputs"
@@ -144,6 +145,8 @@ def _many(hint: object, marks: tuple[object, ...]) -> _Codec | None:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return _choice(arguments)
+    if origin is tuple and arguments[0] is RecordedDiagnostic:
+        return _diagnostics()
     if origin is tuple:
         is_text = arguments[0] is str
         return _Codec(write=write_texts, read=read_texts) if is_text else _rows(arguments[0])
@@ -208,6 +211,28 @@ def _json() -> _Codec:
         write=lambda group, name, value: write_text(group, name, canonical_json(value)),
         read=read_json,
     )
+
+
+def _diagnostics() -> _Codec:
+    def write(group: h5py.Group, name: str, rows: tuple[RecordedDiagnostic, ...]) -> None:
+        # As later columns: a record in which nobody reported anything is one of before.
+        texts = [{**dataclasses.asdict(row), "settled_by": list(row.settled_by)} for row in rows]
+        if rows:
+            write_text(group, name, canonical_json(texts))
+
+    def read(group: h5py.Group, name: str) -> tuple[RecordedDiagnostic, ...]:
+        if name not in group:
+            return ()
+        rows: Any = parse_json(read_text(group, name), f"{group.name}/{name}")
+        try:
+            return tuple(
+                RecordedDiagnostic(**{**row, "settled_by": tuple(row["settled_by"])})
+                for row in rows
+            )
+        except (TypeError, KeyError) as error:
+            raise RecordFormatError(f"{group.name}/{name} holds no diagnostics") from error
+
+    return _Codec(write=write, read=read)
 
 
 def _pairs(key: str, value: str) -> _Codec:

@@ -102,6 +102,32 @@ class Metric:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordedDiagnostic:
+    """Something that deserves attention, as data.
+
+    Attributes:
+        code: stable name, e.g. `scan-without-colour`.
+        severity: `error`, `warning` or `note`.
+        subject: what it is about, e.g. `scan 0`.
+        values: numbers and names that the text is made of.
+        text: one sentence.
+        remedy: what to do about it; empty where nothing can be done.
+        rank_by: name of the value by which the worst of several is chosen, larger is worse; with
+            `-` before it smaller is worse.
+        settled_by: methods or codes of later steps that settle it.
+    """
+
+    code: str
+    severity: Literal["error", "warning", "note"]
+    subject: str
+    values: Mapping[str, bool | int | float | str | None]
+    text: str
+    remedy: str = ""
+    rank_by: str = ""
+    settled_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Figure:
     """What is said of a picture, wherever it is.
 
@@ -286,6 +312,7 @@ class CellOutcome(MethodIdentity, Costs):
         ended: likewise.
         metrics: what the method reported.
         warnings: what limits the result.
+        diagnostics: the same as data, and notes.
         log: text.
     """
 
@@ -299,6 +326,7 @@ class CellOutcome(MethodIdentity, Costs):
     ended: str = ""
     metrics: tuple[Metric, ...] = ()
     warnings: tuple[str, ...] = ()
+    diagnostics: tuple[RecordedDiagnostic, ...] = ()
     log: LongText = ""
 
 

@@ -136,6 +136,9 @@ def _without_folders(record: RunRecord) -> RunRecord:
             cell,
             error_message=without_folders(cell.error_message),
             warnings=clean(cell.warnings),
+            diagnostics=tuple(
+                dataclasses.replace(one, text=without_folders(one.text)) for one in cell.diagnostics
+            ),
             log=without_folders(cell.log),
         )
         for cell in record.cells

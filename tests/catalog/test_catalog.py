@@ -319,7 +319,7 @@ CLASS = """\
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.planes import Planes, PointLabels
 from orthoflow.products.walls import Walls
-from orthoflow.sdk import Method, MethodParams, MetricLabel, Ports
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports
 
 class Mine(Method):
     id = "plane.mine"
@@ -353,15 +353,10 @@ CHANGES = {
         "whole number from 1 on, got 0",
     ),
     "citations": ("    Params", "    citations = 'doi'\n    Params", "must be a tuple of texts"),
-    "labels": (
+    "metrics": (
         "    Params",
-        "    metric_labels = {'n': 'damp'}\n    Params",
-        "metric_labels must give names a MetricLabel each",
-    ),
-    "label of no metric": (
-        "    Params",
-        "    metrics = ('damp',)\n    metric_labels = {'dam': MetricLabel(words='d')}\n    Params",
-        "metric_labels names dam (did you mean damp?), which metrics does not declare",
+        "    metrics = [3]\n    Params",
+        "metrics must be a tuple of MetricSpec, or of names, got [3]",
     ),
     "invented port": ("cloud: P", "cloud: PointCloud\n        more: P", "kind plane has no input"),
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
@@ -405,18 +400,6 @@ def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
     source = CLASS.replace("cloud: PointCloud", "pass")
     catalog = with_plugin("kept", text, tmp_path, monkeypatch, kept_class=source)
     assert catalog.method("plane.mine").load().id == "plane.mine"
-
-
-def test_labels_name_metrics_as_they_are_declared_or_more_closely_or_widely(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = ["wall_[0-9]*_damp", "wall_0_damp", "*_damp"]
-    labels = ", ".join(f"{name!r}: MetricLabel(words='damp')" for name in names)
-    own = f"    metrics = ('wall_[0-9]*_damp',)\n    metric_labels = {{{labels}}}\n    Params"
-    text = hooks(methods=method("plane.mine", "labelled_class:Mine"))
-    source = CLASS.replace("    Params", own, 1)
-    catalog = with_plugin("labelled", text, tmp_path, monkeypatch, labelled_class=source)
-    assert list(catalog.method("plane.mine").load().metric_labels) == names
 
 
 def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(

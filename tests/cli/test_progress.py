@@ -22,12 +22,13 @@ from orthoflow.cli.progress import (
     visible_cells,
     working_on,
 )
+from orthoflow.diagnostics import PLAIN_WARNING, DiagnosticSpec
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
     CellProgress,
+    CellReported,
     CellStarted,
-    CellWarned,
     RunEvent,
     RunStarted,
 )
@@ -41,15 +42,22 @@ FAILED = CellResult(
     status="failed", started="2026-01-02T03:04:05.000Z", wall_s=75.0, error_message="no plane"
 )
 SKIPPED = CellResult(status="skipped", error_message="needs plane, which failed")
+
+
+def reported(address: str, text: str, code: str = "warning", subject: str = "") -> CellReported:
+    spec = DiagnosticSpec(code=code, severity="warning", text="{text}")
+    return CellReported(address=address, diagnostic=spec.of(subject, {"text": text}))
+
+
 EVENTS: list[RunEvent] = [
     RunStarted(run_id="r1", n_cells=5, is_resumed=False),
     CellFinished(address="cloud", result=OK, cached=True),
     CellStarted(address="plane"),
     CellProgress(address="plane", fraction=0.5, text="peeling"),
     CellLogged(address="plane", text="a detail"),
-    CellWarned(address="plane", text="the side is a [guess]"),
-    CellWarned(address="plane", text="wall 2: no point lies within its buffer"),
-    CellWarned(address="plane", text="wall 17: no point lies within its buffer"),
+    reported("plane", "the side is a [guess]"),
+    reported("plane", "no point", code="empty-wall", subject="wall 2"),
+    reported("plane", "no point", code="empty-wall", subject="wall 17"),
     CellFinished(address="plane", result=FAILED, cached=False),
     CellFinished(address="wall", result=SKIPPED, cached=False),
     CellFinished(address="other", result=OK, cached=False),
@@ -82,9 +90,9 @@ def test_plain_progress_is_one_line_per_start_sense_of_warning_and_end(
         "cloud: cached (1 of 5)",
         "plane: started",
         "plane: warning: the side is a [guess]",
-        "plane: warning: wall 2: no point lies within its buffer",
+        "plane: warning: empty-wall (wall 2)",
         "plane: failed in 1 min 15 s: no plane, 1 warning like one above (2 of 5)",
-        "wall: skipped: needs plane, which failed (3 of 5)",
+        "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
         "last: ok in 1.2 s, besides 45.0 s of loading and compiling (5 of 5)",
     ]
@@ -222,9 +230,9 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         "run r1: 5 steps",
         "cloud: cached",
         "plane: warning: the side is a [guess]",
-        "plane: warning: wall 2: no point lies within its buffer",
+        "plane: warning: empty-wall (wall 2)",
         "plane: failed in 1 min 15 s: no plane, 1 warning like one above",
-        "wall: skipped: needs plane, which failed",
+        "wall: skipped",
         "other: ok in 1.2 s",
         "last: ok in 1.2 s, besides 45.0 s of loading and compiling",
     ]
@@ -317,19 +325,6 @@ def test_how_far_a_step_says_it_is_counts_where_nothing_is_known() -> None:
     assert CellState(state="running", started=0.0, fraction=0.5, took_s=10.0).left_s(20.0) == 20.0
 
 
-def test_a_warning_names_parameters_as_they_are_set(capsys: pytest.CaptureFixture[str]) -> None:
-    (item,) = planned("wall")
-    told = dataclasses.replace(item, cell=dataclasses.replace(item.cell, params={"gsd_m": 0.01}))
-    with PlainProgress((told,)) as progress:
-        progress.tell(CellWarned(address="wall", text="raise gsd_m"))
-        # Of what is no cell of the plan nobody knows the parameters.
-        progress.tell(CellWarned(address="other", text="lower gsd_m"))
-    assert capsys.readouterr().err.splitlines() == [
-        "wall: warning: raise wall.gsd_m",
-        "other: warning: lower gsd_m",
-    ]
-
-
 def test_a_run_takes_as_long_as_what_is_left_of_it() -> None:
     running = CellState(state="running", started=0.0, took_s=30.0)
     waiting, unknown = CellState(took_s=50.0), CellState()
@@ -354,7 +349,10 @@ def test_what_steps_say_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[st
         RunStarted(run_id=evil, n_cells=1, is_resumed=False),
         CellStarted(address=f"a {evil}"),
         CellProgress(address=f"a {evil}", fraction=0.5, text=evil),
-        CellWarned(address=f"a {evil}", text=evil),
+        CellReported(
+            address=f"a {evil}",
+            diagnostic=dataclasses.replace(PLAIN_WARNING.of("", {"text": ""}), text=evil),
+        ),
         CellFinished(address=f"b {evil}", result=result, cached=False),
     ]
     live = LiveProgress(())

@@ -147,9 +147,8 @@ def test_whatever_is_raised_is_one_printable_line(world: World) -> None:
 
 def test_warnings_are_lines_and_the_first_ones_are_kept(world: World) -> None:
     warnings = result_of(all_of(world, "warns_much", executor="inline"), "warns_much").warnings
-    assert len(warnings) == 201
+    assert len(warnings) == 1000
     assert warnings[7] == r"7 \x1b[31m\udcff"
-    assert warnings[-1] == "801 more warnings, which are not kept"
 
 
 def test_no_descriptor_is_left_open_by_a_run(world: World) -> None:

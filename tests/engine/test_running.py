@@ -143,13 +143,13 @@ def test_between_what_is_compiled_a_step_says_what_it_said_before() -> None:
     news.compiling("compiling peel")
     half = StepEvent(kind="progress", text="peeling", fraction=0.5)
     news.listen(half)
-    news.listen(StepEvent(kind="warning", text="dark"))
+    news.listen(StepEvent(kind="log", text="dark"))
     news.compiling("compiling grow")
     news.compiling("")
     assert [(event.kind, event.text, event.fraction) for event in heard] == [
         ("progress", "compiling peel", 0.0),
         ("progress", "peeling", 0.5),
-        ("warning", "dark", 0.0),
+        ("log", "dark", 0.0),
         ("progress", "compiling grow", 0.5),
         ("progress", "peeling", 0.5),
     ]

@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.environment import environment
-from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
+from orthoflow.engine.events import (
+    CellFinished,
+    CellLogged,
+    CellProgress,
+    CellReported,
+    CellStarted,
+)
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.engine.scheduling import RunOutcome, execute
@@ -123,7 +129,10 @@ def test_figures_metrics_and_warnings_are_kept(world: World) -> None:
     assert world.store.blob(figure.sha256) == b"\x89PNG\r\n\x1a\n0123"
     assert [(m.name, m.value, m.unit) for m in result.metrics] == [("dots", 1.0, "1")]
     assert result.warnings == ("the dot is small",)
-    assert CellWarned(address="b", text="the dot is small") in world.events
+    warned = [event for event in world.events if isinstance(event, CellReported)]
+    assert [event.diagnostic.text for event in warned if event.address == "b"] == [
+        "the dot is small"
+    ]
 
 
 def test_everything_a_step_says_is_in_its_log(world: World) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -11,8 +12,9 @@ from pathlib import Path
 
 import h5py
 import pytest
-from orthoflow_provenance.encoding import write_table, write_texts
+from orthoflow_provenance.encoding import write_table, write_text, write_texts
 
+from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.records.verification import verify_run
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
@@ -275,9 +277,11 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
     def write(file: h5py.File) -> None:
         hostile.set_attribute(file, "name", f"name {evil}")
         hostile.set_text(file["cells/paint"], "log", evil)
-        for column in ("warnings", "citations"):
-            del file["cells/paint"][column]
-            write_texts(file["cells/paint"], column, [f"{column} {evil}"])
+        del file["cells/paint"]["citations"]
+        write_texts(file["cells/paint"], "citations", [f"citations {evil}"])
+        told = PLAIN_WARNING.of("", {"text": ""})
+        row = {**dataclasses.asdict(told), "text": f"warnings {evil}", "settled_by": []}
+        write_text(file["cells/paint"], "diagnostics", json.dumps([row]))
         hostile.add_figure(file["cells/paint"], f"figure {evil}")
 
     run = hostile.changed(finished.folder / "first", folder / "run", write)

@@ -36,6 +36,7 @@ from tests.report_runs import (
     metrics,
     orthoimages_product,
     record,
+    warned,
 )
 
 # RMS of two detectors in seven rooms; None where it failed.
@@ -53,7 +54,7 @@ RMS_MM: dict[str, tuple[float, float | None]] = {
 def room(name: str, rms_mm: tuple[float, float | None]) -> list[RecordedCell]:
     slow, quick = rms_mm
     return [
-        cell(f"scan@data={name}", warnings=(f"{name} is dark",)),
+        cell(f"scan@data={name}", **warned(f"{name} is dark", code="dark", subject=name)),
         cell(
             f"plane@data={name},plane=slow",
             metrics=metrics(rms_mm=slow, n_oriented=5.0, n_photos=6.0),

@@ -30,7 +30,7 @@ def test_every_metric_of_ours_is_described() -> None:
         name
         for method, entry in catalog.methods.items()
         if entry.distribution.name == "orthoflow-tls"
-        for name in describe_method(catalog, method).method.metrics
+        for name in (one.name for one in describe_method(catalog, method).method.metric_specs())
     }
     assert len(declared) > 200
     assert {name for name in declared if not is_described(name)} == set()

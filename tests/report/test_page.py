@@ -12,6 +12,7 @@ import axe_core_python
 import pytest
 from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 
+from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.report import write_report
 from tests.browser import Page
@@ -614,7 +615,10 @@ def hostile(run: HeldRun) -> HeldRun:
             cell,
             metrics=(*metrics, Metric(name=text, value=1.0, unit=text)) if metrics else (),
             figures=(*figures[:1], drawn) if figures else (),
-            warnings=(text, "turned \u202eround"),
+            diagnostics=(
+                replace(PLAIN_WARNING.of("", {"text": "x"}), text=text),
+                replace(PLAIN_WARNING.of("", {"text": "x"}), text="turned \u202eround"),
+            ),
             citations=(f"{text} doi:10.1/{text}",),
             log=text,
             params={text: text},

@@ -41,6 +41,7 @@ from tests.report_runs import (
     metrics,
     orthoimages_product,
     record,
+    warned,
 )
 
 
@@ -341,42 +342,43 @@ def test_walls_of_different_rooms_may_differ() -> None:
     assert limits(run(*cells, moved))[0].text.count("m2 at omega") == 2
 
 
-def test_advice_on_what_was_measured_is_the_first_limit() -> None:
-    scan = cell("scan", method="read.scan", warnings=("set view_from of it: a guess",))
+def test_what_can_be_mended_is_the_first_limit() -> None:
+    scan = cell("scan", method="read.scan", **warned("a guess", code="guess"))
     check = cell(
-        "points", method="inspect.checkpoints", warnings=("2 of 4 are missing: measure them",)
+        "points",
+        method="inspect.checkpoints",
+        **warned("2 of 4 are missing", code="missing", remedy="measure them"),
     )
     assert [limit.cells for limit in limits(run(scan, check))] == [("points",), ("scan",)]
-    check = replace(check, warnings=("one is an outlier",))
+    check = replace(check, **warned("one is an outlier", code="outlier"))
     assert [limit.cells for limit in limits(run(scan, check))] == [("scan",), ("points",)]
 
 
 def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path: Path) -> None:
-    first = cell("first", method="orient.pnp", warnings=("photo a: few ties",))
+    first = cell("first", method="orient.pnp", **warned("photo a: few ties"))
     reties = cell("reties", method="match.guided", inputs={"c": given("first.cameras", "1", "c")})
     orient = cell(
         "orient",
         method="orient.pnp",
         inputs={"t": given("reties.ties", "2", "t")},
-        warnings=("photo b: few ties",),
+        **warned("photo b: few ties"),
     )
     assert [limit.cells for limit in limits(run(first, reties, orient))] == [("orient",)]
-    silent = run(first, reties, replace(orient, warnings=()))
+    silent = run(first, reties, replace(orient, **warned()))
     write_report([silent], tmp_path / "report.html")
     assert (
         "No step warned of what a later one has not settled."
         in (tmp_path / "report.html").read_text()
     )
-    failed = replace(orient, status="failed", error_message="no disk", warnings=())
+    failed = replace(orient, status="failed", error_message="no disk", **warned())
     told = [limit.cells for limit in limits(run(first, reties, failed))]
     assert told == [("orient",), ("first",)]
 
 
-def test_what_is_said_of_planes_without_an_orthoimage_stands_last() -> None:
-    guessed = "from which side {} was seen is a guess: set view_from"
+def test_diagnostics_of_planes_without_an_orthoimage_stand_last() -> None:
     told = [
-        cell(name, warnings=(text,))
-        for name, text in (("a", guessed.format("wall 6")), ("b", "wall 0: cells are empty"))
+        cell("a", **warned("guessed", code="guessed", subject="wall 6", remedy="set it")),
+        cell("b", **warned("cells are empty", code="empty", subject="wall 0")),
     ]
     image = PublishedFile(path="products/mosaic/wall_0_ortho.tif", size_bytes=1, sha256="0")
     of_one = replace(run(*told), record=replace(run(*told).record, published=(image,)))
@@ -385,17 +387,15 @@ def test_what_is_said_of_planes_without_an_orthoimage_stands_last() -> None:
     assert [limit.cells for limit in limits(run(*told))] == [("a",), ("b",)]
 
 
-def test_what_is_said_of_other_planes_than_the_one_on_show_stands_behind() -> None:
+def test_diagnostics_of_other_planes_than_the_one_on_show_stand_behind() -> None:
     told = run(
-        cell("a", warnings=("wall 3: cells are empty (raise gsd_m)",)),
-        cell("b", warnings=("the photos are few",)),
-        cell("c", warnings=("wall 0: cells are empty",)),
-        cell("d", warnings=("wall 3 and wall 0 are cut",)),
+        cell("a", **warned("empty", code="empty", subject="wall 3", remedy="raise gsd_m")),
+        cell("b", **warned("the photos are few", code="few")),
+        cell("c", **warned("cut", code="cut", subject="wall 0")),
     )
     first = [limit.cells for limit in limits(told)]
-    assert first[0] == ("a",)
-    found = limits(told, "wall 0")
-    assert [limit.cells for limit in found] == [("b",), ("c",), ("d",), ("a",)]
+    assert first == [("a",), ("b",), ("c",)]
+    assert [limit.cells for limit in limits(told, "wall 0")] == [("b",), ("c",), ("a",)]
     assert limits(told, "wall 3")[0].cells == ("a",)
     # A picture without a number, as one of another program, says nothing of planes.
     assert [limit.cells for limit in limits(told, "facade")] == first

@@ -31,6 +31,7 @@ from tests.report_runs import (
     metric,
     metrics,
     record,
+    warned,
 )
 
 
@@ -266,10 +267,10 @@ def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
 
 def test_limits_name_all_cells_that_say_the_same() -> None:
     told = run(
-        cell("plane@plane=coarse", warnings=("odd", "few points")),
-        cell("plane@plane=fine", warnings=("few points",)),
+        cell("plane@plane=coarse", **warned("odd", "few points")),
+        cell("plane@plane=fine", **warned("few points")),
         cell("plane@plane=bad", status="failed", error_message="no plane"),
-        cell("plane@plane=worse", status="failed", error_message="no plane", warnings=("odd",)),
+        cell("plane@plane=worse", status="failed", error_message="no plane", **warned("odd")),
         workflow_resolved=compared_resolved(),
     )
     assert limits(told) == (

@@ -110,7 +110,7 @@ def test_lines_and_fractions_are_heard_in_order(tmp_path: Path) -> None:
     ctx.progress(7.0, "done")
     assert [(event.kind, event.text) for event in heard] == [
         *(("progress", "begun"), ("log", "reading"), ("progress", "")),
-        *(("warning", "few points"), ("progress", "done")),
+        *(("diagnostic", "few points"), ("progress", "done")),
     ]
     assert [event.fraction for event in heard if event.kind == "progress"] == [0.0, 0.25, 1.0]
     assert ctx.warnings == ["few points"]
@@ -222,10 +222,11 @@ def test_a_step_says_far_more_than_any_has_to_say_and_not_without_end(tmp_path: 
         ctx.figure("one_more", PNG)
     heard: list[StepEvent] = []
     ctx.listen = heard.append
-    for k in range(203):
+    for k in range(1003):
         ctx.warn(f"warning {k}")
-    assert len(heard) == 200
-    assert ctx.warnings[199:] == ["warning 199", "3 more warnings, which are not kept"]
+    assert len(heard) == 1000
+    assert (ctx.diagnostics[999].text, len(ctx.diagnostics)) == ("warning 999", 1001)
+    assert ctx.diagnostics[1000].values == {"n": 3}
 
 
 class OfSize:

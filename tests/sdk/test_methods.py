@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Photo, Photos, Planes, PointCloud
-from orthoflow.sdk import Method, MethodParams, Metric, MetricLabel, Part, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, Metric, MetricSpec, Part, Ports, StepContext
 from orthoflow.sdk.methods import checked_part, labelled, mapped_port
 
 
@@ -21,8 +21,7 @@ class Counting(Method):
 
     id = "match.counting"
     maps_over = "photos"
-    metrics = ("n_*", "rms_px")
-    metric_labels: ClassVar = {"n_*": MetricLabel(words="how many", good="more")}
+    metrics = (MetricSpec("n_*", label="number of {0}", better="higher"), "rms_px")
 
     class Params(MethodParams):
         """None."""
@@ -81,10 +80,10 @@ def test_what_maps_over_nothing_is_no_mapping() -> None:
     assert mapped_port(type("Plain", (Counting,), {"maps_over": ""})) is None
 
 
-def test_metrics_are_those_declared_and_called_as_labelled() -> None:
+def test_metrics_are_those_declared_and_labelled() -> None:
     reported = [Metric(name=name, value=1.0, unit="1") for name in ("n_planes", "rms_px")]
     count, rms = labelled(Counting, reported)
-    assert (count.words, count.good) == ("how many", "more")
+    assert (count.words, count.good) == ("number of planes", "more")
     assert rms is reported[1]
     assert [Counting.may_report(name) for name in ("n_planes", "rms_px", "rms_mm")] == [
         *(True, True, False),

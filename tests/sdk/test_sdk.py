@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from orthoflow.products import Photos, Planes, PointCloud
 from orthoflow.sdk import (
     Method,
     Metric,
-    MetricLabel,
+    MetricSpec,
     Part,
     Ports,
     StepContext,
@@ -135,7 +134,9 @@ def test_warnings_are_collected_and_heard(tmp_path: Path) -> None:
     ctx = context(tmp_path, listen=heard.append)
     ctx.warn("no station known")
     assert ctx.warnings == ["no station known"]
-    assert heard == [StepEvent(kind="warning", text="no station known", fraction=0.0)]
+    (event,) = heard
+    assert (event.kind, event.text) == ("diagnostic", "no station known")
+    assert [event.diagnostic] == ctx.diagnostics
 
 
 def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
@@ -148,31 +149,42 @@ def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
 
 
 class Damp(Method):
-    metric_labels: ClassVar[dict[str, MetricLabel]] = {
-        "n_*": MetricLabel(words="damp patches"),
-        "damp_share": MetricLabel(words="share that is damp", good="less"),
-    }
+    metrics = (
+        MetricSpec("n_*", label="damp patches"),
+        MetricSpec("damp_share", label="share that is damp", better="lower"),
+        MetricSpec("wall_[0-9]*_rms_mm", label="RMS, wall {0}{1}"),
+        "other",
+    )
 
 
 def test_metrics_carry_what_their_method_calls_them() -> None:
     reported = [
-        Metric(name=name, value=1.0, unit="1") for name in ("n_patches", "damp_share", "other")
+        Metric(name=name, value=1.0, unit="1")
+        for name in ("n_patches", "damp_share", "wall_12_rms_mm", "other")
     ]
     assert [(one.name, one.words, one.good) for one in labelled(Damp, reported)] == [
         ("n_patches", "damp patches", ""),
         ("damp_share", "share that is damp", "less"),
+        ("wall_12_rms_mm", "RMS, wall 12", ""),
         ("other", "", ""),
     ]
 
 
+def test_the_unit_of_a_metric_is_declared_or_the_end_of_its_name() -> None:
+    assert [MetricSpec(name).unit for name in ("rms_mm", "n_points", "damp_share")] == [
+        *("mm", "1", "1"),
+    ]
+    assert MetricSpec("speed", unit="m/s").unit == "m/s"
+
+
 @pytest.mark.parametrize(
-    ("label", "said"),
+    ("declared", "named"),
     [
-        ({"words": "two\nlines"}, "words must be one printable line of at most 200 bytes"),
-        ({"words": ""}, "words must be one printable line"),
-        ({"words": "a", "good": "most"}, "good side must be less, more, one or empty, got 'most'"),
+        ({"name": "a/b"}, "printable lines of at most 200 bytes"),
+        ({"name": "a", "label": "two\nlines"}, "printable lines"),
+        ({"name": "a", "better": "most"}, "better must be lower, higher, one or empty, got 'most'"),
     ],
 )
-def test_a_label_that_is_none_is_refused(label: dict[str, str], said: str) -> None:
-    with pytest.raises(PluginError, match=said):
-        MetricLabel(**label)  # type: ignore[arg-type]
+def test_a_metric_that_cannot_be_shown_is_refused(declared: dict[str, str], named: str) -> None:
+    with pytest.raises(PluginError, match=named):
+        MetricSpec(**declared)  # type: ignore[arg-type]

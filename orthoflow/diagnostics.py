@@ -1,0 +1,347 @@
+"""What deserves attention, as data: declared once by who reports it, grouped and ordered by code.
+
+A method declares a `DiagnosticSpec` and reports it with `ctx.report(SPEC, subject=..., **values)`.
+Terminal, report and record work on code, severity and values; nobody looks into the text.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import string
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, Protocol
+
+from orthoflow_provenance.model import RecordedDiagnostic as Diagnostic
+
+from orthoflow.errors import ProductError
+from orthoflow.foreign_text import shown
+
+__all__ = [
+    "FIRST_SHOWN",
+    "Diagnostic",
+    "DiagnosticGroup",
+    "DiagnosticSpec",
+    "first_few",
+    "grouped",
+    "placed",
+    "standing",
+    "step_names",
+    "unique",
+    "warning_texts",
+]
+
+Severity = Literal["error", "warning", "note"]
+Value = bool | int | float | str | None
+
+# What a summary shows of groups before it refers to the rest.
+FIRST_SHOWN: Final = 5
+_ORDER: Final = ("error", "warning", "note")
+_LONGEST: Final = 2000
+_CODE: Final = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_STEP: Final = re.compile(r"\{step(?:\[([^\]]+)\])?\}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosticSpec:
+    """One kind of thing to report.
+
+    In `text` and `remedy`, `{step}` stands for the name of the reporting step, and `{step[raster]}`
+    or `{step[raster.grid]}` for the step of that kind or method, so that a remedy can name a
+    setting as it is set: `{step[raster]}.margin_m=0.2`.
+
+    Attributes:
+        code: stable name that documents and tests refer to, e.g. `scan-without-colour`.
+        severity: `error` (the result is wrong), `warning` (it is limited) or `note`.
+        text: format string over the values and `{subject}`: what is wrong, with the numbers.
+        remedy: format string: what to do about it.
+        rank_by: name of the value by which the worst of a group is chosen, larger is worse; with
+            `-` before it smaller is worse.
+        settled_by: method ids or codes: a later step of such a method, or one that reports such a
+            code, settles it.
+    """
+
+    code: str
+    severity: Severity
+    text: str
+    remedy: str = ""
+    rank_by: str = ""
+    settled_by: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not _CODE.fullmatch(self.code):
+            raise ProductError(
+                f"the code of a diagnostic is lower-case words with `-` between, got {self.code!r}"
+            )
+        if self.severity not in _ORDER:
+            raise ProductError(
+                f"the severity of {self.code} must be error, warning or note, got {self.severity!r}"
+            )
+
+    def of(self, subject: str, values: Mapping[str, object]) -> Diagnostic:
+        """Fill in values.
+
+        Raises:
+            ProductError: the text names a value that is not given, or one is no number or text.
+        """
+        fields = {**values, "subject": subject, "step": _StepPlaceholder()}
+        try:
+            text, remedy = (
+                _FORMATTER.vformat(template, (), fields) for template in (self.text, self.remedy)
+            )
+        except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+            raise ProductError(
+                f"diagnostic {self.code} cannot be written: {type(error).__name__}: {error}; it "
+                f"was given {', '.join(values) or 'no values'}"
+            ) from error
+        plain = {name: _plain(self.code, name, value) for name, value in values.items()}
+        rank = plain.get(self.rank_by.removeprefix("-"))
+        if self.rank_by and (isinstance(rank, str) or rank is None):
+            raise ProductError(f"diagnostic {self.code} is ranked by {self.rank_by}, got {rank!r}")
+        return Diagnostic(
+            code=self.code,
+            severity=self.severity,
+            subject=_line(subject),
+            values=plain,
+            text=_line(text),
+            remedy=_line(remedy),
+            rank_by=self.rank_by,
+            settled_by=self.settled_by,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosticGroup:
+    """Diagnostics of one code.
+
+    Attributes:
+        worst: the one with the worst value.
+        count: how many there are.
+        subjects: of the others, each once, in their order.
+        places: addresses of the cells that reported them, that of the worst first, each once.
+    """
+
+    worst: Diagnostic
+    count: int
+    subjects: tuple[str, ...]
+    places: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The worst of them, how many there are, what else they are about, and what to do."""
+        text = self.worst.text
+        # The same of one subject in several combinations is one thing.
+        if self.count > 1 and (self.subjects or self.count > len(self.places)):
+            also = f"; also {first_few(self.subjects)}" if self.subjects else ""
+            text = f"{text} ({'the worst of ' if self.worst.rank_by else ''}{self.count}{also})"
+        return f"{text}: {self.worst.remedy}" if self.worst.remedy else text
+
+    @property
+    def where(self) -> str:
+        """The first of the places, and how many more there are."""
+        return first_few(self.places, most=1)
+
+
+def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup, ...]:
+    """Group diagnostics by code, most harmful first.
+
+    Args:
+        reported: address of the cell and what it reported, in the order of the run.
+
+    Returns:
+        A group per code (those without a code of their own: per text), by severity, then those
+        with a remedy, then the frequent ones, then in the order of the run.
+    """
+    groups: dict[tuple[str, str], list[tuple[str, Diagnostic]]] = {}
+    for place, one in reported:
+        key = (one.code, one.text if one.code == PLAIN_WARNING.code else "")
+        groups.setdefault(key, []).append((place, one))
+    found = [_group(members) for members in groups.values()]
+    return tuple(
+        sorted(
+            found,
+            key=lambda group: (
+                _ORDER.index(group.worst.severity),
+                not group.worst.remedy,
+                -group.count,
+            ),
+        )
+    )
+
+
+def unique(reported: Iterable[Diagnostic]) -> list[Diagnostic]:
+    """Return each of some diagnostics once."""
+    found: list[Diagnostic] = []
+    for one in reported:
+        if one not in found:
+            found.append(one)
+    return found
+
+
+def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
+    """Return the sentences of all that is more than a note, with their remedies, each once."""
+    return tuple(
+        dict.fromkeys(
+            f"{one.text}: {one.remedy}" if one.remedy else one.text
+            for one in reported
+            if one.severity != "note"
+        )
+    )
+
+
+def first_few(names: Sequence[str], most: int = 3) -> str:
+    """Name the first few, and count the others.
+
+    >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
+    ('a, b, c and 2 more', 'a and 1 more')
+    """
+    n_more = len(names) - most
+    named = ", ".join(names[:most])
+    return f"{named} and {n_more} more" if n_more > 0 else named
+
+
+class Ref(Protocol):
+    """A product by its content."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the content."""
+
+
+class ReportingCell(Protocol):
+    """A cell with its outcome, of a run or a record."""
+
+    @property
+    def address(self) -> str:
+        """Of the cell."""
+
+    @property
+    def method(self) -> str:
+        """Id of its method."""
+
+    @property
+    def status(self) -> str:
+        """`ok`, `failed` or `skipped`."""
+
+    @property
+    def diagnostics(self) -> Sequence[Diagnostic]:
+        """What it reported."""
+
+    # Any: a mapping of protocols is not one of classes that fulfil them.
+    @property
+    def inputs(self) -> Mapping[str, Any]:
+        """Products that it took, with a `digest`."""
+
+    @property
+    def outputs(self) -> Mapping[str, Any]:
+        """Products that it made, with a `digest`."""
+
+
+def standing(cells: Iterable[ReportingCell]) -> tuple[tuple[str, Diagnostic], ...]:
+    """Return address and diagnostic of all that no later step has settled."""
+    cells = tuple(cells)
+    settled = {
+        (given.digest, name)
+        for cell in cells
+        if cell.status == "ok"
+        for name in (cell.method, *(one.code for one in cell.diagnostics))
+        for given in cell.inputs.values()
+    }
+    return tuple(
+        (cell.address, one)
+        for cell in cells
+        for one in cell.diagnostics
+        if not any(
+            (made.digest, name) in settled
+            for name in one.settled_by
+            for made in cell.outputs.values()
+        )
+    )
+
+
+def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
+    """Return a look-up of steps by method or kind, for `placed`.
+
+    Args:
+        steps: name of a step and id of its method, of all cells.
+    """
+    found: dict[str, set[str]] = {}
+    for step, method in steps:
+        for name in (method, method.partition(".")[0]):
+            found.setdefault(name, set()).add(step)
+    # Of two steps of a kind nobody can know which is meant.
+    return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
+
+
+def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnostic:
+    """Put the names of steps into the texts of a diagnostic.
+
+    Results are shared between workflows, whose steps may have other names: so they are put in when
+    a result is used, not when it is made.
+    """
+
+    def name(found: re.Match[str]) -> str:
+        return step_of(found[1]) if found[1] else step
+
+    return replace(one, text=_STEP.sub(name, one.text), remedy=_STEP.sub(name, one.remedy))
+
+
+class _StepPlaceholder:
+    def __str__(self) -> str:
+        return "{step}"
+
+    def __format__(self, form: str) -> str:
+        return str(self)
+
+    def __getitem__(self, name: str) -> str:
+        return f"{{step[{name}]}}"
+
+
+_FORMATTER: Final = string.Formatter()
+# Of `ctx.warn`, whose text is all that is known.
+PLAIN_WARNING: Final = DiagnosticSpec(code="warning", severity="warning", text="{text}")
+TOO_MANY: Final = DiagnosticSpec(
+    code="more-diagnostics",
+    severity="note",
+    text="{n:,} more diagnostics of this step are not kept",
+    rank_by="n",
+)
+
+
+def _line(text: str) -> str:
+    line = shown(" ".join(text[: _LONGEST + 1].split()))
+    return line if len(text) <= _LONGEST else f"{line[:_LONGEST]}... ({len(text)} characters)"
+
+
+def _plain(code: str, name: str, value: object) -> Value:
+    # Numbers of numpy, which has no place here.
+    item = getattr(value, "item", None)
+    plain = item() if callable(item) and getattr(value, "ndim", 1) == 0 else value
+    if isinstance(plain, float) and not math.isfinite(plain):
+        return None
+    if isinstance(plain, str):
+        return _line(plain)
+    if plain is None or isinstance(plain, bool | int | float):
+        return plain
+    raise ProductError(
+        f"value {name} of diagnostic {code} must be a number or a text, got {type(value).__name__}"
+    )
+
+
+def _group(members: Sequence[tuple[str, Diagnostic]]) -> DiagnosticGroup:
+    place, worst = max(members, key=lambda member: _harm(member[1]))
+    others = dict.fromkeys(one.subject for _, one in members if one.subject != worst.subject)
+    return DiagnosticGroup(
+        worst=worst,
+        count=len(members),
+        subjects=tuple(filter(None, others)),
+        places=tuple(dict.fromkeys((place, *(place for place, _ in members)))),
+    )
+
+
+def _harm(one: Diagnostic) -> float:
+    value = one.values.get(one.rank_by.removeprefix("-"))
+    if not isinstance(value, int | float):
+        return -math.inf
+    return -value if one.rank_by.startswith("-") else float(value)
