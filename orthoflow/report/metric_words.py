@@ -212,6 +212,7 @@ WORDS: Final[Mapping[str, str]] = {
     "measured_share": "cells with a measured depth",
     "recovered_share": "cells recovered between measured ones",
     "void_behind_share": "cells whose points lie behind the buffer",
+    "void_before_share": "cells behind what stands before the buffer",
     "void_hidden_share": "cells hidden by what stands between them and the scanner",
     "void_sparse_share": "cells beside scanned ones: gaps, shadows of relief, rims",
     "void_unseen_share": "cells of glass, or that no station sees",

@@ -1,4 +1,4 @@
-"""Why cells of a wall are empty: behind the buffer, hidden, beside scanned cells, or never seen."""
+"""Why cells of a wall are empty: before or behind the buffer, hidden, beside points, unseen."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from orthoflow_plugins.raster.sampled_points import SampledPoints, points_in
 _TILE_M: Final = 0.05
 # As many points of the sample as make a surface.
 _POINTS_LEAST: Final = 2
-# What lies farther behind a wall is another room or the street; what stands farther before it than
-# this hides it only where a station is known to look past.
+# What lies farther behind a wall is another room or the street; what stands farther before it, as
+# a portico or a balcony, hides it only where a station is known to look past.
 _BEHIND_MOST_M: Final = 4.0
-_BEFORE_MOST_M: Final = 1.0
+_BEFORE_MOST_M: Final = 5.0
+# A buffer is to take in so much of what stands before a wall.
+_BEFORE_PERCENT: Final = 95.0
 # Rays from the wall to the stations: side of a voxel, how many there are and along one axis, how
 # far both ends are left out, and how many tiles are asked.
 _VOXEL_M: Final = 0.1
@@ -39,13 +41,17 @@ class Emptiness:
     Attributes:
         behind_share: what was scanned there lies behind the buffer.
         behind_m: how far behind the plane, median; NaN where nothing does.
-        hidden_share: something stands before the wall.
+        before_share: something stands right before the wall, beyond the buffer.
+        before_m: how far before the plane 95 % of that is; NaN where nothing does.
+        hidden_share: something stands between the wall and every scanner.
         sparse_share: points of the wall lie about the cell: in gaps, shadows of relief, rims.
         unseen_share: nothing was scanned there.
     """
 
     behind_share: float
     behind_m: float
+    before_share: float
+    before_m: float
     hidden_share: float
     sparse_share: float
     unseen_share: float
@@ -53,7 +59,8 @@ class Emptiness:
     @property
     def share(self) -> float:
         """Share of all empty cells."""
-        return self.behind_share + self.hidden_share + self.sparse_share + self.unseen_share
+        around = self.behind_share + self.before_share
+        return around + self.hidden_share + self.sparse_share + self.unseen_share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,40 +81,51 @@ class Sight:
         return _Room.of(self.points)
 
 
-def emptiness_of(wall: Wall, slab: Slab, sight: Sight, *, threads: int) -> Emptiness:
+def emptiness_of(
+    wall: Wall, slab: Slab, sight: Sight, *, free_m: float = math.inf, threads: int
+) -> Emptiness:
     """Tell why cells of a wall are empty.
 
     Args:
         wall: the wall.
         slab: its raster and buffer.
         sight: what was scanned.
+        free_m: what stands farther before the wall belongs to what faces it.
         threads: how many threads work.
     """
     points = sight.points
     tiles = _tiles(wall, points)
     n_void = tiles.n_void
-    reach = Slab(frame=tiles.frame, front_m=_BEFORE_MOST_M, behind_m=_BEHIND_MOST_M)
+    before_m = min(_BEFORE_MOST_M, free_m)
+    reach = Slab(frame=tiles.frame, front_m=before_m, behind_m=_BEHIND_MOST_M)
     around = points_in(points, reach, threads=threads)
     is_behind, is_before = around.depth_m < -slab.behind_m, around.depth_m > slab.front_m
     n_behind = np.bincount(around.cells[is_behind], minlength=n_void.size).reshape(n_void.shape)
     n_before = np.bincount(around.cells[is_before], minlength=n_void.size).reshape(n_void.shape)
     is_sparse = tiles.n_measured > 0
-    is_hidden = ~is_sparse & (n_before >= _POINTS_LEAST)
-    open_tiles = np.flatnonzero((n_void > 0) & ~is_sparse & ~is_hidden)
+    is_before_tile = ~is_sparse & (n_before >= _POINTS_LEAST)
+    is_hidden = np.zeros(is_sparse.shape, dtype=np.bool_)
+    open_tiles = np.flatnonzero((n_void > 0) & ~is_sparse & ~is_before_tile)
     if sight.stations is not None and len(sight.stations) and len(open_tiles):
         blocked = _blocked(tiles.frame, open_tiles, sight, sight.stations)
         is_hidden.ravel()[open_tiles] |= blocked
-    is_behind_tile = ~is_sparse & ~is_hidden & (n_behind >= _POINTS_LEAST)
+    is_behind_tile = ~is_sparse & ~is_before_tile & ~is_hidden & (n_behind >= _POINTS_LEAST)
+    stands = is_before_tile.ravel()[around.cells] & is_before
+    # Of tiles with some void cells only.
+    stands &= (n_void > 0).ravel()[around.cells]
+    far_m = np.percentile(around.depth_m[stands], _BEFORE_PERCENT) if stands.any() else math.nan
     of_tile = is_behind_tile.ravel()[around.cells] & is_behind
     behind_m = -float(np.median(around.depth_m[of_tile])) if of_tile.any() else math.nan
-    is_unseen = ~is_sparse & ~is_hidden & ~is_behind_tile
-    behind, hidden, sparse, unseen = (
+    is_unseen = ~is_sparse & ~is_before_tile & ~is_hidden & ~is_behind_tile
+    behind, before, hidden, sparse, unseen = (
         float(n_void[of].sum()) / wall.mask.size
-        for of in (is_behind_tile, is_hidden, is_sparse, is_unseen)
+        for of in (is_behind_tile, is_before_tile, is_hidden, is_sparse, is_unseen)
     )
     return Emptiness(
         behind_share=behind,
         behind_m=behind_m,
+        before_share=before,
+        before_m=float(far_m),
         hidden_share=hidden,
         sparse_share=sparse,
         unseen_share=unseen,

@@ -46,6 +46,16 @@ _STRAY_SHARE: Final = 0.02
 # So far beyond is looked too: what goes on there, as the cornices of adjoining walls and the sides
 # of furniture do, has no front within reach that a buffer could take in.
 _BEYOND_MOST_M: Final = 0.1
+# What stands farther before a wall and hangs together with it, as a fountain before its facade,
+# belongs to it where it covers so much of the wall that nothing else does, up to here, and no
+# farther than halfway to a surface that faces the wall or to a scanner.
+_FAR_FRONT_MOST_M: Final = 3.0
+_FAR_SHARE_LEAST: Final = 0.03
+_HALFWAY: Final = 0.5
+_FACING_COSINE: Final = -0.7
+_UPRIGHT_SINE: Final = math.sin(math.radians(10.0))
+# So near to the lowest and the highest points before a wall, ground and ceiling join everything.
+_GROUND_M: Final = 0.15
 # Relief that covers less than this share of the wall decides no buffer.
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
@@ -127,7 +137,13 @@ class Reach:
 
 
 def extent_of(
-    points: SampledPoints, planes: Planes, index: int, reach: Reach, *, threads: int
+    points: SampledPoints,
+    planes: Planes,
+    index: int,
+    reach: Reach,
+    *,
+    stations: NDArray[np.float64] | None = None,
+    threads: int,
 ) -> Extent:
     """Find how far the wall of a plane reaches.
 
@@ -136,6 +152,7 @@ def extent_of(
         planes: all that were found.
         index: of the wall's plane.
         reach: of the wall in depth.
+        stations: (k, 3) world, where scanners stood; None where that is not known.
         threads: how many threads work.
     """
     search = _Search.of(points, planes, index, reach)
@@ -147,6 +164,10 @@ def extent_of(
     if reach.front_m is None:
         relief_m = _relief_m(surface.front_m, _FRONT_MOST_M, search)
         front_m = max(front_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _FRONT_MOST_M))
+        far_m = _far_front_m(
+            points, planes, index, search, stations, near_m=front_m, threads=threads
+        )
+        front_m = max(front_m, far_m)
     if reach.behind_m is None:
         relief_m = _relief_m(-surface.behind_m, _BEHIND_MOST_M, search)
         behind_m = max(behind_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _BEHIND_MOST_M))
@@ -272,6 +293,82 @@ class _Surface:
     front_m: NDArray[np.float64]
     behind_m: NDArray[np.float64]
     is_own: NDArray[np.bool_]
+
+
+def _far_front_m(
+    points: SampledPoints,
+    planes: Planes,
+    index: int,
+    search: _Search,
+    stations: NDArray[np.float64] | None,
+    *,
+    near_m: float,
+    threads: int,
+) -> float:
+    """How far before a wall stands what hangs together with it and hides much of it; 0 for none.
+
+    Args:
+        points: of the cloud.
+        planes: all that were found.
+        index: of the wall's plane.
+        search: of the wall.
+        stations: (k, 3) world, or None.
+        near_m: nearer relief is the wall's in any case.
+        threads: how many threads work.
+    """
+    from scipy import ndimage
+
+    # On floors stands what is no part of them.
+    is_upright = abs(float(planes.normal[index] @ planes.up)) < _UPRIGHT_SINE
+    most_m = min(_FAR_FRONT_MOST_M, free_before_m(planes, index, stations))
+    if not is_upright or most_m <= near_m + _BEYOND_RELIEF_M:
+        return 0.0
+    far = replace(search, slab=replace(search.slab, front_m=most_m))
+    inside = _without_ground(points_in(points, far.slab, threads=threads), far, near_m)
+    surface = _surface(inside, far)
+    if surface is None:
+        return 0.0
+    is_far = surface.front_m > near_m
+    is_far &= ~(surface.behind_m <= near_m)
+    # Sides of what goes on, as of adjoining walls, are thin from here.
+    is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
+    rows, columns = far.inside
+    gained_m = surface.front_m[rows, columns][is_far[rows, columns]]
+    n_wall = (rows.stop - rows.start) * (columns.stop - columns.start)
+    if gained_m.size < _FAR_SHARE_LEAST * n_wall:
+        return 0.0
+    reach_m = float(np.quantile(gained_m, 1.0 - _STRAY_SHARE)) + 0.5 * _DEPTH_STEP_M
+    return min(round(reach_m + _BEYOND_RELIEF_M, 3), most_m)
+
+
+def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | None) -> float:
+    """Halfway from a wall to the nearest surface that faces it, or to a scanner before it, metres.
+
+    What stands farther before it may as well belong to what faces it; infinite without any.
+    """
+    normal, offset_m = planes.normal[index], float(planes.offset[index])
+    distances_m = [math.inf]
+    for other in range(len(planes)):
+        if float(planes.normal[other] @ normal) < _FACING_COSINE:
+            depths_m = planes.corners[other] @ normal - offset_m
+            distances_m.append(float(depths_m.max()))
+    if stations is not None and len(stations):
+        distances_m += (stations @ normal - offset_m).tolist()
+    return _HALFWAY * min(distance_m for distance_m in distances_m if distance_m > 0.0)
+
+
+def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> PointsInside:
+    """Leave out ground and ceiling before a wall, which join what stands there with it."""
+    _, down_m = search.places_m(inside)
+    is_before = inside.depth_m > near_m
+    if not is_before.any():
+        return inside
+    highest_m, lowest_m = np.quantile(down_m[is_before], (0.005, 0.995))
+    is_level = (down_m < highest_m + _GROUND_M) | (down_m > lowest_m - _GROUND_M)
+    kept = ~(is_before & is_level)
+    return PointsInside(
+        places=inside.places[kept], depth_m=inside.depth_m[kept], cells=inside.cells[kept]
+    )
 
 
 def _surface(inside: PointsInside, search: _Search) -> _Surface | None:

@@ -27,7 +27,7 @@ from orthoflow_plugins.raster.crops import (
     cropped,
 )
 from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
-from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
+from orthoflow_plugins.raster.extents import Extent, Reach, extent_of, free_before_m
 from orthoflow_plugins.raster.maps import mapped
 from orthoflow_plugins.raster.reporting import (
     report,
@@ -70,7 +70,7 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 9
+    result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_walls",
@@ -108,8 +108,9 @@ class RasterGrid(Method):
             default=None,
             gt=0,
             description="Points so far from the plane, on both sides, count; unset, as far as the "
-            "relief that hangs together with the wall, 0.5 m in front and 1 m behind at most, and "
-            "at least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm).",
+            "relief that is connected to the wall, 0.5 m in front and 1 m behind at most, and at "
+            "least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm); 3 m in "
+            "front of an upright wall, where what is connected to it hides 3 % of it.",
         )
         buffer_front_m: float | None = Field(
             default=None, ge=0, description="Reach towards the viewer instead of buffer_m."
@@ -242,7 +243,7 @@ class RasterGrid(Method):
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         points = sampled(cloud)
-        extent_of = _extents(points, planes, params, ctx)
+        extent_of = _extents(points, planes, cloud.stations, params, ctx)
         crops, covered = _crops(planes, params, extent_of, ctx)
         slabs = _slabs(params, crops, extent_of)
         rule = _raster_rule(params, threads=ctx.cores)
@@ -264,7 +265,10 @@ class RasterGrid(Method):
                     allocate=partial(_allocated, ctx, k),
                 )
             )
-            empty.append(emptiness_of(rasters[-1].wall, slab, sight, threads=ctx.cores))
+            free_m = free_before_m(planes, index, cloud.stations)
+            empty.append(
+                emptiness_of(rasters[-1].wall, slab, sight, free_m=free_m, threads=ctx.cores)
+            )
             outline_px = crops[index].outline_px
             if outline_px is not None:
                 blank_outside(rasters[-1].wall, outline_px)
@@ -297,7 +301,11 @@ class RasterGrid(Method):
 
 
 def _extents(
-    points: SampledPoints, planes: Planes, params: RasterGrid.Params, ctx: StepContext
+    points: SampledPoints,
+    planes: Planes,
+    stations: NDArray[np.float64] | None,
+    params: RasterGrid.Params,
+    ctx: StepContext,
 ) -> ExtentOf:
     """How far the wall of each plane reaches, found when it is asked for."""
     reach = Reach(
@@ -310,7 +318,7 @@ def _extents(
 
     @cache
     def extent(index: int) -> Extent:
-        found = extent_of(points, planes, index, reach, threads=ctx.cores)
+        found = extent_of(points, planes, index, reach, stations=stations, threads=ctx.cores)
         return (
             found if params.rectangle == "room" else replace(found, growth_m=(0.0,) * 4, cut_m={})
         )

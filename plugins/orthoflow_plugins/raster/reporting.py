@@ -143,7 +143,7 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
     """Tell why cells are empty: in numbers, and in words where it is many of a wall."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
-    for cause in ("behind", "hidden", "sparse", "unseen"):
+    for cause in ("behind", "before", "hidden", "sparse", "unseen"):
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
@@ -165,9 +165,14 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
             "raise buffer_behind_m if that is the wall",
         ),
         (
+            empty.before_share,
+            f"lie behind what stands up to {empty.before_m:.1f} m before the plane and is left out",
+            f"buffer_front_m={_rounded_up(empty.before_m)} shows it as part of the wall",
+        ),
+        (
             empty.hidden_share,
             "are hidden by what stands between them and the scanner",
-            "scan from another station, or raise buffer_front_m if it is relief",
+            "scan from another station",
         ),
         (
             empty.sparse_share,
@@ -184,6 +189,11 @@ def _causes(empty: Emptiness, *, is_dense: bool) -> str:
         for share, what, advice in causes
         if share >= _SHARE_LEAST
     )
+
+
+def _rounded_up(depth_m: float) -> str:
+    """A buffer that takes in a depth, in whole decimetres."""
+    return f"{math.ceil(10.0 * depth_m) / 10.0:.1f}" if math.isfinite(depth_m) else ""
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

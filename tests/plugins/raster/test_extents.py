@@ -658,3 +658,81 @@ def test_voxels_are_as_fine_as_the_points_lie(
     np.testing.assert_allclose(corner, planes.corners[0, 0], atol=1e-9)
     inside: Any = SimpleNamespace(places=np.array([[n_beside + 2.0, n_beside + 1.0]]))
     np.testing.assert_allclose(search.places_m(inside)[:, 0], [2.0 * side_m, side_m])
+
+
+# A basin 2.4 m deep and 0.9 m high that stands before the middle of the wall, and hides that part.
+BASIN_X, BASIN_Z, BASIN_M = (1.2, 2.8), (0.3, 1.2), 2.4
+
+
+def basin(first_m: float = 0.0) -> tuple[NDArray, ...]:
+    """Its top and its front; from a depth on."""
+    top = patch(BASIN_X, (first_m, BASIN_M), (BASIN_Z[1], BASIN_Z[1]))
+    front = patch(BASIN_X, (BASIN_M, BASIN_M), BASIN_Z)
+    sides = [patch((x, x), (first_m, BASIN_M), BASIN_Z) for x in BASIN_X]
+    return top, front, *sides
+
+
+def wall_behind_the_basin() -> NDArray:
+    points = wall()
+    x, z = points[:, 0], points[:, 2]
+    hidden = (x > BASIN_X[0]) & (x < BASIN_X[1]) & (z > BASIN_Z[0]) & (z < BASIN_Z[1])
+    return points[~hidden]
+
+
+@pytest.mark.parametrize(
+    ("case", "front_m"),
+    [
+        ("joined to the wall", BASIN_M),
+        ("apart from it", 0.0),
+        ("joined by the ground", 0.0),
+        ("before a wall that faces it", 0.0),
+        ("before a scanner", 0.0),
+        ("set", 0.3),
+    ],
+)
+def test_what_stands_far_before_a_wall_belongs_to_it_where_it_hangs_together_with_it(
+    tmp_path: Path, case: str, front_m: float
+) -> None:
+    is_apart = case in {"apart from it", "joined by the ground"}
+    patches = [wall_behind_the_basin(), *basin(1.0 if is_apart else 0.0)]
+    if case == "joined by the ground":
+        patches.append(patch((0.0, WIDTH_M), (0.0, 2.9), (0.0, 0.0)))
+        patches.append(patch(BASIN_X, (BASIN_M, BASIN_M), (0.0, BASIN_Z[0])))
+    facing = np.array(
+        [[0, -3.0, HEIGHT_M], [0, -3.0, 0], [WIDTH_M, -3, 0], [WIDTH_M, -3, HEIGHT_M]]
+    )
+    others = [(np.array([0.0, 1.0, 0.0]), facing)] if "faces" in case else []
+    planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), *others)
+    cloud = scanned(*patches)
+    if case == "before a scanner":
+        cloud = replace(cloud, stations=np.array([[2.0, -4.0, 1.5]]))
+    params = {"buffer_front_m": 0.3} if case == "set" else {}
+    walls = laid(cloud, planes, tmp_path, **params)
+    found_m = walls.slab(0).front_m
+    if front_m == BASIN_M:
+        assert found_m == pytest.approx(BASIN_M, abs=0.06)
+        middle = walls.walls[0].depth_m[int((HEIGHT_M - 0.7) / GSD_M), int(2.0 / GSD_M)]
+        assert middle == pytest.approx(BASIN_M, abs=0.01)
+    elif front_m:
+        assert found_m == front_m
+    else:
+        assert found_m <= 0.5
+
+
+def test_what_stands_on_a_floor_is_no_part_of_it(tmp_path: Path) -> None:
+    floor = np.array([[0.0, 4, 0], [0, 0, 0], [4, 0, 0], [4, 4, 0]])
+    planes = samples.planes(
+        normal=np.array([[0.0, 0.0, 1.0]]),
+        offset=np.zeros(1),
+        corners=floor[None],
+        n_points=np.array([100_000]),
+        rms_m=np.full(1, NOISE_M),
+        names=("floor 0",),
+    )
+    step = np.arange(0.0, 4.0, 0.01)
+    x, y = (axis.ravel() for axis in np.meshgrid(step, step))
+    points = np.column_stack([x, y, np.zeros(x.size)])
+    chest = (x > 1.0) & (x < 2.5) & (y > 1.0) & (y < 2.5)
+    points[chest, 2] = 1.2
+    cloud = scenes.cloud_of(points + np.random.default_rng(1).normal(0, NOISE_M, points.shape))
+    assert laid(cloud, planes, tmp_path).slab(0).front_m <= 0.5

@@ -155,11 +155,18 @@ def test_cells_that_are_advised_are_no_longer_too_fine(listener: Listener) -> No
 
 
 def emptiness(
-    *, behind: float = 0.0, hidden: float = 0.0, sparse: float = 0.0, unseen: float = 0.0
+    *,
+    behind: float = 0.0,
+    before: float = 0.0,
+    hidden: float = 0.0,
+    sparse: float = 0.0,
+    unseen: float = 0.0,
 ) -> Emptiness:
     return Emptiness(
         behind_share=behind,
         behind_m=0.4321 if behind else math.nan,
+        before_share=before,
+        before_m=2.7654 if before else math.nan,
         hidden_share=hidden,
         sparse_share=sparse,
         unseen_share=unseen,
@@ -186,6 +193,7 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(listener: 
     assert listener.metrics == pytest.approx(
         {
             "void_behind_share": 0.03,
+            "void_before_share": 0.0,
             "void_hidden_share": 0.02,
             "void_sparse_share": 0.0,
             "void_unseen_share": 0.0375,
