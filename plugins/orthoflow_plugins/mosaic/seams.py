@@ -42,6 +42,7 @@ from orthoflow_plugins.mosaic.agreement import (
     seam_steps,
 )
 from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
+from orthoflow_plugins.mosaic.consensus import consensus
 from orthoflow_plugins.mosaic.drawn_seams import read_seams, seams_of
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow_plugins.mosaic.joining import (
@@ -73,6 +74,7 @@ _NAMED_RGB: Final = {
 _TINT: Final = 0.45
 # Empty cells are told of in words where photos lack so many of a wall, and causes of so many.
 _EMPTY_WORTH_WORDS: Final = 0.1
+_CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
 
 
@@ -87,6 +89,9 @@ class MosaicSeams(Method):
     `voronoi` lays seams into the middle of overlaps, `graph-cut` where photos look alike and, with
     the walls wired, off their depth edges; `priority` goes by a given order of photos. How far the
     photos of an overlap lie apart, and how far colours step along the seams, is reported.
+
+    Where photos contradict each other over a region, a photo that others and the scan's colours
+    bear out paints it (`robust`): who passes by in one photo is left out.
 
     Colours are balanced unless `gains: none`: an exposure per photo, what its lens loses towards
     the corners (with the cameras wired), a smooth field per photo, and what is left near seams.
@@ -118,6 +123,8 @@ class MosaicSeams(Method):
         "overlap_v_rms_cells",
         "overlap_u_rms_mm",
         "overlap_v_rms_mm",
+        "outvoted_share",
+        "contradicted_share",
         # Of the walls that were checked, all together.
         "expected_mm_median",
         "expected_mm_p95",
@@ -161,6 +168,11 @@ class MosaicSeams(Method):
             "where it sees them too; 1 keeps every cell's best view.",
         )
 
+        robust: bool = Field(
+            default=True,
+            description="Where photos contradict each other over a region, as with people and "
+            "vehicles that pass, one that most others and the scan bear out paints it.",
+        )
         publish_layers: bool = Field(
             default=False,
             description="Publish what each photo shows by itself, too, as GeoTIFFs of their own.",
@@ -238,6 +250,8 @@ class _Joined:
         n_edge_seam: cells of seams at depth edges, None when the surface is not known.
         untouched: the same of the photos as they are.
         balance: how colours were balanced, None where they are untouched.
+        n_outvoted: cells that another photo showed otherwise than the one that paints them.
+        n_contradicted: cells that one photo alone shows, and the scan otherwise.
     """
 
     image: Orthoimage
@@ -247,6 +261,8 @@ class _Joined:
     n_edge_seam: int | None
     untouched: SeamSteps
     balance: Balance | None
+    n_outvoted: int = 0
+    n_contradicted: int = 0
 
     @property
     def gains(self) -> dict[str, JsonValue]:
@@ -299,6 +315,10 @@ def _join(
     if params.gains != "none" and len(painters) > 1:
         cameras = [surroundings.cameras.get(layer.source) for layer in painters]
         balance = balance_of(painters, wall, cameras, is_local=params.local_balance)
+    agreed = None
+    if params.robust and painters:
+        agreed = consensus(painters, wall, balance, allocate=allocate)
+        painters = list(agreed.layers)
     wish = SeamWish(
         rule=params.seams,
         priority=params.priority,
@@ -335,6 +355,8 @@ def _join(
         n_seam=n_seam,
         n_edge_seam=None if wall is None else n_edge_seam,
         balance=balance,
+        n_outvoted=0 if agreed is None else agreed.n_outvoted,
+        n_contradicted=0 if agreed is None else agreed.n_contradicted,
     )
 
 
@@ -473,6 +495,17 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         if any(item.balance is not None for item in verdicts):
             untouched = np.concatenate([item.untouched.delta_e for item in verdicts])
             ctx.metric("seam_step_untouched_delta_e", float(untouched.mean()), "1")
+    n_cells = sum(item.image.mask.size for item in verdicts)
+    ctx.metric("outvoted_share", sum(item.n_outvoted for item in verdicts) / n_cells, "1")
+    ctx.metric("contradicted_share", sum(item.n_contradicted for item in verdicts) / n_cells, "1")
+    for item in verdicts:
+        share = item.n_contradicted / item.image.mask.size
+        if share >= _CONTRADICTED_WORTH_WORDS:
+            ctx.warn(
+                f"{item.image.name}: {share:.1%} of its cells are shown by one photo alone, and "
+                "the scan has another colour there: something that passed by may be painted; take "
+                "a second photo of it, or give seams"
+            )
     _report_errors(ctx, [item.image for item in verdicts])
     _report_gains(ctx, verdicts)
 

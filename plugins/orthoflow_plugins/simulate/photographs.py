@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_jpeg
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
     Calibration,
     Camera,
@@ -41,6 +42,13 @@ _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
+# Lowest and highest of legs and of the upper body, over the room's origin, and half their widths.
+_BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
+_ABSENT: Final = 0.5
+_OF_PEOPLE: Final = (
+    *("centre", "axis_a", "axis_b", "extent"),
+    *("plane_index", "role", "texture", "texture_params"),
+)
 # A focal length as files state it is off by up to so much.
 _EXIF_ERROR: Final = 0.02
 # Levels go about with this root of the light.
@@ -153,14 +161,72 @@ def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
     )
 
 
+def with_passers_by(
+    scene: Scene, n_photos: int, count: int, rng: np.random.Generator
+) -> tuple[Scene, ...]:
+    """Give the scene as each photo finds it, with people before the main wall; none without any.
+
+    Each is there in every other photo, somewhere along the wall and 0.5 to 1.4 m before it, and
+    keeps its clothes.
+    """
+    if not count:
+        return ()
+    # Of a stream of their own: without them photos stay what they were.
+    drawn = rng.spawn(1)[0]
+    clothes = drawn.uniform(15.0, 240.0, (count, 2, 3))
+    along, towards = main_wall_axes()
+    side = wall_sides(SceneDraft())[0]
+    scenes = []
+    for _ in range(n_photos):
+        rows: dict[str, list[object]] = {name: [] for name in _OF_PEOPLE}
+        for person in range(count):
+            place, before_m, is_there = (
+                drawn.uniform(-2.2, 2.2),
+                drawn.uniform(0.5, 1.4),
+                drawn.random() < 0.5,
+            )
+            if not is_there:
+                continue
+            foot = side.foot + place * along - before_m * towards
+            for (low, high, half), rgb in zip(_BODY_M, clothes[person], strict=True):
+                rows["centre"].append([foot[0], foot[1], 0.0])
+                rows["axis_a"].append(along)
+                rows["axis_b"].append(_UP)
+                rows["extent"].append([-half, half, low, high])
+                rows["plane_index"].append(-1)
+                rows["role"].append(SurfaceRole.OBJECT)
+                rows["texture"].append(TextureKind.PLAIN)
+                rows["texture_params"].append([*rgb, 0.5, 0.1, 0.3, 900.0 + person, 0.0])
+        scenes.append(_joined(scene, rows))
+    return tuple(scenes)
+
+
+def _joined(scene: Scene, rows: dict[str, list[object]]) -> Scene:
+    if not rows["centre"]:
+        return scene
+    joined = {}
+    for name, added in rows.items():
+        before = getattr(scene, name)
+        joined[name] = np.concatenate([before, np.array(added, dtype=before.dtype)])
+    return replace(scene, **joined)
+
+
 def take_photos(
-    views: SceneCameras,
+    views: SceneCameras | Sequence[SceneCameras],
     shots: tuple[Shot, ...],
     film: Film,
     ctx: StepContext,
     rng: np.random.Generator,
 ) -> Photos:
-    """Take all photos of a room in its own frame; what is known of the camera is not in them."""
+    """Take all photos of a room in its own frame; what is known of the camera is not in them.
+
+    Args:
+        views: the room, or as each of the photos finds it.
+        shots: the photos.
+        film: what they suffer from.
+        ctx: of the step.
+        rng: of all noise.
+    """
     if not shots:
         return Photos(photos=())
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
@@ -170,7 +236,8 @@ def take_photos(
     for place, shot in enumerate(shots):
         ctx.progress(0.5 + 0.5 * place / len(shots), f"photo {place + 1} of {len(shots)}")
         seed = int(rng.integers(0, 2**62))
-        image = views.expose(shot.camera, supersample=film.supersample, seed=seed)
+        view = views[place] if isinstance(views, Sequence) else views
+        image = view.expose(shot.camera, supersample=film.supersample, seed=seed)
         if film.exposures > 0.0:
             image *= np.float32(light[place] ** (1.0 / _GAMMA))
         photos.append(

@@ -20,6 +20,7 @@ from orthoflow_plugins.simulate.photographs import (
     calibration_of,
     planned_shots,
     take_photos,
+    with_passers_by,
 )
 from orthoflow_plugins.simulate.room_model import (
     MOST_TEXTILE,
@@ -178,6 +179,13 @@ class SimulateRoom(Method):
             le=0.9,
             description="Photos get between 1 less and 1 plus this times the light.",
         )
+        n_passers_by: int = Field(
+            0,
+            ge=0,
+            le=20,
+            description="People who walk before the main wall while photos are taken: each stands "
+            "elsewhere in every photo, or is not there. The scan knows nothing of them.",
+        )
         photo_supersample: int = Field(
             2, ge=1, le=8, description="A pixel is the mean of so many rays squared."
         )
@@ -259,10 +267,22 @@ class SimulateRoom(Method):
         )
         calibration = calibration_of(shots, is_known=params.calibrated)
         views = SceneCameras(room.scene, cores=ctx.cores)
-        photos = take_photos(views, shots, _film(params), ctx, photo_rng)
+        crowd = with_passers_by(room.scene, len(shots), params.n_passers_by, photo_rng)
+        photos = take_photos(
+            views if not crowd else [SceneCameras(scene, cores=ctx.cores) for scene in crowd],
+            shots,
+            _film(params),
+            ctx,
+            photo_rng,
+        )
         cloud = cloud_of(delivery)
         # Of rooms as they always were, records do not change.
-        added = {"decoration": "designed", "design_seed": None, "photo_exposure_share": 0.0}
+        added = {
+            "decoration": "designed",
+            "design_seed": None,
+            "photo_exposure_share": 0.0,
+            "n_passers_by": 0,
+        }
         left_out = {name for name, before in added.items() if getattr(params, name) == before}
         settings = params.model_dump(mode="json", exclude=left_out)
         truth = truth_of(delivery, cloud, shots, settings)

@@ -1,0 +1,325 @@
+"""Where photos contradict each other: passing people and vehicles lose to what others show.
+
+Photos of one place, and the scan's own colours, are witnesses of how light it is over blocks of
+some centimetres, once what is smooth between two of them (light, exposure) is taken out. A photo
+does not paint a region where another photo contradicts it that more witnesses bear out. Gloss
+differs, too; there, as everywhere, only another photo's colours take the place of a photo's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.bands import Allocate, row_bands
+from orthoflow.geometry.robust import NMAD_FACTOR
+from orthoflow.products import Layer, LayerMask, Wall
+from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means
+from orthoflow_plugins.mosaic.light import common, inside, light_of_levels
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.levels import Colours
+    from orthoflow_plugins.mosaic.balance import Balance
+
+# Sides of blocks: wider than photos lie apart, narrower than a limb.
+_BLOCK_M: Final = 0.025
+_BLOCK_CELLS: Final = (4, 32)
+_LEAST_PAINTED: Final = 0.5
+# Added to light, so that noise of what is almost black is no difference.
+_DARK: Final = 0.02
+# Two witnesses contradict each other where they differ by so much in the logarithm of light, and by
+# so many deviations of all blocks; a region has a core in which they differ by twice as much.
+_APART: Final = 0.25
+_DEVIATIONS: Final = 5.0
+_CORE_TIMES: Final = 2.0
+_LEAST_CORE_BLOCKS: Final = 6
+# What is smooth over so many blocks is light.
+_SMOOTH_BLOCKS: Final = 40.0
+_SMOOTH_SWEEPS: Final = 2
+# Regions: thinner ones are edges that do not fit; gaps of so many blocks close, and rims grow.
+_OPENING_BLOCKS: Final = 2
+_CLOSING_BLOCKS: Final = 5
+_GROWTH_BLOCKS: Final = 2
+# The grey of a laser bears witness where it goes with that of a photo so well.
+_LEAST_CORRELATION: Final = 0.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consensus:
+    """What is left of layers where others contradict them.
+
+    Attributes:
+        layers: the layers; what they are not to paint is as good as hidden from them.
+        n_outvoted: cells that a photo shows otherwise than the one that paints them now.
+        n_contradicted: cells that one photo alone shows, and the scan otherwise.
+    """
+
+    layers: tuple[Layer, ...]
+    n_outvoted: int
+    n_contradicted: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Witness:
+    """Logarithm of the light (r, c, 3) of the blocks in a box, NaN where a witness says nothing."""
+
+    box: Box
+    log_light: NDArray[np.float64]
+
+
+def consensus(
+    layers: Sequence[Layer], wall: Wall | None, balance: Balance | None, *, allocate: Allocate
+) -> Consensus:
+    """Take from each photo the regions in which better borne out photos contradict it.
+
+    Args:
+        layers: photos of one wall, all of which paint something.
+        wall: what the scan shows of it; None where that is not known.
+        balance: how the colours of the layers are balanced, or None.
+        allocate: gives the masks of changed layers, by name.
+    """
+    shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
+    side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
+    blocks = Blocks.over((shape[0], shape[1]), side)
+    witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
+    if balance is not None:
+        witnesses = [
+            _balanced(item, index, balance, blocks) for index, item in enumerate(witnesses)
+        ]
+    scan = None if wall is None else _scan(wall, blocks, witnesses)
+    everyone = [*witnesses, *([] if scan is None else [scan])]
+    supports, apart = _compared(everyone, len(layers), blocks)
+    outvoted = [
+        _regions(_contradicted(index, supports, apart, blocks)) for index in range(len(layers))
+    ]
+    kept, n_outvoted = _without(layers, outvoted, blocks, allocate)
+    n_alone = 0 if scan is None else _n_alone(witnesses, apart, blocks)
+    return Consensus(layers=kept, n_outvoted=n_outvoted, n_contradicted=n_alone * side * side)
+
+
+def _compared(
+    everyone: Sequence[_Witness], n_photos: int, blocks: Blocks
+) -> tuple[NDArray[np.int8], dict[tuple[int, int], NDArray[np.float64]]]:
+    """How many others bear out each photo in each block, and how far any two are apart.
+
+    Args:
+        everyone: the photos, and the scan behind them if it bears witness.
+        n_photos: how many of them are photos.
+        blocks: of the wall.
+    """
+    supports = np.zeros((n_photos, *blocks.shape), dtype=np.int8)
+    apart: dict[tuple[int, int], NDArray[np.float64]] = {}
+    for i in range(n_photos):
+        for j in range(i + 1, len(everyone)):
+            ratio = _apart(everyone[i], everyone[j], blocks)
+            if ratio is None:
+                continue
+            apart[i, j] = ratio
+            supports[i] += ratio <= 1.0
+            if j < n_photos:
+                supports[j] += ratio <= 1.0
+    return supports, apart
+
+
+def _contradicted(
+    photo: int,
+    supports: NDArray[np.int8],
+    apart: dict[tuple[int, int], NDArray[np.float64]],
+    blocks: Blocks,
+) -> NDArray[np.float64]:
+    """How far a photo is, in each block, from photos that are borne out better; 0 without any."""
+    worst = np.zeros(blocks.shape)
+    for other in range(len(supports)):
+        ratio = apart.get((min(photo, other), max(photo, other)))
+        if ratio is not None and other != photo:
+            wins = (supports[other] > supports[photo]) & np.isfinite(ratio)
+            worst = np.where(wins, np.fmax(worst, ratio), worst)
+    return worst
+
+
+def _n_alone(
+    photos: Sequence[_Witness],
+    apart: dict[tuple[int, int], NDArray[np.float64]],
+    blocks: Blocks,
+) -> int:
+    """How many blocks one photo alone shows, otherwise than the scan."""
+    shown = np.array([_known(item, blocks) for item in photos])
+    is_alone = shown.sum(axis=0) == 1
+    count = 0
+    for index, mine in enumerate(shown):
+        ratio = apart.get((index, len(photos)))
+        if ratio is not None:
+            alone = np.where(mine & is_alone, np.nan_to_num(ratio), 0.0)
+            count += int(np.count_nonzero(_regions(alone) & mine & is_alone))
+    return count
+
+
+def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Witness:
+    painted = block_means(lambda rows: is_painted[rows], blocks)
+    rows, columns = (np.flatnonzero((painted > 0.0).any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return _Witness(box=(slice(0, 0), slice(0, 0)), log_light=np.zeros((0, 0, 3)))
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    part = blocks.cells(box)
+    light = light_of_levels(int(np.iinfo(rgb.dtype).max))
+    own, shows, inner = rgb[part], is_painted[part], blocks.within(box)
+
+    def lit(channel: int, some: slice) -> NDArray[np.float32]:
+        return np.asarray(light[own[some][..., channel]] * shows[some], dtype=np.float32)
+
+    sums = np.stack([block_means(partial(lit, channel), inner) for channel in range(3)], axis=-1)
+    share = painted[box][..., None]
+    means = sums / np.maximum(share, 1e-6)
+    return _Witness(
+        box=box, log_light=np.where(share >= _LEAST_PAINTED, np.log(means + _DARK), np.nan)
+    )
+
+
+def _balanced(witness: _Witness, index: int, balance: Balance, blocks: Blocks) -> _Witness:
+    rows, columns = (
+        middles.astype(np.int64)[part]
+        for middles, part in zip(blocks.centres(), witness.box, strict=True)
+    )
+    at = [side.ravel() for side in np.broadcast_arrays(rows[:, None], columns)]
+    gains = balance.log_gains(index, at[0], at[1]).reshape(witness.log_light.shape)
+    light = (np.exp(witness.log_light) - _DARK) * np.exp(gains)
+    return replace(witness, log_light=np.log(np.maximum(light, 0.0) + _DARK))
+
+
+def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | None:
+    """The scan's colours, or its grey where it goes with that of the photos."""
+    if wall.rgb is not None and wall.rgb_mask is not None:
+        return _witness(wall.rgb, wall.rgb_mask > 0, blocks)
+    if wall.intensity is None:
+        return None
+    levels = np.rint(255.0 * np.clip(np.nan_to_num(wall.intensity), 0.0, 1.0)).astype(np.uint8)
+    grey = _witness(np.repeat(levels[..., None], 3, axis=2), np.isfinite(wall.intensity), blocks)
+    return _fitted(grey, photos)
+
+
+def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
+    """A grey on the scale of the photos' light, channel by channel; None where it is another."""
+    x, y = [], []
+    for photo in photos:
+        box = common(grey.box, photo.box)
+        if box is not None:
+            x.append(grey.log_light[inside(box, grey.box)][..., 0].ravel())
+            y.append(photo.log_light[inside(box, photo.box)].reshape(-1, 3))
+    if not x:
+        return None
+    given, shown = np.concatenate(x), np.concatenate(y)
+    known = np.isfinite(given) & np.isfinite(shown).all(axis=1)
+    if known.sum() < 100 or given[known].std() < 1e-6:
+        return None
+    given, shown = given[known], shown[known]
+    if np.corrcoef(given, shown.mean(axis=1))[0, 1] < _LEAST_CORRELATION:
+        return None
+    centred = given - given.mean()
+    slopes = centred @ (shown - shown.mean(axis=0)) / (centred @ centred)
+    values = shown.mean(axis=0) + slopes * (grey.log_light[..., :1] - given.mean())
+    return replace(grey, log_light=values)
+
+
+def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
+    known = np.zeros(blocks.shape, dtype=np.bool_)
+    known[witness.box] = np.isfinite(witness.log_light[..., 0])
+    return known
+
+
+def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
+    """How far two witnesses are apart in each block, 1 where they begin to contradict each other.
+
+    NaN where one says nothing; None where they share no block.
+    """
+    box = common(one.box, other.box)
+    if box is None:
+        return None
+    difference = (
+        one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
+    ).astype(np.float64)
+    known = np.isfinite(difference).all(axis=2)
+    if not known.any():
+        return None
+    difference[~known] = 0.0
+    rest = difference - np.median(difference[known], axis=0)
+    for _ in range(_SMOOTH_SWEEPS):
+        is_light = known & (np.abs(rest).max(axis=2) <= _CORE_TIMES * _APART)
+        rest = rest - _smooth(rest, is_light)
+    sizes = np.abs(rest).max(axis=2)
+    typical = NMAD_FACTOR * float(np.median(sizes[known]))
+    ratio = np.full(blocks.shape, np.nan)
+    ratio[box] = np.where(known, sizes / max(_APART, _DEVIATIONS * typical), np.nan)
+    return ratio
+
+
+def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Means (r, c, 3) of the used values about each block."""
+    import cv2
+
+    weights = cv2.GaussianBlur(is_used.astype(np.float64), (0, 0), _SMOOTH_BLOCKS)
+    sums = cv2.GaussianBlur(np.where(is_used[..., None], values, 0.0), (0, 0), _SMOOTH_BLOCKS)
+    return np.asarray(sums / np.maximum(weights, 1e-9)[..., None], dtype=np.float64)
+
+
+def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whole regions in which something is contradicted that has a core."""
+    import cv2
+
+    square = cv2.getStructuringElement(cv2.MORPH_RECT, (_OPENING_BLOCKS, _OPENING_BLOCKS))
+    is_apart = cv2.morphologyEx((ratio > 1.0).astype(np.uint8), cv2.MORPH_OPEN, square)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_BLOCKS, _CLOSING_BLOCKS))
+    closed = cv2.morphologyEx(is_apart, cv2.MORPH_CLOSE, disc)
+    count, labels = cv2.connectedComponents(closed, connectivity=8)
+    cores = np.bincount(labels[(ratio > _CORE_TIMES) & (is_apart > 0)], minlength=count)
+    is_thing = cores >= _LEAST_CORE_BLOCKS
+    is_thing[0] = False
+    side = 2 * _GROWTH_BLOCKS + 1
+    grown = cv2.dilate(
+        is_thing[labels].astype(np.uint8),
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)),
+    )
+    return grown > 0
+
+
+def _without(
+    layers: Sequence[Layer],
+    outvoted: Sequence[NDArray[np.bool_]],
+    blocks: Blocks,
+    allocate: Allocate,
+) -> tuple[tuple[Layer, ...], int]:
+    """The layers without their outvoted blocks where another paints; and how many cells that is."""
+    changed = [index for index, region in enumerate(outvoted) if region.any()]
+    if not changed:
+        return tuple(layers), 0
+    shape = layers[0].frame.shape
+    masks = {
+        index: np.asarray(allocate(f"consensus.{index}", shape, np.uint8), np.uint8)
+        for index in changed
+    }
+    n_outvoted = 0
+    of_row = np.repeat(np.arange(blocks.shape[0]), np.diff(blocks.rows))
+    of_column = np.repeat(np.arange(blocks.shape[1]), np.diff(blocks.columns))
+    for rows in row_bands(shape):
+        at = np.ix_(of_row[rows], of_column)
+        painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
+        is_out = [region[at] & shows for region, shows in zip(outvoted, painted, strict=True)]
+        stays = np.logical_or.reduce(
+            [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
+        )
+        for index in changed:
+            loses = is_out[index] & stays
+            masks[index][rows] = np.where(loses, LayerMask.OCCLUDED, layers[index].mask[rows])
+            n_outvoted += int(np.count_nonzero(loses))
+    return (
+        tuple(
+            replace(layer, mask=masks[index]) if index in masks else layer
+            for index, layer in enumerate(layers)
+        ),
+        n_outvoted,
+    )
