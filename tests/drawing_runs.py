@@ -129,15 +129,15 @@ def box_openings() -> Openings:
     Its second side was found in the photo, its third by nobody.
     """
     frame = wall_frame(box_planes())
-    places = np.array([[0.5, -0.6], [0.5, -1.8], [1.3, -1.8], [1.3, -0.6]])
+    cells = np.array([[0.5, 0.6], [0.5, 1.8], [1.3, 1.8], [1.3, 0.6]]) / GSD_M
     return Openings(
         openings=(
             Opening(
                 wall=WALL,
                 wall_name=f"wall {WALL}",
                 kind="niche",
-                outline_m=places,
-                outline_world=frame.world_from_wall(places * [1.0, -1.0] / GSD_M),
+                outline_m=frame.raster_from_wall(cells),
+                outline_world=frame.world_from_wall(cells),
                 side_sigma_m=np.array([0.003, 0.0015, np.nan, 0.003]),
                 side_source=np.array([0, 1, 2, 0], dtype=np.uint8),
                 depth_m=0.25,

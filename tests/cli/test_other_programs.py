@@ -91,7 +91,8 @@ def test_qgis_opens_orthoimage_and_vectors_in_the_same_coordinates(exported: Pat
     said = json.loads(done.stdout.splitlines()[-1])
     assert said["raster"][:3] == [True, 380, 230]
     wide, high = SIZE_M[0] - 0.2, SIZE_M[2] - 0.2
-    assert said["extent"] == pytest.approx([0.0, -high, wide, 0.0], abs=1e-9)
+    # Y is the height: the room begins at 100 m, the picture 10 cm above.
+    assert said["extent"] == pytest.approx([0.0, 100.1, wide, 100.1 + high], abs=1e-9)
     is_valid, kinds = said[f"wall_{WALL}.geojson"]
     assert is_valid
     assert kinds == {

@@ -335,7 +335,7 @@ def _images(run: Run, address: str) -> Sequence[Orthoimage]:
 def _lines(results: RoomResults) -> RoomLines | None:
     if results.planes is None:
         return None
-    return room_lines(results.planes, results.checkpoints, results.inspections, results.openings)
+    return room_lines(results.planes, results.checkpoints, results.openings)
 
 
 def _drawn(results: RoomResults, wall: WallResult, image: str) -> DrawnWall:

@@ -1,8 +1,10 @@
-"""CAD files: each wall in its own plane, and the room in space, in metres."""
+"""CAD files: each wall in its plane with grid, heights and dimensions, and the room in space."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,38 +12,64 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import StoreError
-from orthoflow.files.drawings.room_lines import DrawnWall, Residuals, RoomLines, edges_of
+from orthoflow.files.drawings.regular_openings import regular_opening
+from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
 from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts.layout import Modelspace
 
-# Name and colour, as CAD programs number them.
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A layer as the US National CAD Standard names it.
+
+    Attributes:
+        holds: what lies on it.
+        colour: as CAD programs number them.
+        weight: of its lines, hundredths of a millimetre, as ISO 128 grades them.
+    """
+
+    holds: str
+    colour: int
+    weight: int
+
+
+# Walls are elevations (A-ELEV), the room in space is a model of surfaces (A-WALL).
 LAYERS: Final = {
-    "IMAGE": 7,
-    "FRAME": 8,
-    "RECTANGLE": 3,
-    "PARTS": 9,
-    "EDGES": 1,
-    "CORNERS": 1,
-    "OPENINGS": 4,
-    "OUTLINE": 5,
-    "FACES": 252,
-    "CHECKPOINTS": 6,
-    "RESIDUALS": 30,
-    "TEXT": 7,
+    "A-ELEV-IMAG": Layer(holds="orthoimages", colour=7, weight=13),
+    "A-ELEV-OTLN": Layer(holds="outline of the orthoimage", colour=8, weight=13),
+    "A-ELEV-EDGE": Layer(holds="edges to neighbouring planes", colour=7, weight=35),
+    "A-ELEV-OPNG": Layer(holds="openings, regular", colour=4, weight=35),
+    "A-WALL-EDGE": Layer(holds="edges in which planes meet", colour=1, weight=35),
+    "A-WALL-OTLN": Layer(holds="outline of the room at the floor", colour=5, weight=50),
+    "A-WALL-FACE": Layer(holds="faces of walls", colour=252, weight=13),
+    "A-WALL-OPNG": Layer(holds="openings in space", colour=4, weight=35),
+    "A-SURV-PNTS": Layer(holds="surveyed points", colour=6, weight=25),
+    "A-ANNO-GRID": Layer(holds="grid with coordinates", colour=9, weight=13),
+    "A-ANNO-LEVL": Layer(holds="height marks", colour=3, weight=18),
+    "A-ANNO-DIMS": Layer(holds="dimensions", colour=2, weight=18),
+    "A-ANNO-TEXT": Layer(holds="names and notes", colour=7, weight=18),
 }
-_TEXT_M: Final = 0.05
+# Letters of 2.5 mm at 1:50.
+_TEXT_M: Final = 0.125
 _METRES: Final = 6
 _VERSION: Final = "R2010"
+# Programs that show no attributes have the same as text beside the mark.
+_UNSEEN: Final = {"flags": 1}
+_GRID_STEPS_M: Final = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0, 100.0)
+_MOST_LINES: Final = 12
+DIMENSION_STYLE: Final = "ORTHOFLOW"
+_POINT_BLOCK: Final = "SURVEY-POINT"
+_LEVEL_BLOCK: Final = "LEVEL"
 
 
 def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
-    """Write a wall in the coordinates of its GeoTIFF, its picture in exact scale.
+    """Write a wall in the coordinates of its GeoTIFF, its orthoimage in exact scale.
 
-    Layers: IMAGE, FRAME of the cells, RECTANGLE of the plane's points, PARTS of it, EDGES to other
-    planes, OPENINGS of it, CHECKPOINTS near it, RESIDUALS found on it (enlarged, as a text says).
+    Layers are those of `LAYERS` for elevations. Openings are rectangles or arches where those fit;
+    a text states how far the outline that was found leaves them. Marks are blocks with attributes.
 
     Raises:
         StoreError: it cannot be written.
@@ -49,27 +77,30 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     document, space = _new_document()
     frame = wall.frame
     corners = wall.place_m(frame.corners_world())
-    _add_polygon(space, corners, "FRAME")
+    _add_polygon(space, corners, "A-ELEV-OTLN")
     if wall.image:
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
         size = (frame.width * frame.gsd_m, frame.height * frame.gsd_m)
-        image = space.add_image(definition, tuple(corners[1]), size, dxfattribs={"layer": "IMAGE"})
+        image = space.add_image(
+            definition, tuple(corners[1]), size, dxfattribs={"layer": "A-ELEV-IMAG"}
+        )
         # The rows of a ceiling go up along Y.
         image.dxf.v_pixel = (0.0, -frame.raster_down * frame.gsd_m, 0.0)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    is_upright = frame.raster_axes == "wall"
+    _add_grid(space, low, high)
+    if is_upright:
+        _add_level(space, high[0], low[1])
+        _add_level(space, high[0], high[1])
     for opening in wall.openings:
-        _add_polygon(space, opening.outline_m, "OPENINGS")
-        left, top = opening.outline_m[:, 0].min(), opening.outline_m[:, 1].max()
-        for row, part in enumerate(opening.said.split(", "), start=1):
-            place = np.array([left + _TEXT_M, top - 2.0 * row * _TEXT_M])
-            _add_text(space, part, place, "OPENINGS")
+        _add_opening(space, opening.outline_m, opening.edge_sigma_m, opening.said)
+    _add_dimension(space, low, np.array([high[0], low[1]]), -6 * _TEXT_M)
+    _add_dimension(space, low, np.array([low[0], high[1]]), 6 * _TEXT_M)
+    _add_text(space, wall.name, low - [0.0, 10 * _TEXT_M], "A-ANNO-TEXT")
     if lines is not None:
-        if wall.plane_index is not None:
-            _add_polygon(space, wall.place_m(lines.planes.corners[wall.plane_index]), "RECTANGLE")
-            for part in lines.surfaces[wall.plane_index].rectangles_world:
-                _add_polygon(space, wall.place_m(part), "PARTS")
         for edge in edges_of(lines, wall.plane_index):
             begin, end = wall.place_m(edge.ends_world)
-            space.add_line(tuple(begin), tuple(end), dxfattribs={"layer": "EDGES"})
+            space.add_line(tuple(begin), tuple(end), dxfattribs={"layer": "A-ELEV-EDGE"})
         if lines.checkpoints is not None:
             near = np.flatnonzero(wall.near(lines.checkpoints.points_world))
             _add_points(
@@ -77,20 +108,14 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
                 [lines.checkpoints.names[index] for index in near],
                 wall.place_m(lines.checkpoints.points_world[near]),
             )
-        for residuals in lines.residuals:
-            own = residuals.wall == wall.number
-            begins = wall.place_m(residuals.points_world[own])
-            shifts = residuals.displacement_m[own] * [1.0, frame.raster_down]
-            _add_residuals(space, residuals, begins, begins + residuals.times * shifts)
     save_document(document, path)
 
 
 def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> None:
     """Write a room in the coordinates of its scan, with a coordinate system `wall_<k>` per wall.
 
-    Layers: IMAGE of each wall in its place, RECTANGLE of each plane, PARTS, EDGES, CORNERS,
-    OPENINGS, OUTLINE from above at the height of the floor, FACES of the walls between floor and
-    ceiling, CHECKPOINTS, RESIDUALS.
+    Layers are those of `LAYERS` for walls: edges, the outline at the height of the floor, faces
+    between floor and ceiling, openings, surveyed points, and each orthoimage in its place.
 
     Raises:
         StoreError: it cannot be written.
@@ -98,45 +123,127 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
     document, space = _new_document()
     for wall in walls:
         _add_placed_wall(document, space, wall)
-    for index, surface in enumerate(lines.surfaces):
-        corners = lines.planes.corners[index]
-        _add_polygon(space, corners, "RECTANGLE")
-        for part in surface.rectangles_world:
-            _add_polygon(space, part, "PARTS")
-        _add_text(space, lines.planes.names[index], corners.mean(axis=0), "TEXT")
+    for index, name in enumerate(lines.planes.names):
+        middle = lines.planes.corners[index].mean(axis=0)
+        _add_text(space, name, middle, "A-ANNO-TEXT")
     for edge in lines.edges:
         begin, end = edge.ends_world
-        space.add_line(tuple(begin), tuple(end), dxfattribs={"layer": "EDGES"})
-    for corner in lines.corners:
-        space.add_point(tuple(corner.point_world), dxfattribs={"layer": "CORNERS"})
+        space.add_line(tuple(begin), tuple(end), dxfattribs={"layer": "A-WALL-EDGE"})
     for opening in lines.openings:
-        _add_polygon(space, opening.outline_world, "OPENINGS")
-        _add_text(space, opening.said, opening.outline_world.mean(axis=0), "OPENINGS")
+        _add_polygon(space, opening.outline_world, "A-WALL-OPNG")
     _add_outline(space, lines)
     if lines.checkpoints is not None:
         _add_points(space, lines.checkpoints.names, lines.checkpoints.points_world)
-    for residuals in lines.residuals:
-        ends = residuals.points_world.copy()
-        for wall in walls:
-            own = residuals.wall == wall.number
-            axes = np.array([wall.frame.u_world, wall.frame.v_world])
-            ends[own] += residuals.times * residuals.displacement_m[own] @ axes
-        _add_residuals(space, residuals, residuals.points_world, ends)
     save_document(document, path)
 
 
 def _new_document() -> tuple[Drawing, Modelspace]:
     from ezdxf.filemanagement import new
 
-    document = new(_VERSION, units=_METRES)
-    for name, colour in LAYERS.items():
-        document.layers.add(name, color=colour)
-    # Crosses of 5 cm: a dot is not seen on a picture.
-    document.header["$PDMODE"] = 2
-    document.header["$PDSIZE"] = _TEXT_M
+    document = new(_VERSION, setup=True, units=_METRES)
+    for name, given in LAYERS.items():
+        layer = document.layers.add(name, color=given.colour, lineweight=given.weight)
+        layer.description = given.holds
+    add_dimension_style(document, _TEXT_M)
+    _add_blocks(document)
     # LibreCAD takes the limits of paper space for its paper, and them for metres: A3.
     document.paperspace().dxf.limmax = (0.42, 0.297)
     return document, document.modelspace()
+
+
+def add_dimension_style(document: Drawing, text_m: float) -> None:
+    """Define how dimensions look: metres with three decimals, text above the line.
+
+    The header has the same: some programs draw dimensions anew, by it alone.
+    """
+    style = document.dimstyles.add(DIMENSION_STYLE)
+    values = {
+        "dimtxt": text_m,
+        "dimasz": 0.8 * text_m,
+        "dimexe": 0.4 * text_m,
+        "dimexo": 0.4 * text_m,
+        "dimgap": 0.3 * text_m,
+        "dimdec": 3,
+        "dimzin": 0,
+        "dimlfac": 1.0,
+        "dimtad": 1,
+        "dimtih": 0,
+        "dimtoh": 0,
+    }
+    for name, value in values.items():
+        setattr(style.dxf, name, value)
+        document.header[f"${name.upper()}"] = value
+    document.header["$DIMSTYLE"] = DIMENSION_STYLE
+    style.set_arrows(blk="OBLIQUE")
+
+
+def _add_blocks(document: Drawing) -> None:
+    """Define the marks: a surveyed point with its name, a level with its height."""
+    size = 0.4 * _TEXT_M
+    point = document.blocks.new(_POINT_BLOCK)
+    point.add_line((-size, 0), (size, 0))
+    point.add_line((0, -size), (0, size))
+    point.add_circle((0, 0), 0.6 * size)
+    point.add_attdef("NAME", (1.2 * size, 0.4 * size), height=_TEXT_M, dxfattribs=_UNSEEN)
+    level = document.blocks.new(_LEVEL_BLOCK)
+    level.add_lwpolyline([(0, 0), (size, 1.4 * size), (-size, 1.4 * size)], close=True)
+    level.add_line((-size, 0), (10 * size, 0))
+    level.add_attdef("HEIGHT", (1.6 * size, 0.4 * size), height=_TEXT_M, dxfattribs=_UNSEEN)
+
+
+def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    """Add lines at round coordinates, each with its number outside the picture."""
+    longest = float((high - low).max())
+    step = next(s for s in _GRID_STEPS_M if longest / s <= _MOST_LINES or s == _GRID_STEPS_M[-1])
+    for axis in (0, 1):
+        first = math.ceil(low[axis] / step - 1e-9)
+        for k in range(first, math.floor(high[axis] / step + 1e-9) + 1):
+            begin, end = low.copy(), high.copy()
+            begin[axis] = end[axis] = k * step
+            grid = {"layer": "A-ANNO-GRID"}
+            space.add_line(tuple(begin), tuple(end), dxfattribs=grid)
+            place = begin - ([0.0, 2 * _TEXT_M] if axis == 0 else [5 * _TEXT_M, 0.5 * _TEXT_M])
+            _add_text(space, f"{k * step:g}", place, "A-ANNO-GRID")
+
+
+def _add_level(space: Modelspace, x: float, height_m: float) -> None:
+    """Add a height mark right of the picture."""
+    mark = space.add_blockref(
+        _LEVEL_BLOCK, (x + 2 * _TEXT_M, height_m), dxfattribs={"layer": "A-ANNO-LEVL"}
+    )
+    mark.add_auto_attribs({"HEIGHT": f"{height_m:+.3f}"})
+    place = np.array([x + 2.8 * _TEXT_M, height_m + 0.3 * _TEXT_M])
+    _add_text(space, f"{height_m:+.3f}", place, "A-ANNO-LEVL")
+
+
+def _add_opening(
+    space: Modelspace, outline_m: NDArray[np.float64], sigma_m: float | None, words: str
+) -> None:
+    """Add an opening in regular form, with its size, and how far what was found leaves it."""
+    regular = regular_opening(outline_m, sigma_m)
+    _add_polygon(space, regular.outline_m, "A-ELEV-OPNG")
+    low, high = regular.outline_m.min(axis=0), regular.outline_m.max(axis=0)
+    if min(high - low) > 6 * _TEXT_M:
+        _add_dimension(space, low, np.array([high[0], low[1]]), 2 * _TEXT_M)
+        _add_dimension(space, low, np.array([low[0], high[1]]), -2 * _TEXT_M)
+    rows = words.split(", ")
+    if regular.kind != "outline":
+        rows.append(f"{regular.kind}, deviation {1e3 * regular.deviation_m:.0f} mm")
+    for row, text in enumerate(rows, start=1):
+        place = np.array([low[0] + 3 * _TEXT_M, high[1] - 1.8 * row * _TEXT_M])
+        _add_text(space, text, place, "A-ANNO-TEXT")
+
+
+def _add_dimension(
+    space: Modelspace, begin: NDArray[np.float64], end: NDArray[np.float64], distance_m: float
+) -> None:
+    space.add_aligned_dim(
+        p1=tuple(begin),
+        p2=tuple(end),
+        distance=distance_m,
+        dimstyle=DIMENSION_STYLE,
+        dxfattribs={"layer": "A-ANNO-DIMS"},
+    ).render()
 
 
 def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> None:
@@ -150,8 +257,9 @@ def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> N
     if wall.image:
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
         bottom_left = frame.corners_world()[1]
+        layer = {"layer": "A-ELEV-IMAG"}
         image = space.add_image(
-            definition, tuple(bottom_left.tolist()), (1.0, 1.0), dxfattribs={"layer": "IMAGE"}
+            definition, tuple(bottom_left.tolist()), (1.0, 1.0), dxfattribs=layer
         )
         image.dxf.u_pixel = tuple((frame.gsd_m * frame.u_world).tolist())
         image.dxf.v_pixel = tuple((-frame.gsd_m * frame.v_world).tolist())
@@ -161,14 +269,14 @@ def _add_outline(space: Modelspace, lines: RoomLines) -> None:
     outline = lines.outline
     is_upright = float(lines.planes.up[2]) == 1.0
     for points, is_closed in zip(outline.chains_world, outline.closed, strict=True):
-        layer = {"layer": "OUTLINE"}
+        layer = {"layer": "A-WALL-OTLN"}
         if is_upright:
             flat = space.add_lwpolyline(points[:, :2].tolist(), close=is_closed, dxfattribs=layer)
             flat.dxf.elevation = outline.floor_m
         else:
             space.add_polyline3d(points.tolist(), close=is_closed, dxfattribs=layer)
     for face in outline.faces_world:
-        space.add_3dface(face.tolist(), dxfattribs={"layer": "FACES"})
+        space.add_3dface(face.tolist(), dxfattribs={"layer": "A-WALL-FACE"})
 
 
 def _add_polygon(space: Modelspace, corners: NDArray[np.float64], layer: str) -> None:
@@ -180,22 +288,12 @@ def _add_polygon(space: Modelspace, corners: NDArray[np.float64], layer: str) ->
 
 def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.float64]) -> None:
     for name, place in zip(names, places, strict=True):
-        space.add_point(tuple(place.tolist()), dxfattribs={"layer": "CHECKPOINTS"})
-        _add_text(space, name, place, "CHECKPOINTS")
-
-
-def _add_residuals(
-    space: Modelspace,
-    residuals: Residuals,
-    begins: NDArray[np.float64],
-    ends: NDArray[np.float64],
-) -> None:
-    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
-        space.add_line(begin, end, dxfattribs={"layer": "RESIDUALS"})
-    if len(begins):
-        said = f"{residuals.cell}: residuals, shown - true, {residuals.times:g} times enlarged"
-        lowest = begins.min(axis=0) - 2 * _TEXT_M
-        _add_text(space, said, lowest, "RESIDUALS")
+        mark = space.add_blockref(
+            _POINT_BLOCK, tuple(place.tolist()), dxfattribs={"layer": "A-SURV-PNTS"}
+        )
+        mark.add_auto_attribs({"NAME": shown(name)})
+        beside = place + np.array([0.6, 0.3, 0.0])[: len(place)] * _TEXT_M
+        _add_text(space, name, beside, "A-SURV-PNTS")
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:

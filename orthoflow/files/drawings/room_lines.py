@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
-from orthoflow.files.drawings.papers import nice_step
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.adjoining import (
     REACH_M,
@@ -21,31 +19,7 @@ from orthoflow.geometry.adjoining import (
     edges_between,
 )
 from orthoflow.geometry.outlines import RoomOutline
-from orthoflow.products import CheckPoints, Inspection, Opening, Planes
-
-# Residuals are drawn so much longer that those of this share of them have this length at most.
-_SHARE_PERCENT: Final = 95.0
-_LENGTH_M: Final = 0.1
-_MOST_RESIDUALS: Final = 5000
-
-
-@dataclass(frozen=True, kw_only=True)
-class Residuals:
-    """Displacements that an inspection found.
-
-    Attributes:
-        cell: address of the inspection.
-        wall: (n,) numbers of walls.
-        points_world: (n, 3) metres.
-        displacement_m: (n, 2) metres along u and v, shown - true.
-        times: how much longer they are drawn.
-    """
-
-    cell: str
-    wall: NDArray[np.int32]
-    points_world: NDArray[np.float64]
-    displacement_m: NDArray[np.float64]
-    times: float
+from orthoflow.products import CheckPoints, Opening, Planes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +33,6 @@ class RoomLines:
         corners: where three meet.
         outline: of the room.
         checkpoints: surveyed points, None without.
-        residuals: of inspections.
         openings: of walls.
     """
 
@@ -69,7 +42,6 @@ class RoomLines:
     corners: tuple[Corner, ...]
     outline: RoomOutline
     checkpoints: CheckPoints | None
-    residuals: tuple[Residuals, ...]
     openings: tuple[Opening, ...] = ()
 
 
@@ -105,7 +77,6 @@ class DrawnWall:
 def room_lines(
     planes: Planes,
     checkpoints: CheckPoints | None,
-    inspections: dict[str, Inspection],
     openings: tuple[Opening, ...] = (),
 ) -> RoomLines:
     """Work out the lines of a room."""
@@ -118,9 +89,6 @@ def room_lines(
         corners=corners_between(surfaces, edges),
         outline=outline_of(planes),
         checkpoints=checkpoints,
-        residuals=tuple(
-            _residuals(address, inspection) for address, inspection in inspections.items()
-        ),
         openings=openings,
     )
 
@@ -136,22 +104,3 @@ def numbered_openings(openings: Sequence[Opening]) -> Iterator[tuple[int, Openin
     for opening in openings:
         counts[opening.wall] = counts.get(opening.wall, -1) + 1
         yield counts[opening.wall], opening
-
-
-def _residuals(address: str, inspection: Inspection) -> Residuals:
-    known = np.flatnonzero(np.isfinite(inspection.displacement_m).all(axis=1))
-    # Evenly over all of them: an inspection of the truth has one per traced cell.
-    kept = known[:: max(1, -(-len(known) // _MOST_RESIDUALS))]
-    shifts = inspection.displacement_m[kept]
-    typical_m = 0.0
-    if len(kept):
-        typical_m = float(np.percentile(np.linalg.norm(shifts, axis=1), _SHARE_PERCENT))
-    # Half of the next round number is at most what is wanted.
-    times = 1.0 if typical_m <= 0.0 else max(1.0, 0.5 * nice_step(_LENGTH_M / typical_m))
-    return Residuals(
-        cell=address,
-        wall=inspection.wall[kept],
-        points_world=inspection.points_world[kept],
-        displacement_m=shifts,
-        times=times,
-    )

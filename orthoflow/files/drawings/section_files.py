@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.dxf import save_document
+from orthoflow.files.drawings.dxf import DIMENSION_STYLE, add_dimension_style, save_document
 from orthoflow.files.drawings.papers import (
     MARGIN_MM,
     SCALES,
@@ -127,6 +127,7 @@ def _document(drawing: SectionDrawing) -> Drawing:
     document.layers.get("A-SECT-HIDN").dxf.linetype = "DASHED"
     document.header["$LTSCALE"] = drawing.mm(8.0)
     document.header["$PDMODE"] = 0
+    add_dimension_style(document, drawing.mm(_TEXT_MM))
     space = document.modelspace()
     section = drawing.section
     for line in section.lines:
@@ -168,22 +169,11 @@ def _add_dimension(space: Modelspace, line: CutLine, drawing: SectionDrawing) ->
     left = np.array([-direction[1], direction[0]])
     if left @ line.behind < 0.0:  # dimensions stand outside, behind what is cut
         begin, end = end, begin
-    style = {
-        "dimtxt": drawing.mm(_TEXT_MM),
-        "dimasz": drawing.mm(2.0),
-        "dimexe": drawing.mm(1.0),
-        "dimexo": drawing.mm(1.0),
-        "dimgap": drawing.mm(0.8),
-        "dimdec": 3,
-        "dimzin": 0,
-        "dimlfac": 1.0,
-        "dimtad": 1,
-    }
     space.add_aligned_dim(
         p1=tuple(begin),
         p2=tuple(end),
         distance=drawing.mm(8.0),
-        override=style,
+        dimstyle=DIMENSION_STYLE,
         dxfattribs={"layer": "A-ANNO-DIMS"},
     ).render()
 

@@ -208,7 +208,7 @@ def test_a_wall_is_chosen_by_its_number() -> None:
     ("change", "notes"),
     [
         ({}, ("accuracy: RMSE 1 mm; RMS 2 mm", "colours untouched", "cells of 10 mm")),
-        ({"accuracy": ()}, ("accuracy: not measured", "colours untouched", "cells of 10 mm")),
+        ({"accuracy": ()}, ("accuracy not checked", "colours untouched", "cells of 10 mm")),
         ({"colours": ""}, ("accuracy: RMSE 1 mm; RMS 2 mm", "cells of 10 mm")),
     ],
 )

@@ -347,11 +347,11 @@ def test_the_picture_lies_on_its_wall_to_scale(drawn: Path) -> None:
     np.testing.assert_array_equal(picture[:, 9, 1], np.arange(230))
 
 
-def test_a_wall_has_its_edges_points_and_residuals_in_metres(drawn: Path) -> None:
+def test_a_wall_has_its_edges_points_grid_and_heights_in_metres(drawn: Path) -> None:
     space = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace()
     edges = [
         np.array([line.dxf.start, line.dxf.end])[:, :2]
-        for line in space.query('LINE[layer=="EDGES"]')
+        for line in space.query('LINE[layer=="A-ELEV-EDGE"]')
     ]
     # 10 cm outside the rectangle of points on all four sides.
     sides = sorted(
@@ -361,20 +361,26 @@ def test_a_wall_has_its_edges_points_and_residuals_in_metres(drawn: Path) -> Non
     )
     beside = [-GAP_M, WIDE_M + GAP_M, TOP_M + GAP_M, TOP_M - HIGH_M - GAP_M]
     assert sides == pytest.approx(sorted(beside))
-    points = [tuple(point.dxf.location)[:2] for point in space.query("POINT")]
+    marks = space.query('INSERT[name=="SURVEY-POINT"]')
+    points = [tuple(mark.dxf.insert)[:2] for mark in marks]
     assert points == [pytest.approx((1.0, TOP_M - 1.0)), pytest.approx((2.0, TOP_M - 1.0))]
-    shifts = [
-        np.array(line.dxf.end - line.dxf.start)[:2]
-        for line in space.query('LINE[layer=="RESIDUALS"]')
+    heights = [
+        (tuple(mark.dxf.insert)[1], mark.get_attrib_text("HEIGHT"))
+        for mark in space.query('INSERT[name=="LEVEL"]')
     ]
-    (said,) = [
-        text.dxf.text
-        for text in space.query('TEXT[layer=="RESIDUALS"]')
-        if "enlarged" in text.dxf.text
+    for height, text in heights:
+        assert text == f"{height:+.3f}"
+    assert [height for height, _ in heights] == pytest.approx([TOP_M - HIGH_M, TOP_M])
+    level = [
+        line.dxf.start.y
+        for line in space.query('LINE[layer=="A-ANNO-GRID"]')
+        if line.dxf.start.y == line.dxf.end.y
     ]
-    times = float(said.split(", ")[2].split()[0])
-    # To the right, and down, which is -Y.
-    np.testing.assert_allclose(shifts, times * np.array([[0.001, 0.0], [0.0, -0.002]]), atol=1e-9)
+    assert level == pytest.approx([100.5, 101.0, 101.5, 102.0])
+    measured = sorted(
+        dimension.get_measurement() for dimension in space.query('DIMENSION[layer=="A-ANNO-DIMS"]')
+    )
+    assert measured == pytest.approx([0.8, 1.2, HIGH_M, WIDE_M], abs=1e-6)
 
 
 def test_the_room_has_each_wall_in_its_place(drawn: Path) -> None:
@@ -402,22 +408,29 @@ def test_the_room_has_each_wall_in_its_place(drawn: Path) -> None:
     drawn_at = np.array([point[:2] for point in outline.get_points()])
     for point in corners:
         assert np.linalg.norm(drawn_at - point[:2], axis=1).min() < 1e-6
-    assert len(space.query('LINE[layer=="EDGES"]')) == 12
-    assert len(space.query('POINT[layer=="CORNERS"]')) == 8
+    assert len(space.query('LINE[layer=="A-WALL-EDGE"]')) == 12
 
 
 def test_openings_are_drawn_on_a_layer_of_the_wall_and_of_the_room(drawn: Path) -> None:
     (opening,) = box_openings().openings
-    places = {f"wall_{WALL}.dxf": opening.outline_m, "room.dxf": opening.outline_world}
-    for name, expected in places.items():
-        layer = ezdxf.readfile(drawn / name).modelspace().query('*[layer=="OPENINGS"]')
-        (outline,) = layer.query("LWPOLYLINE POLYLINE")
-        assert outline.closed if name.startswith("wall") else outline.is_closed
+    places = {
+        f"wall_{WALL}.dxf": ("A-ELEV-OPNG", opening.outline_m),
+        "room.dxf": ("A-WALL-OPNG", opening.outline_world),
+    }
+    for name, (layer, expected) in places.items():
+        space = ezdxf.readfile(drawn / name).modelspace()
+        (outline,) = space.query(f'LWPOLYLINE[layer=="{layer}"]') or space.query(
+            f'POLYLINE[layer=="{layer}"]'
+        )
         points = outline.get_points() if name.startswith("wall") else outline.points()
         corners = np.array([tuple(point)[: expected.shape[1]] for point in points])
-        np.testing.assert_allclose(corners, expected, atol=1e-6)
-        said = [text.dxf.text for text in layer.query("TEXT")]
-        assert ", ".join(said) == "niche 0.250 m deep, 0.80 x 1.20 m"
+        for corner in expected:
+            assert np.linalg.norm(corners - corner, axis=1).min() < 1e-6
+    texts = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace().query("TEXT")
+    found = [text.dxf.text for text in texts]
+    assert {"niche 0.250 m deep", "0.80 x 1.20 m", "rectangle", "deviation 0 mm"} <= {
+        part for text in found for part in (text, *text.split(", "))
+    }
 
 
 def test_openings_are_outlined_on_sheets_in_scale(sheet: pdfplumber.page.Page) -> None:
@@ -439,9 +452,8 @@ def test_openings_are_outlined_on_sheets_in_scale(sheet: pdfplumber.page.Page) -
 
 
 def test_names_from_a_record_are_harmless_in_drawings(drawn: Path) -> None:
-    texts = [
-        text.dxf.text for text in ezdxf.readfile(drawn / "room.dxf").modelspace().query("TEXT")
-    ]
+    marks = ezdxf.readfile(drawn / "room.dxf").modelspace().query("INSERT")
+    texts = [mark.get_attrib_text("NAME") for mark in marks]
     assert "P2\\x1b]0;" in texts
     assert b"\x1b" not in (drawn / "room.dxf").read_bytes()
 

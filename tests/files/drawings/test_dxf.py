@@ -1,81 +1,71 @@
-"""Layers of drawings: what is another thing has another colour."""
+"""Regular openings, and layers of CAD files."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
+import ezdxf
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.dxf import LAYERS, _add_polygon, write_wall_dxf
-from orthoflow.files.drawings.room_lines import Residuals, room_lines
-from tests.drawing_runs import WALL, box_planes, drawn_wall
-
-
-def test_layers_are_told_apart_by_their_colours() -> None:
-    # The index of CAD programs, of which 0 and 256 are no colours.
-    assert all(1 <= colour <= 255 for colour in LAYERS.values())
-    # Corners are where edges meet, and letters are as black as pictures, whose colour nobody sees.
-    alike = [{"CORNERS", "EDGES"}, {"IMAGE", "TEXT"}]
-    for one, other in combinations(LAYERS, 2):
-        assert (LAYERS[one] == LAYERS[other]) is ({one, other} in alike), (one, other)
-
-
-@pytest.mark.parametrize("n_axes", [2, 3])
-def test_polygons_are_closed_on_paper_and_in_space(n_axes: int) -> None:
-    import ezdxf
-
-    space = ezdxf.new().modelspace()
-    corners = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0], [2.0, 1.0, 3.0]])[:, :n_axes]
-    _add_polygon(space, corners, "PARTS")
-    (line,) = space
-    assert (line.dxf.layer, line.is_closed) == ("PARTS", True)
-    points = [
-        tuple(point)[:n_axes] for point in (line.vertices() if n_axes == 2 else line.points())
-    ]
-    np.testing.assert_array_equal(points, corners)
+from orthoflow.files.drawings.dxf import LAYERS, write_wall_dxf
+from orthoflow.files.drawings.regular_openings import regular_opening
+from orthoflow.files.drawings.room_lines import room_lines
+from tests.drawing_runs import box_planes, drawn_wall
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
+def test_a_wall_has_the_edges_of_its_plane_where_that_is_known(
     tmp_path: Path, is_known: bool
 ) -> None:
-    import ezdxf
+    lines = room_lines(box_planes(), None)
+    write_wall_dxf(tmp_path / "a.dxf", drawn_wall(box_planes(), is_known=is_known), lines)
+    document = ezdxf.readfile(tmp_path / "a.dxf")
+    counts = Counter(entity.dxf.layer for entity in document.modelspace())
+    assert counts["A-ELEV-OTLN"] == 1
+    assert counts["A-ELEV-EDGE"] == (4 if is_known else 0)  # a wall of a box meets four others
+    assert set(counts) <= set(LAYERS)
+    for name, given in LAYERS.items():
+        layer = document.layers.get(name)
+        assert (layer.dxf.color, layer.dxf.lineweight) == (given.colour, given.weight)
 
-    planes = box_planes()
-    lines = room_lines(planes, None, {})
-    wall = drawn_wall(planes, is_known=is_known)
-    write_wall_dxf(tmp_path / "a.dxf", wall, lines)
-    space = ezdxf.readfile(tmp_path / "a.dxf").modelspace()
-    counts = Counter(entity.dxf.layer for entity in space)
-    assert counts["FRAME"] == 1
-    assert counts["RECTANGLE"] == int(is_known)
-    assert counts["PARTS"] == (len(lines.surfaces[WALL].rectangles_world) if is_known else 0)
-    # A wall of a box meets four others.
-    assert counts["EDGES"] == (4 if is_known else 0)
-    assert counts["IMAGE"] == 0
-    # Of residuals on other walls there is nothing, not even how much they are enlarged.
-    shifts = np.full((2, 2), 0.01)
-    elsewhere = Residuals(
-        cell="check",
-        wall=np.array([WALL + 1, WALL]),
-        points_world=np.zeros((2, 3)),
-        displacement_m=shifts,
-        times=5.0,
-    )
-    for wall_of, n_lines, n_texts in (([WALL + 1] * 2, 0, 0), ([WALL + 1, WALL], 1, 1)):
-        residuals = replace(elsewhere, wall=np.array(wall_of))
-        write_wall_dxf(tmp_path / "c.dxf", wall, replace(lines, residuals=(residuals,)))
-        drawn = ezdxf.readfile(tmp_path / "c.dxf").modelspace().query('*[layer=="RESIDUALS"]')
-        kinds = Counter(entity.dxftype() for entity in drawn)
-        assert (kinds["LINE"], kinds["TEXT"]) == (n_lines, n_texts)
-        for line in drawn.query("LINE"):
-            # Five times as long; v goes down, Y up.
-            along = np.subtract(line.dxf.end, line.dxf.start)
-            np.testing.assert_allclose(along, [0.05, -0.05, 0.0], atol=1e-9)
-    write_wall_dxf(tmp_path / "b.dxf", wall, None)
-    alone = ezdxf.readfile(tmp_path / "b.dxf").modelspace()
-    assert {entity.dxf.layer for entity in alone} == {"FRAME"}
+
+def wobbled(outline: np.ndarray, seed: int, sd_m: float) -> np.ndarray:
+    """An outline with a vertex every 5 cm, each moved at random."""
+    points = []
+    for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        count = max(1, int(np.linalg.norm(end - begin) / 0.05))
+        points += [begin + k / count * (end - begin) for k in range(count)]
+    return np.array(points) + np.random.default_rng(seed).normal(0.0, sd_m, (len(points), 2))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_window_with_uneven_sides_is_a_rectangle(seed: int) -> None:
+    box = np.array([[1.0, 0.5], [2.2, 0.5], [2.2, 2.0], [1.0, 2.0]])
+    found = regular_opening(wobbled(box, seed, 0.005), 0.005)
+    assert found.kind == "rectangle"
+    assert np.abs(found.outline_m - box).max() < 0.005
+    assert 0.004 < found.deviation_m < 0.03
+
+
+@pytest.mark.parametrize(("seed", "rise_m"), [(0, 0.6), (1, 0.3), (2, 0.15)])
+def test_a_door_under_an_arch_is_one(seed: int, rise_m: float) -> None:
+    half, spring = 0.6, 2.0
+    radius = (half**2 + rise_m**2) / (2 * rise_m)
+    angle = np.arcsin(half / radius)
+    turns = np.linspace(angle, -angle, 40)
+    arc = np.column_stack([np.sin(turns), np.cos(turns)]) * radius
+    arc += [0.0, spring + rise_m - radius]
+    door = np.vstack([[-half, 0.0], [half, 0.0], arc])
+    found = regular_opening(wobbled(door, seed, 0.003), 0.003)
+    assert found.kind == "arch"
+    assert found.outline_m[:, 1].max() == pytest.approx(spring + rise_m, abs=0.012)
+    assert found.deviation_m < 0.03
+
+
+def test_what_is_neither_keeps_its_outline() -> None:
+    star = np.array([[0.0, 0.0], [1.0, 0.3], [2.0, 0.0], [1.4, 0.8], [1.0, 2.0], [0.6, 0.8]])
+    found = regular_opening(star, None)
+    assert (found.kind, found.deviation_m) == ("outline", 0.0)
+    np.testing.assert_array_equal(found.outline_m, star)

@@ -40,7 +40,7 @@ def test_a_wall_without_planes_is_its_frame_and_its_openings_in_its_own_metres(
 
 @pytest.mark.parametrize("is_closed", [True, False])
 def test_an_outline_that_does_not_close_is_a_line(tmp_path: Path, *, is_closed: bool) -> None:
-    lines = room_lines(box_planes(), None, {})
+    lines = room_lines(box_planes(), None)
     chain = np.array([[1.0, 2.0, 3.0], [4.0, 2.0, 3.0], [4.0, 6.1234567, 3.0]])
     outline = replace(lines.outline, chains_world=(chain,), closed=(is_closed,), floor_m=3.0)
     geojson.write_room_geojson(tmp_path / "a.geojson", replace(lines, outline=outline), None)
@@ -89,7 +89,7 @@ def test_a_wall_has_the_lines_of_its_plane_where_that_is_known(
     tmp_path: Path, is_known: bool
 ) -> None:
     planes = box_planes()
-    lines = room_lines(planes, None, {})
+    lines = room_lines(planes, None)
     wall = drawn_wall(planes, is_known=is_known)
     geojson.write_wall_geojson(tmp_path / "a.geojson", wall, lines)
     kinds = [one["properties"]["kind"] for one in features(tmp_path / "a.geojson")]
