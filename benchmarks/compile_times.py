@@ -28,9 +28,9 @@ from orthoflow.catalog.discovery import discover_catalog  # noqa: E402
 from orthoflow.engine.plan import RunOptions, plan_run  # noqa: E402
 from orthoflow.engine.scheduling import execute  # noqa: E402
 from orthoflow.engine.store import Store  # noqa: E402
-from orthoflow.workflow.cells import expand_cells  # noqa: E402
 from orthoflow.workflow.document import load_workflow  # noqa: E402
-from orthoflow.workflow.recipes import shipped_workflow  # noqa: E402
+from orthoflow.workflow.expand import expand_cells  # noqa: E402
+from orthoflow.workflow.source import shipped_workflow  # noqa: E402
 
 
 @dataclass

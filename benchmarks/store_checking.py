@@ -27,9 +27,9 @@ from orthoflow.records import writing
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import executed_and_written, write_run
 from orthoflow.report import write_page
-from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.expand import expand_cells
+from orthoflow.workflow.model import Workflow
 
 CHECKING = ((Store, "damage"), (Store, "take"), (Store, "blob"), (store, "describe_product"))
 SYNCING = ((writing, "sync_tree"),)

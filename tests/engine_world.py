@@ -29,8 +29,8 @@ from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import OrthoflowError
-from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.expand import expand_cells
 from tests.engine_mischief import MISCHIEF, NAMES
 from tests.engine_toys import HOOKS, MAKES, PRODUCTS, WORKS
 

@@ -114,7 +114,7 @@ def _serve() -> None:
     import orthoflow.records.verification
     import orthoflow.records.writing
     import orthoflow.workflow.document
-    import orthoflow.workflow.schema
+    import orthoflow.workflow.views
     from orthoflow.engine.environment import cpu_name, git_commit
     from orthoflow.report.pages import environment
 

@@ -17,7 +17,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
-from orthoflow.workflow.schema import workflow_schema
+from orthoflow.workflow.views import workflow_schema
 from tests.long_loops import IS_LONG
 from tests.road.conftest import metrics_of
 

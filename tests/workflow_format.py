@@ -1,41 +1,47 @@
-"""The reference of the workflow format as Markdown, made of its declaration.
+"""The reference of the workflow format as Markdown, made of its models.
 
 `python tests/workflow_format.py` writes `docs/workflow-format.md`.
 """
 
 from __future__ import annotations
 
+import inspect
+import io
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orthoflow.workflow.format import (
-    CALL,
-    COMPARISON,
-    DATASET,
-    FILE,
-    INPUT,
-    SHARE,
-    STEP,
-    SWEPT,
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from ruamel.yaml import YAML
+
+from orthoflow.workflow.model import (
+    CallSection,
+    CompareSection,
+    DatasetSection,
+    InputSection,
+    ResourcesSection,
+    StepSection,
+    SweepSection,
+    WorkflowFile,
+    annotation_at,
 )
-from orthoflow.workflow.shapes import Key, Section
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "docs" / "workflow-format.md"
 COMMAND = "python tests/workflow_format.py"
 
 # Headings, in the order of a file, with the section below each.
-SECTIONS: dict[str, Section] = {
-    "The file": FILE,
-    "`inputs.<name>`: an input": INPUT,
-    "`datasets.<name>`: a dataset": DATASET,
-    "`steps.<name>`: a step": STEP,
-    "`steps.<name>.variants.<name>`: a method call": CALL,
-    "`params.<name>`: a sweep": SWEPT,
-    "`resources`": SHARE,
-    "`compare`": COMPARISON,
+SECTIONS: dict[str, type[BaseModel]] = {
+    "The file": WorkflowFile,
+    "`inputs.<name>`: an input": InputSection,
+    "`datasets.<name>`: a dataset": DatasetSection,
+    "`steps.<name>`: a step": StepSection,
+    "`steps.<name>.variants.<name>`: a method call": CallSection,
+    "`params.<name>`: a sweep": SweepSection,
+    "`resources`": ResourcesSection,
+    "`compare`": CompareSection,
 }
 
 EXAMPLE = """\
@@ -61,8 +67,8 @@ compare:
 HEAD = f"""\
 # The workflow file
 
-Every key that a workflow file may hold. Made of `orthoflow/workflow/format.py` by
-`{COMMAND}`; the checks and `orthoflow schema` are made of the same declaration.
+Every key that a workflow file may hold. Made of `orthoflow/workflow/model.py` by
+`{COMMAND}`; the checks and `orthoflow schema` are made of the same models.
 
 ```yaml
 {EXAMPLE}```
@@ -70,6 +76,7 @@ Every key that a workflow file may hold. Made of `orthoflow/workflow/format.py` 
 `orthoflow check FILE` names everything that is wrong in one pass, each as
 `file:line:column: path: message`.
 Names start with a lower-case letter and have at most 32 lower-case letters, digits, `-` or `_`.
+Values are those of YAML 1.2's core schema: `.5e-1` is a number, `1_000`, `0b11` and `yes` are text.
 """
 
 
@@ -77,29 +84,40 @@ def reference() -> str:
     """The whole document."""
     parts = [HEAD]
     for heading, section in SECTIONS.items():
-        parts.append(f"## {heading}\n\n{section.about}\n")
+        parts.append(f"## {heading}\n\n{inspect.cleandoc(section.__doc__ or '')}\n")
         parts.append("\n".join(_table(section)) + "\n")
     return "\n".join(parts)
 
 
-def keys() -> Iterator[tuple[str, Key[Any]]]:
+def all_keys() -> Iterator[tuple[str, type[BaseModel], str, FieldInfo]]:
     """Every key of every section, behind the section's heading."""
     for heading, section in SECTIONS.items():
-        for key in _all_keys(section):
-            yield f"{heading}: {key.name}", key
+        for name, info in section.model_fields.items():
+            yield f"{heading}: {name}", section, info.alias or name, info
 
 
-def _table(section: Section) -> Iterator[str]:
-    yield "| key | value | example | without it | meaning |"
-    yield "|---|---|---|---|---|"
-    for key in _all_keys(section):
-        without = "refused" if key.missing else key.default
-        cells = (f"`{key.name}`", key.shape.words, f"`{key.example}`", without, key.meaning)
-        yield f"| {' | '.join(cells)} |"
+def _table(section: type[BaseModel]) -> Iterator[str]:
+    yield "| key | value | example | meaning |"
+    yield "|---|---|---|---|"
+    for name, info in section.model_fields.items():
+        key = info.alias or name
+        words = annotation_at(section, [key])[1].words
+        example = written((info.examples or [""])[0])
+        yield f"| `{key}` | {words} | `{example}` | {info.description} |"
+    if section is DatasetSection:
+        yield (
+            "| `<input>` | a text, or a list of them | `data/hall/*.jpg` | Files of the input of "
+            "that name, which have to be there. |"
+        )
 
 
-def _all_keys(section: Section) -> tuple[Key[Any], ...]:
-    return (*section.keys, *((section.others,) if section.others else ()))
+def written(example: Any) -> str:
+    """An example as YAML in one line."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = True, 1000, False  # type: ignore[assignment]
+    stream = io.StringIO()
+    yaml.dump(example, stream)
+    return stream.getvalue().removesuffix("...\n").strip()
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.format import Workflow
+    from orthoflow.workflow.model import Workflow
 
 
 @click.command(cls=Command)
@@ -52,8 +52,8 @@ class _Verdict:
 
 def _check(workflow: str, changes: Changes) -> _Verdict:
     from orthoflow.catalog.discovery import discover_catalog
-    from orthoflow.workflow.cells import expand_cells, is_plain
-    from orthoflow.workflow.doubts import doubts_about
+    from orthoflow.workflow.checks import doubts_about
+    from orthoflow.workflow.expand import expand_cells, is_plain
     from orthoflow.workflow.inputs import resolve_input_files
 
     catalog = discover_catalog()
@@ -74,7 +74,7 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
 
 def _baseline_text(workflow: Workflow) -> str:
     """Which variants the others are compared with: of a sweep, nobody named it."""
-    from orthoflow.workflow.cells import variants_text
+    from orthoflow.workflow.expand import variants_text
 
     named = variants_text(workflow.baseline)
     return f"; baseline {named}" if named else ""

@@ -15,7 +15,7 @@ from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import OrthoflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.format import Workflow
+    from orthoflow.workflow.model import Workflow
 
 EXIT_GOOD: Final = 0
 EXIT_CELL_FAILED: Final = 1
@@ -87,7 +87,7 @@ def say_error(*lines: str) -> None:
 
 def say_doubts(workflow: Workflow) -> None:
     """Write to standard error what is allowed in a workflow and can hardly be meant."""
-    from orthoflow.workflow.doubts import doubts_about
+    from orthoflow.workflow.checks import doubts_about
 
     for doubt in doubts_about(workflow):
         say_error(f"workflow: warning: {doubt}")

@@ -15,7 +15,7 @@ from orthoflow.cli.tables import echo
 def graph(workflow: str, changes: Changes) -> int:
     """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
     from orthoflow.catalog.discovery import discover_catalog
-    from orthoflow.workflow.mermaid import mermaid
+    from orthoflow.workflow.views import mermaid
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)

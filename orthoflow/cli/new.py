@@ -15,7 +15,7 @@ from orthoflow.cli.tables import echo, echo_folded, echo_json
 from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.drafting import Draft, Recipe
+    from orthoflow.workflow.draft import Draft, Recipe
 
 _RECIPES: Final = ("photos-on-scan", "direct", "plan")
 
@@ -51,8 +51,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     if output.exists():
         raise ArgumentError(f"{output} is there already: choose another name with -o")
     with working_on("looking at the files"):
-        from orthoflow.workflow.drafting import draft_workflow
-        from orthoflow.workflow.recognising import recognised
+        from orthoflow.workflow.draft import draft_workflow, recognised
 
         draft = draft_workflow(recognised(files), output, recipe)
     _write(output, draft.text)

@@ -45,7 +45,7 @@ def plan(
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
-    from orthoflow.workflow.cells import expand_cells
+    from orthoflow.workflow.expand import expand_cells
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
     from orthoflow.records.writing import WrittenRun
-    from orthoflow.workflow.format import Workflow
+    from orthoflow.workflow.model import Workflow
 
 
 @click.command(cls=Command)
@@ -106,7 +106,7 @@ def prepared(
         from orthoflow.engine.plan import RunOptions, plan_run
         from orthoflow.engine.run_folder import require_run_folder
         from orthoflow.engine.store import Store
-        from orthoflow.workflow.cells import expand_cells
+        from orthoflow.workflow.expand import expand_cells
 
         options = RunOptions(**choices)
         catalog = discover_catalog()
@@ -281,7 +281,7 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))
     from orthoflow.report.combinations import baseline_of
-    from orthoflow.workflow.cells import variants_text
+    from orthoflow.workflow.expand import variants_text
 
     if baseline := variants_text(baseline_of(run)):
         echo(f"baseline: {baseline}, with which the others are compared")

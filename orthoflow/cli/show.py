@@ -31,7 +31,7 @@ from orthoflow.cli.tables import (
     say_verify,
     size,
 )
-from orthoflow.workflow.format import DATA
+from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
@@ -141,7 +141,7 @@ def _print_comparison(run: Run) -> bool:
     from orthoflow.records.datasets import parts_of
     from orthoflow.report.comparisons import comparison_table
     from orthoflow.report.paired import over_datasets, who_leads
-    from orthoflow.workflow.cells import variants_text
+    from orthoflow.workflow.expand import variants_text
 
     parts = parts_of(run)
     names: Sequence[str]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import CellResult
     from orthoflow.engine.store import Store
-    from orthoflow.workflow.cells import Cell
+    from orthoflow.workflow.expand import Cell
 
 # Shipped recipes that between them run our methods on simulated rooms, and what makes these small.
 _COARSE: Final = ("room.scan_step_m=0.05", "wall.gsd_m=0.05")
@@ -129,8 +129,8 @@ def _warm(workflow: str | None) -> Warmed:
 
 
 def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
-    from orthoflow.workflow.cells import expand_cells
     from orthoflow.workflow.document import load_workflow
+    from orthoflow.workflow.expand import expand_cells
 
     loaded = load_workflow(workflow, catalog)
     calls = {_Call.of(cell) for cell in expand_cells(loaded, catalog)}
@@ -143,8 +143,8 @@ def _results(catalog: Catalog, wanted: Collection[_Call] | None) -> dict[str, Ce
     """Run the recipes in a store that goes away; give one result per method, a good one first."""
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
-    from orthoflow.workflow.cells import expand_cells
     from orthoflow.workflow.document import load_workflow
+    from orthoflow.workflow.expand import expand_cells
 
     found: dict[str, CellResult] = {}
     methods = None if wanted is None else {call.method for call in wanted}
@@ -163,7 +163,7 @@ def _results(catalog: Catalog, wanted: Collection[_Call] | None) -> dict[str, Ce
 
 
 def _recipes() -> dict[Path, tuple[str, ...]]:
-    from orthoflow.workflow.recipes import shipped_workflow
+    from orthoflow.workflow.source import shipped_workflow
 
     return {shipped_workflow(name): sets for name, sets in _RECIPES.items()}
 

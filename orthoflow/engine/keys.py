@@ -30,7 +30,7 @@ from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import MappedPort, Method, mapped_port, port_specs
 from orthoflow.version import DISTRIBUTION
-from orthoflow.workflow.cells import Cell
+from orthoflow.workflow.expand import Cell
 
 _WHAT: Final = "orthoflow/cell"
 _KEY_VERSION: Final = 1

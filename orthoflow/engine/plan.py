@@ -28,9 +28,9 @@ from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.system import usable_cores
-from orthoflow.workflow.cells import Cell, CellOutput, Selection, check_step_names, select_cells
-from orthoflow.workflow.format import Workflow
+from orthoflow.workflow.expand import Cell, CellOutput, Selection, check_step_names, select_cells
 from orthoflow.workflow.inputs import resolve_input_files
+from orthoflow.workflow.model import Workflow
 
 ExecutorName = Literal["local", "inline", "dask"]
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]

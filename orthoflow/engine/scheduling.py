@@ -58,7 +58,7 @@ from orthoflow.errors import (
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
-from orthoflow.workflow.cells import Cell, CellOutput, compared_cells
+from orthoflow.workflow.expand import Cell, CellOutput, compared_cells
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = DiagnosticSpec(

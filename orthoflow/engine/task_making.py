@@ -14,7 +14,7 @@ from orthoflow.engine.results import MethodIdentity, ProductRef, shared_fields
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
-from orthoflow.workflow.cells import Cell, WorkflowInput
+from orthoflow.workflow.expand import Cell, WorkflowInput
 
 
 @dataclass(frozen=True, kw_only=True)

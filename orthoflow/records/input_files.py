@@ -22,17 +22,16 @@ from orthoflow.alike import first_few
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.errors import InputError, RecordError
-from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.records.runs import Run, record_errors
-from orthoflow.workflow.format import Workflow, WorkflowInputSpec
 from orthoflow.workflow.inputs import (
     InputOption,
     override_inputs,
     read_input_options,
-    read_inputs,
     resolve_input_files,
+    written_files,
 )
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.model import Workflow, WorkflowInputSpec
+from orthoflow.workflow.source import ProblemLog
 
 # Of a folder that files may lie in; what lies in a larger one is found by its name alone.
 _MOST_LISTED: Final = 10_000
@@ -313,7 +312,8 @@ def _places(
     roots = dict.fromkeys(
         (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
     )
-    written = _written_specs(workflow)
+    # The resolved form has options in the place of what the file names, and no folders.
+    written = written_files(workflow.source)
     places: dict[str, _Places] = {}
     listings = _Listings()
     for name, spec in specs.items():
@@ -322,7 +322,7 @@ def _places(
         if files is not None:
             places[name] = _Places(files=files, listings=listings)
             continue
-        texts = (*spec.files, *(written[name].files if name in written else ()))
+        texts = (*spec.files, *written.get(name, ()))
         named = [
             root / folder
             for root in roots
@@ -346,11 +346,3 @@ def _of_all_datasets(
     return tuple(
         dataclasses.replace(option, name=name) for option in options for name in meant(option.name)
     )
-
-
-def _written_specs(workflow: Workflow) -> Mapping[str, WorkflowInputSpec]:
-    """What the file itself names: the resolved form has options in its place, and no folders."""
-    log = ProblemLog(file="")
-    document = read_yaml(workflow.source, log)
-    section = document.get("inputs") if isinstance(document, Table) else None
-    return read_inputs(section.value, Path(), log) if section else {}

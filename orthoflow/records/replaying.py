@@ -20,10 +20,9 @@ from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.input_files import LaidOutInputs, find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
-from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
-from orthoflow.workflow.format import StepVariant, Workflow
+from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.resolved import workflow_from_resolved
+from orthoflow.workflow.model import StepVariant, Workflow, workflow_from_resolved
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 

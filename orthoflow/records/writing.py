@@ -39,15 +39,15 @@ from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.model import resolved_json, workflow_from_resolved
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import FigureRef
     from orthoflow.engine.scheduling import RunOutcome
     from orthoflow.engine.store import Store
-    from orthoflow.workflow.cells import Cell
-    from orthoflow.workflow.format import Workflow
+    from orthoflow.workflow.expand import Cell
+    from orthoflow.workflow.model import Workflow
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4

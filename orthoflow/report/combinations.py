@@ -20,8 +20,8 @@ from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report.rankings import Sense, count_of_photos, sense_of
-from orthoflow.workflow.cells import variants_text
-from orthoflow.workflow.format import DATA
+from orthoflow.workflow.expand import variants_text
+from orthoflow.workflow.model import DATA
 
 # Walls that differ by more are two.
 _TURNED_DEG: Final = 10.0

@@ -17,8 +17,8 @@ from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
 from orthoflow.report.summaries import limits
-from orthoflow.workflow.cells import variants_text
-from orthoflow.workflow.format import DATA
+from orthoflow.workflow.expand import variants_text
+from orthoflow.workflow.model import DATA
 
 _ORIENTED: Final = "n_oriented"
 _MOST_COLUMNS: Final = 6

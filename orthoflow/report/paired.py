@@ -20,8 +20,8 @@ from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments
 from orthoflow.report.rankings import Sense, badness, is_yes_or_no
-from orthoflow.workflow.cells import variants_text
-from orthoflow.workflow.format import DATA
+from orthoflow.workflow.expand import variants_text
+from orthoflow.workflow.model import DATA
 
 # The datasets that decide make up at least this share of all differences.
 _DECIDING_SHARE: Final = 0.5

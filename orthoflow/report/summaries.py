@@ -15,7 +15,7 @@ from orthoflow.report.combinations import baseline_cells, combinations_of, unequ
 from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.ways import improved_on
-from orthoflow.workflow.cells import NOT_ASKED_FOR
+from orthoflow.workflow.expand import NOT_ASKED_FOR
 
 # Without photos that show a place, completeness cannot be asked for there.
 _SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"

@@ -3,53 +3,64 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.errors import WorkflowError
-from orthoflow.files.yaml_positions import Entry, Position, Table, plain, read_yaml
+from orthoflow.catalog.discovery import NAME_PATTERN
+from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.files.yaml_positions import Table, Value, describe
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.comparison import check_baseline, first_variants, read_compare
-from orthoflow.workflow.datasets import DatasetReader, choose_data
-from orthoflow.workflow.format import (
-    COMPARE,
-    DATASETS,
-    FILE,
-    INPUTS,
-    NAME,
-    ORTHOFLOW,
-    SEED,
-    STEPS,
-    Comparison,
-    Workflow,
-    WorkflowStep,
-)
+from orthoflow.workflow.checks import check_comparison, check_wiring, first_variants
 from orthoflow.workflow.inputs import (
+    DatasetReader,
     add_missing_inputs,
+    check_no_step,
     check_shared_inputs,
+    choose_data,
+    input_specs,
     override_inputs,
     read_input_options,
-    read_inputs,
+    read_seeds,
+)
+from orthoflow.workflow.model import (
+    INPUTS,
+    NAME_RULE,
+    SEED,
+    CallSection,
+    Comparison,
+    StepSection,
+    Workflow,
+    WorkflowFile,
+    WorkflowStep,
 )
 from orthoflow.workflow.parameters import (
-    CallName,
-    Override,
-    assign_overrides,
-    assign_settings,
-    resolve_params,
+    DraftCall,
+    DraftStep,
+    MethodInfo,
+    Overrides,
+    describe_method,
+    expand_sweeps,
+    joined,
+    overrides_of_options,
+    overrides_of_settings,
+    resolve_call,
 )
-from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.recipes import find_workflow
-from orthoflow.workflow.shapes import check_name, read_table
-from orthoflow.workflow.steps import DraftStep, read_steps
-from orthoflow.workflow.sweeps import expand_sweeps
-from orthoflow.workflow.wiring import check_wiring
+from orthoflow.workflow.source import (
+    Location,
+    ProblemLog,
+    as_plain,
+    find_workflow,
+    read_text,
+    validate,
+)
 
-MOST_BYTES: Final = 400_000
+_STEPS: Final = "steps"
+_OF_CALLS: Final = tuple(CallSection.model_fields)
 
 
 def load_workflow(  # noqa: PLR0913 - an argument for each option of the command line
@@ -71,11 +82,11 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         sets: `step[.variant].param=value`, each as behind `--set`.
         inputs: `NAME=PATH`, each as behind `--input`; relative to the working directory.
         datasets: a table in the place of the file's datasets, as behind `--datasets`, or what the
-            file would say of them.
+            file would state in their place.
         only_data: names of datasets, each as behind `--only-data`.
         set_files: YAML files of `step.parameter: value`, as behind `--set-file`; what stands
             behind `--set` goes before them.
-        also_files: of a file with problems, input files that are missing are told with them.
+        also_files: of a file with problems, input files that are missing are reported with them.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
@@ -84,25 +95,37 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         WorkflowError: there is no such file, or it cannot be read at all.
     """
     path = find_workflow(name_or_path)
-    source = _read_text(path)
+    source = read_text(path)
     log = ProblemLog(file=str(name_or_path), lines=tuple(source.splitlines()))
-    value = read_yaml(source, log)
-    table = FILE.read(value, "", log) if value is not None else None
-    if table is None:
+    tree = log.parse(source)
+    if tree is not None and not isinstance(tree, Table):
+        log.report((), f"expected a mapping, got {describe(tree)}")
+    if not isinstance(tree, Table):
         log.raise_any()
         raise WorkflowError(f"{name_or_path} holds no workflow")
-    if table.get(STEPS.name) is None:
+    for key, needed in (
+        ("orthoflow", "a workflow begins with orthoflow: 1"),
+        (_STEPS, "a workflow needs the key steps"),
+    ):
+        if tree.get(key) is None:
+            log.report((key,), needed)
+    if tree.get(_STEPS) is None:
         # All else names steps: each of these names would be one more complaint.
+        _sections(tree, log)
         log.raise_any()
-    options = _Options(
+    reader = _Reader(
+        path=path,
+        source=source,
+        catalog=catalog,
+        log=log,
+        tree=tree,
         sets=tuple(sets),
         inputs=tuple(inputs),
         datasets=datasets,
         only_data=tuple(only_data),
         profiles=tuple(_read_profile(Path(name), log) for name in set_files),
     )
-    reader = _Reader(path=path, source=source, catalog=catalog, log=log, options=options)
-    workflow = reader.read(table)
+    workflow = reader.read()
     if also_files and log.has_any:
         # Else they are looked for by who needs them.
         add_missing_inputs(workflow, log)
@@ -110,57 +133,35 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     return workflow
 
 
-def _read_text(path: Path, what: str = "a workflow file") -> str:
-    try:
-        # No more than is looked at: what was named by mistake may be a scan, or a device.
-        with path.open("rb") as stream:
-            content = stream.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
-    if len(content) > MOST_BYTES:
-        raise WorkflowError(f"{path} is too large: {what} has at most {MOST_BYTES} bytes")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        column = error.start - content.rfind(b"\n", 0, error.start)
-        raise WorkflowError(
-            f"{path}:{line}:{column}: expected UTF-8 text, got the byte "
-            f"0x{content[error.start]:02x}; save the file as UTF-8"
-        ) from error
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Options:
-    """What the command line says of the workflow."""
-
-    sets: tuple[str, ...]
-    inputs: tuple[str, ...]
-    datasets: str | Mapping[str, JsonValue]
-    only_data: tuple[str, ...]
-    profiles: tuple[_Profile, ...]
+def _sections(tree: Table, log: ProblemLog) -> WorkflowFile:
+    """Validate the file; `datasets` and `seed` have several forms and are read apart."""
+    data = as_plain(tree)
+    assert isinstance(data, dict)  # noqa: S101 - a table is a mapping
+    for key in ("datasets", SEED):
+        data.pop(key, None)
+    return validate(WorkflowFile, data, log) or WorkflowFile()
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Profile:
     """What a file of `--set-file` holds, and the log of that file."""
 
-    settings: Table
+    settings: Mapping[str, JsonValue]
     log: ProblemLog
 
 
 def _read_profile(path: Path, log: ProblemLog) -> _Profile:
     try:
-        text = _read_text(path, "a file of parameters")
+        text = read_text(path, "a file of parameters")
     except WorkflowError as error:
-        log.add_option(f"--set-file {path}", str(error))
+        log.report_option(f"--set-file {path}", str(error))
         text = "{}"
     beside = log.beside(str(path), text)
-    value = read_yaml(text, beside)
-    settings = read_table(value, "", beside) if value is not None else None
-    return _Profile(
-        settings=settings or Table(position=Position(line=1, column=1), entries=()), log=beside
-    )
+    tree = beside.parse(text)
+    if tree is not None and not isinstance(tree, Table):
+        beside.report((), f"expected a mapping, got {describe(tree)}")
+    settings = as_plain(tree)
+    return _Profile(settings=settings if isinstance(settings, dict) else {}, log=beside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,29 +172,33 @@ class _Reader:
     source: str
     catalog: Catalog
     log: ProblemLog
-    options: _Options
+    tree: Table
+    sets: tuple[str, ...]
+    inputs: tuple[str, ...]
+    datasets: str | Mapping[str, JsonValue]
+    only_data: tuple[str, ...]
+    profiles: tuple[_Profile, ...]
 
-    def read(self, table: Table) -> Workflow:
+    def read(self) -> Workflow:
         """Read all sections; the result may be used only when the log stays empty."""
-        ORTHOFLOW.read(table, "", self.log)
-        section = table.get(INPUTS.name)
-        specs = read_inputs(section.value, self.path.resolve().parent, self.log) if section else {}
-        steps_entry = table.get(STEPS.name)
-        steps: tuple[DraftStep, ...] = ()
-        step_names: tuple[str, ...] = ()
-        if steps_entry is not None:
-            steps = read_steps(steps_entry.value, self.catalog, self.log)
-            if isinstance(steps_entry.value, Table):
-                step_names = tuple(entry.key for entry in steps_entry.value)
-        check_wiring(steps, step_names, tuple(specs), self.log)
-        given = read_input_options(self.options.inputs, self.log)
+        log = self.log
+        file = _sections(self.tree, log)
+        folder = self.path.resolve().parent
+        seeds = read_seeds(self._value(SEED), log, (SEED,)) or (0,)
+        specs = input_specs(file.inputs, folder, log)
+        steps = tuple(self._steps(file.steps))
+        section = self._value(_STEPS)
+        step_names = tuple(entry.key for entry in section) if isinstance(section, Table) else ()
+        if isinstance(section, Table) and not step_names:
+            log.report((_STEPS,), "a workflow needs at least one step")
+        check_wiring(steps, step_names, tuple(specs), log)
+        given = read_input_options(self.inputs, log)
         shared = tuple(option for option in given if not option.is_of_dataset)
-        specs = override_inputs(specs, shared, self.log)
-        expanded = expand_sweeps(steps, self._overrides(steps), self.log)
-        steps, overrides = expanded.steps, expanded.overrides
+        specs = override_inputs(specs, shared, log)
+        steps, overrides = expand_sweeps(steps, self._overrides(steps), log)
         read = {step.name: self._step(step, overrides) for step in steps}
-        datasets = DatasetReader(
-            folder=self.path.resolve().parent,
+        reader = DatasetReader(
+            folder=folder,
             inputs=specs,
             steps=steps,
             overrides=overrides,
@@ -203,16 +208,23 @@ class _Reader:
                 for variant in step.variants
                 if variant.params
             },
-            log=self.log,
-        ).read(table.get(DATASETS.name), self.options.datasets)
-        compare = self._compare(table.get(COMPARE.name), steps, step_names, tuple(datasets))
-        if compare is None and expanded.has_sweeps:
+            log=log,
+        )
+        datasets = reader.read(self._value("datasets"), self.datasets)
+        is_swept = len(seeds) > 1
+        if is_swept or any(item.seeds for item in datasets.values()):
+            check_no_step(steps, SEED, log, (SEED,) if is_swept else ("datasets",))
+        compare = check_comparison(
+            file.compare, steps, step_names, tuple(datasets), seeds if is_swept else (), log
+        )
+        if compare is None and any(call.swept for step in steps for call in step.calls):
             compare = Comparison(baseline=first_variants(steps))
         workflow = Workflow(
-            name=self._name(table),
+            name=self._name(file),
             path=self.path,
             source=self.source,
-            seed=SEED.read(table, "", self.log) or 0,
+            seed=seeds[0],
+            seeds=seeds if is_swept else (),
             inputs=specs,
             steps=read,
             compare=compare,
@@ -222,75 +234,120 @@ class _Reader:
                 *self._data_options(),
             ),
             datasets=datasets,
-            only_data=choose_data(self.options.only_data, datasets, self.log),
+            only_data=choose_data(self.only_data, datasets, log),
         )
-        check_shared_inputs(workflow, shared, self.log)
+        check_shared_inputs(workflow, shared, log)
         own = tuple(option for option in given if option.is_of_dataset)
-        return workflow.with_input_specs(override_inputs(workflow.input_specs, own, self.log))
+        return workflow.with_input_specs(override_inputs(workflow.input_specs, own, log))
 
-    def _overrides(self, steps: Sequence[DraftStep]) -> dict[CallName, tuple[Override, ...]]:
-        """What files of `--set-file` and then `--set` say of each call."""
-        found: dict[CallName, tuple[Override, ...]] = {}
-        said = [
-            *(assign_settings(one.settings, "", steps, one.log) for one in self.options.profiles),
-            assign_overrides(self.options.sets, steps, self.log),
-        ]
-        for overrides in said:
-            for call, several in overrides.items():
-                found[call] = (*found.get(call, ()), *several)
-        return found
+    def _value(self, key: str) -> Value | None:
+        entry = self.tree.get(key)
+        return entry.value if entry else None
+
+    def _name(self, file: WorkflowFile) -> str:
+        if file.name is None and self._value("name") is None:
+            if re.fullmatch(NAME_PATTERN, self.path.stem):
+                return self.path.stem
+            message = f"{self.path.stem!r} cannot be a name: {NAME_RULE}"
+            self.log.report((), message, shown=("name",))
+        return file.name or self.path.stem
+
+    def _overrides(self, steps: Sequence[DraftStep]) -> Overrides:
+        """Return what files of `--set-file` and then `--set` set of each call."""
+        return joined(
+            *(overrides_of_settings(one.settings, (), steps, one.log) for one in self.profiles),
+            overrides_of_options(self.sets, steps, self.log),
+        )
 
     def _set_options(self) -> Iterator[str]:
-        # A record holds no files of profiles: what they say stands there as if it had been set.
-        for profile in self.options.profiles:
-            for entry in profile.settings:
-                yield f"--set {entry.key}={json.dumps(plain(entry.value), ensure_ascii=False)}"
-        yield from (f"--set {text}" for text in self.options.sets)
+        # A record holds no files of profiles: they stand there as if each had been set.
+        for profile in self.profiles:
+            for key, value in profile.settings.items():
+                yield f"--set {key}={json.dumps(value, ensure_ascii=False)}"
+        yield from (f"--set {text}" for text in self.sets)
 
     def _data_options(self) -> Iterator[str]:
-        datasets = self.options.datasets
-        if isinstance(datasets, Mapping):
-            yield f"datasets={first_few(list(datasets))}"
-        elif datasets:
-            yield f"--datasets {Path(datasets).name}"
-        yield from (f"--only-data {text}" for text in self.options.only_data)
+        if isinstance(self.datasets, Mapping):
+            yield f"datasets={first_few(list(self.datasets))}"
+        elif self.datasets:
+            yield f"--datasets {Path(self.datasets).name}"
+        yield from (f"--only-data {text}" for text in self.only_data)
 
-    def _name(self, table: Table) -> str:
-        if table.get(NAME.name) is not None:
-            return NAME.read(table, "", self.log) or ""
-        check_name(self.path.stem, table.position, NAME.name, self.log)
-        return self.path.stem
+    # Steps ----------------------------------------------------------------------------------------
 
-    def _compare(
-        self,
-        entry: Entry | None,
-        steps: Sequence[DraftStep],
-        step_names: Sequence[str],
-        datasets: Sequence[str],
-    ) -> Comparison | None:
-        if entry is None:
-            return None
-        comparison = read_compare(entry.value, steps, step_names, datasets, self.log)
-        if comparison is not None:
-            check_baseline(comparison, entry.position, self.log)
-        return comparison
+    def _steps(self, sections: Mapping[str, StepSection]) -> Iterator[DraftStep]:
+        for name, section in sections.items():
+            location = (_STEPS, name)
+            if name == INPUTS:
+                message = "a step cannot be called inputs, which names files"
+                self.log.report(location, message, at_key=True)
+                continue
+            is_varied = section.variants is not None
+            yield DraftStep(
+                location=location,
+                name=name,
+                calls=self._variants(section, location)
+                if is_varied
+                else (self._call("", section, location),),
+                inputs=section.in_,
+                only_if=section.if_,
+                unless=section.unless,
+                is_varied=is_varied,
+            )
 
-    def _step(
-        self, draft: DraftStep, overrides: Mapping[CallName, tuple[Override, ...]]
-    ) -> WorkflowStep:
-        variants = []
-        for variant in draft.variants:
-            call = CallName(step=draft.name, variant=variant.call.name)
-            params = resolve_params(variant, overrides.get(call, ()), self.log)
-            variants.append(replace(variant.call, params=params.resolved, params_set=params.as_set))
-        return WorkflowStep(
-            name=draft.name,
-            variants=tuple(variants),
-            inputs={
-                port.name: tuple(placed.reference for placed in port.references)
-                for port in draft.ports
-            },
-            only_if=draft.only_if.reference.name if draft.only_if else "",
-            unless=draft.unless.reference.name if draft.unless else "",
-            is_varied=draft.is_varied,
+    def _variants(self, section: StepSection, location: Location) -> tuple[DraftCall, ...]:
+        for key in _OF_CALLS:
+            if self.log.value((*location, key)) is not None:
+                message = f"with variants, {key} belongs into each of them"
+                self.log.report((*location, key), message, at_key=True)
+        calls = [
+            self._call(name, call, (*location, "variants", name))
+            for name, call in (section.variants or {}).items()
+        ]
+        if (
+            isinstance(table := self.log.value((*location, "variants")), Table)
+            and not table.entries
+        ):
+            self.log.report((*location, "variants"), "expected at least one variant")
+        kinds = [call.kind.name for call in calls if call.kind is not None]
+        for call in calls:
+            if call.kind is None:
+                continue
+            if call.kind.is_source:
+                message = f"{call.method} is a source, and sources take no variants; give it a step"
+                self.log.report((*call.location, "use"), message)
+            elif call.kind.name != kinds[0]:
+                message = (
+                    "variants of a step must be of one kind, got "
+                    f"{call.kind.name} beside {kinds[0]}"
+                )
+                self.log.report((*call.location, "use"), message)
+        return tuple(calls)
+
+    def _call(self, name: str, call: CallSection, location: Location) -> DraftCall:
+        if self.log.value((*location, "use")) is None:
+            message = "needs the key use, a method such as plane.hough2d"
+            self.log.report(location, message, at_key=True)
+        kind = self.catalog.kinds.get((call.use or "").partition(".")[0])
+        return DraftCall(
+            location=location,
+            name=name,
+            call=call,
+            info=self._method(call.use, (*location, "use")) if call.use else None,
+            kind=kind.spec if kind is not None and kind.state == "fine" else None,
+        )
+
+    def _method(self, method: str, location: Location) -> MethodInfo | None:
+        try:
+            return describe_method(self.catalog, method)
+        except WorkflowError as error:
+            self.log.report(location, str(error))
+        except PluginError as error:
+            self.log.report_plugin(location, str(error))
+        return None
+
+    def _step(self, draft: DraftStep, overrides: Overrides) -> WorkflowStep:
+        return draft.checked(
+            resolve_call(call, overrides.get((draft.name, call.name), ()), self.log)
+            for call in draft.calls
         )

@@ -1,33 +1,74 @@
-"""Inputs of a workflow: what its file names, what `--input` puts in the place, what is there."""
+"""Inputs and datasets of a workflow: what names files, what takes their place, what is there."""
 
 from __future__ import annotations
 
+import csv
 import glob
 import os
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import InputError
-from orthoflow.files.yaml_positions import Value, join
+from orthoflow.errors import InputError, WorkflowError
+from orthoflow.files.yaml_positions import (
+    Entry,
+    Listing,
+    Position,
+    Table,
+    Text,
+    Value,
+    describe,
+    plain,
+)
 from orthoflow.products.input_files import InputFiles
-from orthoflow.workflow.format import FILES, INPUT, INPUTS, OPTIONAL, Workflow, WorkflowInputSpec
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.products.product import JsonValue
+from orthoflow.workflow.model import (
+    DATA,
+    SEED,
+    Dataset,
+    DatasetSection,
+    DatasetsSection,
+    InputSection,
+    SeedSweep,
+    StepVariant,
+    Workflow,
+    WorkflowFile,
+    WorkflowInputSpec,
+)
+from orthoflow.workflow.parameters import (
+    SWEEP,
+    DraftStep,
+    Overrides,
+    Report,
+    overrides_of_settings,
+    resolve_call,
+)
+from orthoflow.workflow.source import Location, ProblemLog, read_text, validate
 
 # Files and folders that are looked at for one input: `/**` would go on for hours.
 MOST_LOOKED_AT: Final = 100_000
+MOST_TABLE_BYTES: Final = 4_000_000
+MOST_DATASETS: Final = 10_000
+MOST_COLUMNS: Final = 200
+MOST_LINE: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
+_DATASETS: Final = "datasets"
+_NUMBER: Final = re.compile(r"-?(0|[1-9]\d{0,14})(\.\d{1,15})?")
+# The first of them that the header has.
+_SEPARATORS: Final = (";", "\t", ",")
 
 
 class MissingInputsError(InputError):
-    """Input files are missing; `problems` says which, of many the first."""
+    """Input files are missing; `problems` names them, of many the first."""
 
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
@@ -36,27 +77,33 @@ class MissingInputsError(InputError):
         super().__init__("\n".join([*problems[:most], *more]))
 
 
-def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, WorkflowInputSpec]:
-    """Read the section `inputs`.
+# Inputs of the file and of the command line -------------------------------------------------------
 
-    Args:
-        value: the section.
-        folder: folder of the workflow file.
-        log: takes the problems.
-    """
-    specs: dict[str, WorkflowInputSpec] = {}
-    for entry in INPUTS.shape.read(value, INPUTS.name, log) or ():
-        path = join(INPUTS.name, entry.key)
-        table = INPUT.read(entry.value, path, log)
-        named = table.get(FILES.name) if table else None
-        specs[entry.key] = WorkflowInputSpec(
-            name=entry.key,
-            files=(FILES.read(table, path, log) or ()) if table else (),
-            optional=bool(table and OPTIONAL.read(table, path, log)),
+
+def input_specs(
+    sections: Mapping[str, InputSection], folder: Path, log: ProblemLog
+) -> dict[str, WorkflowInputSpec]:
+    """Return the inputs of a workflow file that lies in a folder."""
+    return {
+        name: WorkflowInputSpec(
+            name=name,
+            files=section.files,
+            optional=section.optional,
             folder=folder,
-            place=log.place(named.value.position, join(path, FILES.name)) if named else None,
+            place=log.place(("inputs", name, "files")) if section.files else None,
         )
-    return specs
+        for name, section in sections.items()
+    }
+
+
+def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
+    """Return what the text of a workflow file names for each input, without `--input`."""
+    log = ProblemLog(file="")
+    tree = log.parse(source)
+    section = tree.get("inputs") if isinstance(tree, Table) else None
+    data = {"inputs": plain(section.value)} if section else {}
+    file = validate(WorkflowFile, data, log) or WorkflowFile()
+    return {name: spec.files for name, spec in file.inputs.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +140,7 @@ def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOpti
         if name and path:
             options.append(InputOption(name=name, path=path))
         else:
-            log.add_option(f"--input {text}", "expected NAME=PATH")
+            log.report_option(f"--input {text}", "expected NAME=PATH")
     return tuple(options)
 
 
@@ -105,7 +152,7 @@ def override_inputs(
     for option in options:
         name = option.name
         if name not in specs:
-            log.add_option(
+            log.report_option(
                 str(option),
                 f"there is no input {name}{did_you_mean(name, specs)}; inputs: {some_of(specs)}",
             )
@@ -124,23 +171,35 @@ def check_shared_inputs(
     for option in options:
         if option.name in workflow.inputs and option.name not in workflow.input_specs:
             example = workflow.chosen_data[0].inputs[option.name].name
-            log.add_option(
+            log.report_option(
                 str(option),
                 f"every dataset has its own {option.name}; name that of one of them, as in --input "
                 f"{example}=PATH",
             )
 
 
+def some_of(names: Collection[str]) -> str:
+    """Name what there is, of many only the first.
+
+    >>> some_of(["scan", "photos"]), some_of([])
+    ('scan, photos', 'none')
+    """
+    return first_few(list(names), most=_MOST_LISTED) or "none"
+
+
+# Looking for files --------------------------------------------------------------------------------
+
+
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
     """Find the files of every input, sorted by name; None for optional data that are absent.
 
-    A file stands for itself, a folder for the files directly in it (hidden ones left out), a
-    pattern for the files it matches (`**` for folders at any depth).
+    A file stands for itself, a folder for the files in it and its subfolders (hidden ones left
+    out), a pattern for the files it matches (`**` for folders at any depth).
 
     Raises:
         InputError: a file is missing, a folder is empty, a pattern matches nothing, or an input
-            that is not optional was given no files; says so of every input. An optional input may
-            be missing unless it was named on the command line or by a dataset.
+            that is not optional was given no files; names every input. An optional input may be
+            missing unless it was named on the command line or by a dataset.
     """
     found: dict[str, InputFiles | None] = {}
     missing: list[str] = []
@@ -163,7 +222,7 @@ def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
             _resolve(spec)
         except InputError as error:
             place = _place(spec)
-            log.add_input(spec.place if place else None, str(error).removeprefix(place))
+            log.report_input(spec.place if place else None, str(error).removeprefix(place))
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
@@ -173,15 +232,6 @@ def present_inputs(workflow: Workflow) -> frozenset[str]:
         for spec in workflow.input_specs.values()
         if not spec.optional or _resolve(spec) is not None
     )
-
-
-def some_of(names: Collection[str]) -> str:
-    """Name what there is, of many only the first.
-
-    >>> some_of(["scan", "photos"]), some_of([])
-    ('scan, photos', 'none')
-    """
-    return first_few(list(names), most=_MOST_LISTED) or "none"
 
 
 def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
@@ -203,7 +253,7 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
 
 def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     path = spec.folder / pattern
-    beside = f"the table {spec.said_in}" if spec.said_in else "the workflow"
+    beside = f"the table {spec.table}" if spec.table else "the workflow"
     where = " in the working directory" if spec.is_given else f" beside {beside} ({path})"
     if Path(pattern).is_absolute():
         where = ""
@@ -213,6 +263,9 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         missing = f"the folder {pattern}{where} holds no files"
     elif path.exists():
         files, missing = [path], ""
+    elif path.is_symlink():
+        files = []
+        missing = f"{pattern}{where} is a link to {path.readlink()}, which is not there"
     elif glob.has_magic(pattern):
         # Names may themselves hold brackets; only what is no existing path is taken as a pattern.
         files = [match for match in look.for_pattern(spec.folder, pattern) if match.is_file()]
@@ -229,7 +282,7 @@ def _place(spec: WorkflowInputSpec) -> str:
 
 
 def _meant(path: Path) -> str:
-    """Ask whether a file beside it was meant, empty where none is called alike."""
+    """Ask whether a file beside it was meant, empty where none has a similar name."""
     with suppress(OSError):
         beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
         return did_you_mean(path.name, beside)
@@ -244,7 +297,7 @@ class _Look:
         self._n_seen = 0
 
     def into(self, folder: Path) -> Iterator[Path]:
-        """Give what lies in a folder, nothing when it cannot be read.
+        """Return what lies in a folder, nothing when it cannot be read.
 
         Raises:
             InputError: it was too much.
@@ -274,7 +327,7 @@ class _Look:
                     yield path
 
     def for_pattern(self, folder: Path, pattern: str) -> list[Path]:
-        """Give what a pattern matches below a folder, as `glob` does with `recursive`.
+        """Return what a pattern matches below a folder, as `glob` does with `recursive`.
 
         Raises:
             InputError: it was too much.
@@ -289,7 +342,11 @@ class _Look:
 
     def _matches(self, folder: Path, part: str) -> Iterator[Path]:
         if part == "**":
-            yield from self._below(folder)
+            waiting = [folder]
+            while waiting:
+                place = waiting.pop()
+                yield place
+                waiting += (path for path in self.into(place) if path.name[0] != ".")
         elif not glob.has_magic(part) or os.path.lexists(folder / part):
             yield folder / part
         else:
@@ -297,9 +354,394 @@ class _Look:
                 if fnmatchcase(path.name, part) and (path.name[0] != "." or part[0] == "."):
                     yield path
 
-    def _below(self, folder: Path) -> Iterator[Path]:
-        waiting = [folder]
-        while waiting:
-            place = waiting.pop()
-            yield place
-            waiting += (path for path in self.into(place) if path.name[0] != ".")
+
+# Seeds --------------------------------------------------------------------------------------------
+
+
+def read_seeds(value: Value | None, log: ProblemLog, location: Location) -> tuple[int, ...]:
+    """Read a seed, or a sweep of seeds; empty for nothing usable."""
+    if value is None:
+        return ()
+    data = plain(value)
+    if isinstance(data, dict):
+        swept = validate(SeedSweep, data, log, location)
+        seeds = tuple(swept.sweep) if swept else ()
+        if again := [seed for index, seed in enumerate(seeds) if seed in seeds[:index]]:
+            log.report((*location, SWEEP), f"{again[0]} is swept twice; leave one of them out")
+        return tuple(dict.fromkeys(seeds))
+    try:
+        SeedSweep.model_validate({SWEEP: [data, 0]})
+    except ValueError:
+        message = "expected a whole number from 0 on, or {sweep: [NUMBER, NUMBER, ...]}"
+        log.report(location, f"{message}, got {describe(value)}")
+        return ()
+    return (data,) if isinstance(data, int) else ()
+
+
+def check_no_step(
+    steps: Sequence[DraftStep], factor: str, log: ProblemLog, location: Location
+) -> None:
+    """Refuse a step that has the name of a factor of addresses."""
+    if any(step.name == factor for step in steps):
+        what = {DATA: "the dataset", SEED: "the seed"}[factor]
+        log.report(
+            location,
+            f"a step is called {factor}, which stands for {what} in addresses; give the step "
+            "another name",
+            at_key=True,
+        )
+
+
+# Datasets -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Origin:
+    """Where datasets are named.
+
+    Attributes:
+        log: of the file.
+        folder: what relative paths start from.
+        table: the file's name, empty for the workflow itself.
+        is_given: its paths were given with the call, from the working directory.
+    """
+
+    log: ProblemLog
+    folder: Path
+    table: str = ""
+    is_given: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetReader:
+    """Reads datasets against what a workflow has.
+
+    Attributes:
+        folder: of the workflow.
+        inputs: of the workflow, with those of `--input`.
+        steps: of the workflow.
+        overrides: of `--set`, which go over those of datasets.
+        calls: (step, variant) -> the call without datasets; those with mistakes are missing.
+        log: takes the problems.
+    """
+
+    folder: Path
+    inputs: Mapping[str, WorkflowInputSpec]
+    steps: Sequence[DraftStep]
+    overrides: Overrides
+    calls: Mapping[tuple[str, str], StepVariant]
+    log: ProblemLog
+
+    def read(
+        self, section: Value | None, table: str | Mapping[str, JsonValue]
+    ) -> dict[str, Dataset]:
+        """Read the table of `--datasets`, else the section, which may name a table itself.
+
+        Args:
+            section: of the workflow file.
+            table: of the command line, relative to the working directory; empty for none. From
+                Python it may be what the section would state, with paths from there, too.
+        """
+        if isinstance(table, Mapping):
+            log = self.log.beside("datasets=", "")
+            log.tree, log.unnamed = _unplaced({_DATASETS: dict(table)}), _DATASETS
+            return self._named(_Origin(log=log, folder=Path.cwd(), is_given=True))
+        if table:
+            report = partial(self.log.report_option, f"--datasets {table}")
+            return self._from_table(Path(table), table, report)
+        if section is None:
+            return {}
+        if isinstance(section, Text) and isinstance(section.value, str) and section.value:
+            report = partial(self.log.report, (_DATASETS,))
+            return self._from_table(self.folder / section.value, section.value, report)
+        if not isinstance(section, Table):
+            form = "a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"
+            self.log.report((_DATASETS,), f"expected {form}, got {describe(section)}")
+            return {}
+        return self._named(_Origin(log=self.log, folder=self.folder))
+
+    def _from_table(self, path: Path, name: str, report: Report) -> dict[str, Dataset]:
+        try:
+            text = read_text(path, "a table of datasets", MOST_TABLE_BYTES)
+        except WorkflowError as error:
+            missing = f"there is no table of datasets {path}"
+            report(str(error) if os.path.lexists(path) else missing)
+            return {}
+        log = self.log.beside(name, text)
+        rows = read_rows(log)
+        if not rows.entries:
+            if not log.has_any:
+                report(f"the table {name} holds no dataset")
+            return {}
+        start = Position(line=1, column=1)
+        entry = Entry(position=start, key=_DATASETS, value=rows)
+        log.tree, log.unnamed = Table(position=start, entries=(entry,)), _DATASETS
+        return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
+
+    def _named(self, origin: _Origin) -> dict[str, Dataset]:
+        """Read the mapping that stands under `datasets` in the origin's tree."""
+        log = origin.log
+        check_no_step(self.steps, DATA, log, (_DATASETS,))
+        value = log.value((_DATASETS,))
+        assert isinstance(value, Table)  # noqa: S101 - by the callers
+        if not value.entries:
+            log.report((_DATASETS,), "expected at least one dataset")
+        # What names no input gets no second problem for its value.
+        known = {"set", *self.inputs}
+        data: dict[str, JsonValue] = {}
+        for entry in value:
+            data[entry.key] = plain(entry.value)
+            if isinstance(entry.value, Table):
+                items = {item.key: item.value for item in entry.value}
+                for key in items.keys() - known:
+                    self._report_unknown(key, (_DATASETS, entry.key, key), origin)
+                data[entry.key] = {k: plain(v) for k, v in items.items() if k in known}
+        section = validate(DatasetsSection, {_DATASETS: data}, log)
+        found = section.datasets if section else {}
+        return {name: self._dataset(name, one, origin) for name, one in found.items()}
+
+    def _dataset(self, name: str, section: DatasetSection, origin: _Origin) -> Dataset:
+        log, here = origin.log, (_DATASETS, name)
+        line = log.position(here, at_key=True).line
+        specs = {
+            key: WorkflowInputSpec(
+                name=f"{key}@{name}",
+                files=files,
+                folder=origin.folder,
+                is_given=origin.is_given,
+                place=log.place((*here, key)),
+                table=f"{origin.table}:{line}" if origin.table else "",
+            )
+            for key, files in (section.model_extra or {}).items()
+        }
+        for key, spec in self.inputs.items():
+            is_named = log.value((*here, key)) is not None
+            if not is_named and not spec.files and not spec.optional:
+                log.report(
+                    here,
+                    f"the dataset names no files for the input {key}, and neither does the "
+                    f"workflow; give it {key}",
+                    at_key=True,
+                )
+        place = (*here, "set", SEED)
+        settings = {key: value for key, value in section.set.items() if key != SEED}
+        return Dataset(
+            name=name,
+            inputs=specs,
+            sets=section.set,
+            seeds=read_seeds(log.value(place), log, place),
+            calls=self._calls(settings, (*here, "set"), origin),
+        )
+
+    def _report_unknown(self, key: str, location: Location, origin: _Origin) -> None:
+        step, _, parameter = key.partition(".")
+        meant = ""
+        if key == SEED or (parameter and any(one.name == step for one in self.steps)):
+            meant = f"; parameters stand in set: {{set: {{{key}: VALUE}}}}"
+        elif origin.table:
+            # A table has parameters by the dot in the names of their columns.
+            meant = "; columns of parameters are called step.parameter"
+        origin.log.report(
+            location,
+            f"there is no input {key}{did_you_mean(key, self.inputs)}; inputs: "
+            f"{', '.join(self.inputs) or 'none'}{meant}",
+            at_key=True,
+            # A column of a table is reported once, not for every line.
+            shown=(key,) if origin.table else None,
+        )
+
+    def _calls(
+        self, settings: Mapping[str, JsonValue], location: Location, origin: _Origin
+    ) -> dict[tuple[str, str], StepVariant]:
+        assigned = overrides_of_settings(
+            settings, location, self.steps, origin.log, is_column=bool(origin.table)
+        )
+        shown = location[:-1] if origin.table else None
+        blame = partial(origin.log.report, location, shown=shown)
+        calls = {}
+        for step in self.steps:
+            for draft in step.calls:
+                name = (step.name, draft.name)
+                if name not in assigned:
+                    continue
+                call = self.calls.get(name)
+                overrides = (*assigned[name], *self.overrides.get(name, ()))
+                # Of a call with mistakes of its own, those are reported at their places, and once.
+                resolved = resolve_call(draft, overrides, self.log, blame if call else None)
+                if call is not None:
+                    calls[name] = resolved
+        return calls
+
+
+def _unplaced(value: JsonValue) -> Value:
+    """Return what a document would hold for a value that comes from none."""
+    nowhere = Position(line=0, column=0)
+    if isinstance(value, dict):
+        entries = [
+            Entry(position=nowhere, key=key, value=_unplaced(item)) for key, item in value.items()
+        ]
+        return Table(position=nowhere, entries=tuple(entries))
+    if isinstance(value, list):
+        return Listing(position=nowhere, items=tuple(map(_unplaced, value)))
+    return Text(position=nowhere, value=value)
+
+
+def choose_data(
+    texts: Sequence[str], datasets: Mapping[str, Dataset], log: ProblemLog
+) -> tuple[str, ...]:
+    """Read what stands behind each `--only-data`: names of datasets with commas between them."""
+    chosen: dict[str, None] = {}
+    for text in texts:
+        for name in (part.strip() for part in text.split(",")):
+            if name in datasets:
+                chosen[name] = None
+            elif not datasets and log.has_any:
+                # The names in a table that cannot be read are unknown.
+                continue
+            elif not datasets:
+                log.report_option(f"--only-data {text}", "the workflow has no datasets")
+            else:
+                log.report_option(
+                    f"--only-data {text}",
+                    f"there is no dataset {name or 'without a name'}"
+                    f"{did_you_mean(name, datasets)}; datasets: {some_of(datasets)}",
+                )
+    return tuple(chosen)
+
+
+# Tables of datasets -------------------------------------------------------------------------------
+
+
+def read_rows(log: ProblemLog) -> Table:
+    """Read the lines of a table as a mapping from names to datasets, with their places.
+
+    Columns are separated by semicolons, tabs or commas. A column with a dot in its name, or called
+    `seed`, goes into the dataset's `set`, its values read as YAML; empty places are left out. Keys
+    have the position of their column in the header, so that what is wrong with a column is reported
+    once.
+    """
+    rows = _rows(log)
+    header = next(rows, None)
+    start = Position(line=1, column=1)
+    if header is None:
+        log.add(start, "", "a table of datasets begins with a line of column names, got none")
+    columns = _columns(header, log) if header else {}
+    entries: dict[str, Entry] = {}
+    for row in rows if "name" in columns else ():
+        entry = _row(row, columns, log)
+        if entry is None:
+            continue
+        if entry.key in entries:
+            line = entries[entry.key].position.line
+            log.add(
+                entry.position,
+                "name",
+                f"the dataset {entry.key} is there already, in line {line}; give it another name",
+            )
+        elif len(entries) == MOST_DATASETS:
+            log.add(entry.position, "", f"a table has at most {MOST_DATASETS} datasets")
+            break
+        else:
+            entries[entry.key] = entry
+    return Table(position=start, entries=tuple(entries.values()))
+
+
+def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
+    """Return the fields of every line that holds something, each a text with its place."""
+    separator = ""
+    for number, line in enumerate(log.lines, start=1):
+        start = Position(line=number, column=1)
+        if not line.strip() or line.lstrip()[0] == "#":
+            continue
+        if len(line) > MOST_LINE:
+            log.add(start, "", f"a line has at most {MOST_LINE} letters, got {len(line)}")
+            return
+        separator = separator or next((mark for mark in _SEPARATORS if mark in line), ",")
+        try:
+            fields = next(csv.reader([line], delimiter=separator, strict=True))
+        except (csv.Error, StopIteration) as error:
+            log.add(start, "", f"the line cannot be read as CSV: {error}")
+            continue
+        placed, at = [], 0
+        for field in fields:
+            # A field with doubled quotes is not found as it is written; its place is about right.
+            at = max(at, line.find(field, at))
+            position = Position(line=number, column=at + 1)
+            placed.append(Text(position=position, value=field.strip()))
+            at += len(field)
+        yield tuple(placed)
+
+
+def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, tuple[int, Position]]:
+    """Return index and position of the columns by name; those without one are left out."""
+    columns: dict[str, tuple[int, Position]] = {}
+    start = header[0].position
+    if len(header) > MOST_COLUMNS:
+        log.add(start, "", f"a table has at most {MOST_COLUMNS} columns, got {len(header)}")
+        return {}
+    for index, field in enumerate(header):
+        name = str(field.value)
+        if name in columns:
+            log.add(field.position, name, f"the column {name} is there twice; remove one of them")
+        elif name:
+            columns[name] = (index, field.position)
+    if "name" not in columns:
+        listed = ", ".join(columns) or "none"
+        is_mapping = any(": " in name or name.endswith(":") for name in columns)
+        way_out = "; a mapping stands in the workflow, under datasets:" if is_mapping else ""
+        log.add(
+            start,
+            "",
+            f"a table of datasets needs the column name; its columns are {listed}{way_out}",
+        )
+    return columns
+
+
+def _row(
+    row: tuple[Text, ...], columns: Mapping[str, tuple[int, Position]], log: ProblemLog
+) -> Entry | None:
+    """Return what a line states of its dataset."""
+    start = row[0].position
+    places = [index for index, field in enumerate(row) if field.value]
+    if not places:
+        return None
+    named = {index for index, _ in columns.values()}
+    if unnamed := [index for index in places if index not in named]:
+        field = row[unnamed[0]]
+        message = (
+            f"{field.value} stands in column {unnamed[0] + 1}, which has no name in the header"
+        )
+        log.add(field.position, "", message)
+        return None
+    if columns["name"][0] not in places:
+        log.add(start, "name", "the dataset needs a name in the column name")
+        return None
+    files, sets = [], []
+    for key, (index, position) in columns.items():
+        if key == "name" or index not in places:
+            continue
+        field = row[index]
+        if "." not in key and key != SEED:
+            files.append(Entry(position=position, key=key, value=field))
+        elif (value := _as_yaml(field, key, log)) is not None:
+            sets.append(Entry(position=position, key=key, value=value))
+    if sets:
+        table = Table(position=start, entries=tuple(sets))
+        files.append(Entry(position=start, key="set", value=table))
+    inner = Table(position=start, entries=tuple(files))
+    name = row[columns["name"][0]]
+    return Entry(position=name.position, key=str(name.value), value=inner)
+
+
+def _as_yaml(field: Text, key: str, log: ProblemLog) -> Value | None:
+    """Read what stands in a column of parameters, as behind `--set`."""
+    text = str(field.value)
+    if _NUMBER.fullmatch(text):
+        # A thousand rooms have a thousand numbers, and to read each as YAML takes milliseconds.
+        return replace(field, value=float(text) if "." in text else int(text))
+    own = ProblemLog(file="")
+    value = own.parse(text)
+    if value is None or own.has_any:
+        log.add(field.position, key, "the value cannot be read as YAML; quote it")
+        return None
+    return replace(value, position=field.position)

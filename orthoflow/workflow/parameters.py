@@ -1,44 +1,57 @@
-"""Parameters of method calls: those of the file, those of `--set`, and the defaults."""
+"""Parameters of method calls: those of the file, of `--set` and of sweeps, and the defaults."""
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+import math
+import re
+import types
+import typing
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import groupby
-from typing import Final, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import ArgumentError
-from orthoflow.files.yaml_positions import (
-    Listing,
-    Position,
-    Table,
-    Value,
-    describe_scalar,
-    join,
-    plain,
-    read_yaml,
-)
+from orthoflow.files.yaml_positions import describe_scalar
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.format import CALL, PARAMS
-from orthoflow.workflow.hints import meant_number, meant_parameter, written_form
-from orthoflow.workflow.methods import MethodInfo
-from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
-from orthoflow.workflow.steps import DraftStep, DraftVariant
+from orthoflow.sdk.hooks import KindSpec
+from orthoflow.sdk.methods import Method, PortSpec, port_specs
+from orthoflow.workflow.model import (
+    MOST_SWEPT,
+    CallSection,
+    Reference,
+    StepVariant,
+    SweepSection,
+    WorkflowStep,
+)
+from orthoflow.workflow.source import (
+    InvalidWorkflowError,
+    Location,
+    ProblemLog,
+    as_plain,
+    validate,
+)
 
 Report: TypeAlias = Callable[[str], None]
 
 # Keys of a call that are written among its parameters.
-_BESIDE: Final = {key.name for key in CALL.keys} - {PARAMS.name}
+_BESIDE: Final = CallSection.model_fields.keys() - {"params"}
+SWEEP: Final = "sweep"
 # Letters of a value that a message repeats.
 _SHOWN: Final = 60
+# Letters of a name, see `NAME_PATTERN`; fewer letters of a parameter would not show which it is.
+_LETTERS: Final = 32
+_MIN_LETTERS: Final = 4
 # What pydantic calls a list or a mapping of another form, and a value of another type in one.
 _OF_LISTS: Final = frozenset(
     ("tuple_type", "list_type", "dict_type", "missing", "too_long", "too_short")
@@ -46,6 +59,120 @@ _OF_LISTS: Final = frozenset(
 _OF_LEAVES: Final = frozenset(
     ("float_type", "int_type", "string_type", "bool_type", "finite_number", "int_from_float")
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodInfo:
+    """A loaded method.
+
+    Attributes:
+        id: method id.
+        method: its class.
+        is_source: it has ports of its own and takes no variants.
+        takes: input ports it does not ignore.
+        gives: output port -> product type.
+    """
+
+    id: str
+    method: type[Method]
+    is_source: bool
+    takes: Mapping[str, PortSpec]
+    gives: Mapping[str, str]
+
+
+def describe_method(catalog: Catalog, method_id: str) -> MethodInfo:
+    """Load a method and read its ports.
+
+    Raises:
+        WorkflowError: no plugin brings a method of that id.
+        PluginError: it cannot be loaded.
+    """
+    entry = catalog.method(method_id)
+    method = entry.load()
+    return MethodInfo(
+        id=method_id,
+        method=method,
+        is_source=entry.kind is not None and entry.kind.is_source,
+        takes=port_specs(method.In),
+        gives={port.name: port.type_name for port in port_specs(method.Out).values()},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftCall:
+    """A method call as the file states it, with its place.
+
+    Attributes:
+        location: of the mapping that holds `use`.
+        name: of the variant, empty for a step without variants.
+        call: what the file states; its parameters without sweeps.
+        info: the method, None when it cannot be loaded.
+        kind: ports of its kind, known even when the method is not.
+        swept: of a variant that a sweep made, the parameters and their values.
+        family: of such a variant, the name of the variant that it came from.
+        is_unswept: the file sweeps it, and the command line sets one value.
+    """
+
+    location: Location
+    name: str
+    call: CallSection
+    info: MethodInfo | None
+    kind: KindSpec | None
+    swept: Mapping[str, JsonValue] | None = None
+    family: str = ""
+    is_unswept: bool = False
+
+    @property
+    def method(self) -> str:
+        """Method id, empty where the file names none."""
+        return self.call.use or ""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the method's parameters."""
+        return tuple(self.info.method.Params.model_fields) if self.info else ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that `--set` may use for it.
+
+        A step without variants has its method's name, so that `plane.hough2d.cell_m` works in
+        recipes with and without variants; what was swept keeps the name that it had before, too.
+        """
+        method = self.method.partition(".")[2]
+        before = (self.family or method,) if self.swept else ()
+        return (*before, self.name or method)
+
+    def may_have(self, parameter: str) -> bool:
+        """Whether it has a parameter; a method that cannot be loaded may have any."""
+        return self.info is None or parameter in self.parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftStep:
+    """A step as the file states it, with its place."""
+
+    location: Location
+    name: str
+    calls: tuple[DraftCall, ...]
+    inputs: Mapping[str, tuple[Reference, ...]]
+    only_if: Reference | None
+    unless: Reference | None
+    is_varied: bool
+
+    def checked(self, calls: Iterable[StepVariant]) -> WorkflowStep:
+        """Return the step with its calls resolved."""
+        return WorkflowStep(
+            name=self.name,
+            variants=tuple(calls),
+            inputs=self.inputs,
+            only_if=self.only_if.name if self.only_if else "",
+            unless=self.unless.name if self.unless else "",
+            is_varied=self.is_varied,
+        )
+
+
+# Setting parameters -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,98 +190,183 @@ class Override:
     value: JsonValue
 
 
-@dataclass(frozen=True, kw_only=True)
-class CallName:
-    """Names a method call: step, and variant or nothing."""
-
-    step: str
-    variant: str
+# (step, variant) -> what is set; the variant is empty for a step without variants.
+Overrides: TypeAlias = dict[tuple[str, str], tuple[Override, ...]]
 
 
-def assign_overrides(
+def overrides_of_options(
     sets: Sequence[str], steps: Sequence[DraftStep], log: ProblemLog
-) -> Mapping[CallName, tuple[Override, ...]]:
+) -> Overrides:
     """Find the method calls that each `--set` means; what fits nowhere goes to the log."""
-    assigned: dict[CallName, list[Override]] = {}
+    assigned: Overrides = {}
     for text in sets:
-        report = partial(log.add_option, f"--set {text}")
+        report = partial(log.report_option, f"--set {text}")
         try:
             parts, value = _parse(text)
-            for call, override in _targets(report, parts, value, steps):
-                assigned.setdefault(call, []).append(override)
+            _assign(assigned, report, parts, value, steps)
         except ArgumentError as error:
             report(str(error))
-    return {call: tuple(overrides) for call, overrides in assigned.items()}
+    return assigned
 
 
-def assign_settings(
-    settings: Table,
-    path: str,
+def overrides_of_settings(
+    settings: Mapping[str, JsonValue],
+    location: Location,
     steps: Sequence[DraftStep],
     log: ProblemLog,
     *,
     is_column: bool = False,
-) -> Mapping[CallName, tuple[Override, ...]]:
+) -> Overrides:
     """Find the method calls that each `step.parameter: value` of a mapping means.
 
     Args:
         settings: the mapping.
-        path: what stands before its keys in problems.
+        location: of the mapping in the log's tree.
         steps: of the workflow.
         log: takes the problems.
-        is_column: the keys are columns of a table; problems of these bear the key alone, so that
-            they are told of once.
+        is_column: the keys are columns of a table; problems of these name the key alone, so that
+            each is reported once.
     """
-    assigned: dict[CallName, list[Override]] = {}
-    for entry in settings:
-        here = entry.key if is_column else join(path, entry.key)
-        parts = entry.key.split(".")
+    assigned: Overrides = {}
+    for key, value in settings.items():
+        here = (*location, key)
+        shown = (key,) if is_column else here
+        parts = key.split(".")
         if len(parts) < 2 or not all(parts):
-            log.add(entry.position, here, "expected step.parameter or step.variant.parameter")
+            message = "expected step.parameter or step.variant.parameter"
+            log.report(here, message, at_key=True, shown=shown)
             continue
-        report = partial(log.add, entry.value.position, join(path, entry.key))
         try:
-            for call, override in _targets(report, parts, plain(entry.value), steps):
-                assigned.setdefault(call, []).append(override)
+            _assign(assigned, partial(log.report, here), parts, value, steps)
         except ArgumentError as error:
-            log.add(entry.position, here, str(error))
-    return {call: tuple(overrides) for call, overrides in assigned.items()}
+            log.report(here, str(error), at_key=True, shown=shown)
+    return assigned
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResolvedParams:
-    """Parameters of a method call.
-
-    Attributes:
-        resolved: defaults included.
-        as_set: as written in the file or set on the command line.
-    """
-
-    resolved: Mapping[str, JsonValue] = field(default_factory=dict)
-    as_set: Mapping[str, JsonValue] = field(default_factory=dict)
+def joined(*several: Mapping[tuple[str, str], tuple[Override, ...]]) -> Overrides:
+    """Put overrides behind each other; later ones win."""
+    found: Overrides = {}
+    for overrides in several:
+        for call, own in overrides.items():
+            found[call] = (*found.get(call, ()), *own)
+    return found
 
 
-def resolve_params(
-    variant: DraftVariant,
+def _parse(text: str) -> tuple[list[str], JsonValue]:
+    key, mark, raw = text.partition("=")
+    parts = key.strip().split(".")
+    if not mark or len(parts) < 2 or not all(parts):
+        raise ArgumentError("expected step.parameter=value or step.variant.parameter=value")
+    if not raw.strip():
+        raise ArgumentError("expected a value behind the equals sign")
+    log = ProblemLog(file="the value")
+    value = log.parse(raw)
+    try:
+        log.raise_any()
+    except InvalidWorkflowError as error:
+        # A shell would have parted it at the space.
+        way_out = "" if " " in raw.strip() else "; quote it"
+        raise ArgumentError(
+            f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
+        ) from error
+    return parts, as_plain(value)
+
+
+def _assign(
+    assigned: Overrides,
+    report: Report,
+    parts: list[str],
+    value: JsonValue,
+    steps: Sequence[DraftStep],
+) -> None:
+    by_name = {step.name: step for step in steps}
+    step = by_name.get(parts[0])
+    if step is None:
+        raise ArgumentError(
+            f"there is no step {parts[0]}{did_you_mean(parts[0], by_name)}; steps: "
+            f"{', '.join(by_name)}"
+        )
+    calls, keys = _select_calls(step, parts[1:])
+    chosen = [call for call in calls if call.may_have(keys[0])]
+    if not chosen:
+        known = sorted({name for call in calls for name in call.parameters})
+        who = " or ".join(dict.fromkeys(call.method for call in calls))
+        meant = meant_parameter(keys[0], known, value) or did_you_mean(keys[0], known)
+        raise ArgumentError(
+            f"there is no parameter {keys[0]} in {who}{meant}; known: {', '.join(known) or 'none'}"
+        )
+    if any(keys[0] in (call.swept or ()) for call in chosen):
+        raise ArgumentError(
+            f"{keys[0]} is swept in step {step.name}, so its variants have its values; take the "
+            "sweep away, or this"
+        )
+    override = Override(report=report, keys=tuple(keys), value=value)
+    for call in chosen:
+        name = (step.name, call.name)
+        assigned[name] = (*assigned.get(name, ()), override)
+
+
+def _select_calls(step: DraftStep, parts: list[str]) -> tuple[tuple[DraftCall, ...], list[str]]:
+    if len(parts) == 1:
+        return step.calls, parts
+    head, *rest = parts
+    if named := tuple(call for call in step.calls if head in call.names):
+        return named, rest
+    if any(head in call.parameters for call in step.calls):
+        return step.calls, parts
+    names = dict.fromkeys(name for call in step.calls for name in call.names)
+    raise ArgumentError(
+        f"step {step.name} has no variant {head}{did_you_mean(head, names)}; it has "
+        f"{', '.join(names)}"
+    )
+
+
+# Resolving ----------------------------------------------------------------------------------------
+
+
+def resolve_call(
+    draft: DraftCall,
     overrides: Sequence[Override],
     log: ProblemLog,
     blame: Report | None = None,
-) -> ResolvedParams:
+) -> StepVariant:
     """Check the parameters of a method call, strictly: the text "0.003" is not a number.
 
     Args:
-        variant: the method call.
-        overrides: put over what the file says, one after the other.
-        log: takes the problems of what the file says.
+        draft: the method call.
+        overrides: put over what the file states, one after the other.
+        log: takes the problems of what the file states.
         blame: takes these in the log's place, for a call that is fine without the overrides.
+
+    Returns:
+        The call; without resolved parameters where they are wrong, or the method is unknown.
     """
-    written = plain(variant.params) if variant.params else {}
-    as_set: dict[str, JsonValue] = written if isinstance(written, dict) else {}
+    as_set: dict[str, JsonValue] = deepcopy(draft.call.params)
     for override in overrides:
         _put(as_set, override)
-    info = variant.info
+    return StepVariant(
+        name=draft.name,
+        method=draft.method,
+        params=_resolved(draft, as_set, overrides, log, blame),
+        params_set=as_set,
+        repeat=draft.call.repeat,
+        cores=draft.call.resources.cores,
+        timeout_s=draft.call.timeout,
+        swept=draft.swept or {},
+    )
+
+
+def _resolved(
+    draft: DraftCall,
+    as_set: Mapping[str, JsonValue],
+    overrides: Sequence[Override],
+    log: ProblemLog,
+    blame: Report | None,
+) -> Mapping[str, JsonValue]:
+    info = draft.info
     if info is None:
-        return ResolvedParams(as_set=as_set)
+        return {}
+    resolved: dict[str, JsonValue] = {}
     try:
         with foreign_code(f"checking the parameters of {info.id}"):
             params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
@@ -164,20 +376,17 @@ def resolve_params(
     except ValidationError as error:
         reports = {override.keys[0]: override.report for override in overrides}
         reporter = _Reporter(
-            variant=variant, info=info, as_set=as_set, reports=reports, log=log, blame=blame
+            draft=draft, info=info, as_set=as_set, reports=reports, log=log, blame=blame
         )
         reporter.report_all(error.errors())
-        return ResolvedParams(as_set=as_set)
+        return {}
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # noqa: BLE001 - a stranger's validator may raise anything
-        log.add_plugin(
-            variant.position,
-            f"{variant.path}.params",
-            f"checking the parameters of {info.id} failed: {describe_error(error)}",
-        )
-        return ResolvedParams(as_set=as_set)
-    return ResolvedParams(resolved=resolved, as_set=as_set)
+    except BaseException as error:  # noqa: BLE001 - a third party's validator may raise anything
+        message = f"checking the parameters of {info.id} failed: {describe_error(error)}"
+        log.report_plugin((*draft.location, "params"), message)
+        return {}
+    return resolved
 
 
 def _put(params: dict[str, JsonValue], override: Override) -> None:
@@ -197,7 +406,7 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
 class _Reporter:
     """Turns pydantic's errors into problems of the file, of a `--set` or of a dataset."""
 
-    variant: DraftVariant
+    draft: DraftCall
     info: MethodInfo
     as_set: Mapping[str, JsonValue]
     reports: Mapping[str, Report]
@@ -206,16 +415,16 @@ class _Reporter:
 
     def report_all(self, errors: Sequence[ErrorDetails]) -> None:
         """Report each; but what is wrong with the form of one list or mapping is one problem."""
-        for first, group in groupby(errors, key=lambda details: details["loc"][:1]):
-            told = list(group)
-            if form := self._other_form(str(first[0]) if first else "", told):
+        for first, group in itertools.groupby(errors, key=lambda details: details["loc"][:1]):
+            several = list(group)
+            if form := self._other_form(str(first[0]) if first else "", several):
                 self._report(first, form)
                 continue
-            for details in told:
+            for details in several:
                 self._report(details["loc"], self._message(details))
 
     def _other_form(self, name: str, errors: Sequence[ErrorDetails]) -> str:
-        """Say how a parameter is written whose value has another form; empty where it has not."""
+        """Return how a parameter is written whose value has another form, else nothing."""
         field_info = self.info.method.Params.model_fields.get(name)
         kinds = {details["type"] for details in errors if len(details["loc"]) > 1}
         kinds |= {details["type"] for details in errors} - {"missing"}
@@ -226,16 +435,21 @@ class _Reporter:
         given = given if len(given) <= _SHOWN else f"{given[:_SHOWN]} ..."
         return form and f"{name} is written {form}, got {given}"
 
-    def _report(self, location: tuple[int | str, ...], message: str) -> None:
-        name = str(location[0]) if location else ""
-        inside = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    def _report(self, loc: tuple[int | str, ...], message: str) -> None:
+        name = str(loc[0]) if loc else ""
         if report := self.reports.get(name, self.blame):
             # It names the parameter itself, but nothing inside it, and datasets not even that.
-            is_named = name in self.reports and len(location) == 1
+            inside = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
+            is_named = name in self.reports and len(loc) == 1
             who = inside[1:] or f"the parameters of {self.info.id}"
             report(message if is_named else f"{who}: {message}")
             return
-        self.log.add(self._position(location), f"{self.variant.path}.params{inside}", message)
+        params = (*self.draft.location, "params")
+        here = (*params, *loc)
+        if self.log.value(params) is None:
+            self.log.report((*self.draft.location, "use"), message, shown=here)
+        else:
+            self.log.report(here, message, at_key=bool(loc))
 
     def _message(self, details: ErrorDetails) -> str:
         location = details["loc"]
@@ -253,119 +467,348 @@ class _Reporter:
             case "value_error" | "assertion_error":
                 return str(details.get("ctx", {}).get("error", details["msg"]))
         words = details["msg"][:1].lower() + details["msg"][1:]
-        meant = meant_number(name, details["input"]) if "number" in words else ""
+        given = details["input"]
+        meant = meant_number(name, given) if "number" in words else ""
         if len(location) == 1 and details["type"].endswith(("_type", "enum", "literal_error")):
-            meant += self._swept(details["input"])
-        return f"{words}, got {_shown(details['input'])}{meant}"
+            meant += self._sweep_of(given)
+        shown = "a list" if isinstance(given, list) else "a mapping"
+        if not isinstance(given, list | dict):
+            shown = describe_scalar(given)
+        return f"{words}, got {shown}{meant}"
 
-    def _swept(self, value: object) -> str:
-        """Say how each value of a list is tried, to who wrote it in the place of one value."""
-        is_source = self.variant.kind is not None and self.variant.kind.is_source
+    def _sweep_of(self, value: object) -> str:
+        """Return how each value of a list is tried, for a list in the place of one value."""
+        is_source = self.draft.kind is not None and self.draft.kind.is_source
         if is_source or not isinstance(value, list) or len(value) < 2:
             return ""
         written = json.dumps(value)
         return f"; to try each: {{sweep: {written if len(written) <= _SHOWN else '[...]'}}}"
 
-    def _position(self, location: tuple[int | str, ...]) -> Position:
-        position = self.variant.position
-        if self.variant.params is None:
-            return position
-        position = self.variant.params.position
-        value: Value = self.variant.params
-        for part in location:
-            if isinstance(value, Table) and (entry := value.get(str(part))) is not None:
-                position, value = entry.position, entry.value
-            elif isinstance(value, Listing) and isinstance(part, int) and part < len(value.items):
-                value = value.items[part]
-                position = value.position
+
+# Sweeps -------------------------------------------------------------------------------------------
+
+# Parameter -> its values, each with what reports a problem of it.
+_Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]
+
+
+def expand_sweeps(
+    steps: Sequence[DraftStep], overrides: Overrides, log: ProblemLog
+) -> tuple[tuple[DraftStep, ...], Overrides]:
+    """Put a variant for each value in the place of every call that sweeps a parameter.
+
+    A `--set` of a swept parameter takes the place of the sweep, and may be one itself.
+
+    Returns:
+        The steps, and the overrides of their calls, the swept values among them.
+    """
+    expanded: list[DraftStep] = []
+    kept: Overrides = {}
+    for step in steps:
+        calls: list[DraftCall] = []
+        taken = {call.name for call in step.calls}
+        is_swept = False
+        for written in step.calls:
+            sweeps, others = _sweeps_of(written, overrides.get((step.name, written.name), ()), log)
+            call = _without_sweeps(written)
+            if sweeps and _may_vary(step, call, log):
+                is_swept = True
+                for variant, values in _variants(call, sweeps, taken):
+                    calls.append(variant)
+                    kept[step.name, variant.name] = (*values, *others)
             else:
-                break
-        return position
+                calls.append(replace(call, is_unswept=call != written))
+                kept[step.name, call.name] = others
+        expanded.append(replace(step, calls=tuple(calls), is_varied=step.is_varied or is_swept))
+    return tuple(expanded), kept
 
 
-def _shown(value: object) -> str:
-    if isinstance(value, list):
-        return "a list"
-    return "a mapping" if isinstance(value, dict) else describe_scalar(value)
+def _sweeps_of(
+    draft: DraftCall, overrides: Sequence[Override], log: ProblemLog
+) -> tuple[_Sweeps, tuple[Override, ...]]:
+    """Return what a call sweeps, and the overrides that sweep nothing."""
+    found: _Sweeps = {}
+    for name, value in draft.call.params.items():
+        if _is_sweep(value):
+            location = (*draft.location, "params", name)
+            swept = validate(SweepSection, deepcopy(value), log, location)
+            found[name] = [
+                (one, partial(log.report, (*location, SWEEP, index)))
+                for index, one in enumerate(swept.sweep if swept else ())
+            ]
+    others: list[Override] = []
+    for override in overrides:
+        parameter, *inside = override.keys
+        value = override.value
+        if inside == [SWEEP]:
+            value, inside = {SWEEP: value}, []
+        if not inside and _is_sweep(value):
+            try:
+                swept_values = SweepSection.model_validate(value).sweep
+                found[parameter] = [(one, override.report) for one in swept_values]
+            except ValidationError:
+                override.report(
+                    f"expected {{{SWEEP}: [VALUE, VALUE, ...]}} with 2 to {MOST_SWEPT} values and "
+                    "nothing beside it"
+                )
+            continue
+        found.pop(parameter, None)
+        others.append(override)
+    once = {name: _once(values) for name, values in found.items() if values}
+    return once, tuple(others)
 
 
-def _parse(text: str) -> tuple[list[str], JsonValue]:
-    key, mark, raw = text.partition("=")
-    parts = key.strip().split(".")
-    if not mark or len(parts) < 2 or not all(parts):
-        raise ArgumentError("expected step.parameter=value or step.variant.parameter=value")
-    if not raw.strip():
-        raise ArgumentError("expected a value behind the equals sign")
-    log = ProblemLog(file="the value")
-    value = read_yaml(raw, log)
-    try:
-        log.raise_any()
-    except InvalidWorkflowError as error:
-        # A shell would have parted it at the space.
-        way_out = "" if " " in raw.strip() else "; quote it"
-        raise ArgumentError(
-            f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
-        ) from error
-    return parts, None if value is None else plain(value)
+def _is_sweep(value: JsonValue) -> bool:
+    return isinstance(value, dict) and SWEEP in value
 
 
-def _targets(
-    report: Report, parts: list[str], value: JsonValue, steps: Sequence[DraftStep]
-) -> list[tuple[CallName, Override]]:
-    by_name = {step.name: step for step in steps}
-    step = by_name.get(parts[0])
-    if step is None:
-        raise ArgumentError(
-            f"there is no step {parts[0]}{did_you_mean(parts[0], by_name)}; steps: "
-            f"{', '.join(by_name)}"
-        )
-    variants, keys = _select_variants(step, parts[1:])
-    chosen = [variant for variant in variants if _may_have(variant, keys[0])]
-    if not chosen:
-        known = sorted({name for variant in variants for name in _parameters(variant)})
-        who = " or ".join(dict.fromkeys(variant.call.method for variant in variants))
-        meant = meant_parameter(keys[0], known, value) or did_you_mean(keys[0], known)
-        raise ArgumentError(
-            f"there is no parameter {keys[0]} in {who}{meant}; known: {', '.join(known) or 'none'}"
-        )
-    if any(keys[0] in variant.swept for variant in chosen):
-        raise ArgumentError(
-            f"{keys[0]} is swept in step {step.name}, so its variants have its values; take the "
-            "sweep away, or this"
-        )
-    override = Override(report=report, keys=tuple(keys), value=value)
-    return [(CallName(step=step.name, variant=variant.call.name), override) for variant in chosen]
+def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Report]]:
+    """Leave out what stands there twice, and report it at its place."""
+    kept: dict[str, tuple[JsonValue, Report]] = {}
+    for value, report in values:
+        text = _canonical(value)
+        if text in kept:
+            comma = "; if it begins numbers, decimals have a point: 0.5" if value == 0 else ""
+            report(f"{json.dumps(value)} is swept twice; leave one of them out{comma}")
+        kept.setdefault(text, (value, report))
+    return list(kept.values())
 
 
-def _select_variants(
-    step: DraftStep, parts: list[str]
-) -> tuple[tuple[DraftVariant, ...], list[str]]:
-    if len(parts) == 1:
-        return step.variants, parts
-    head, *rest = parts
-    if named := tuple(variant for variant in step.variants if head in _spoken_names(variant)):
-        return named, rest
-    if any(head in _parameters(variant) for variant in step.variants):
-        return step.variants, parts
-    names = dict.fromkeys(name for one in step.variants for name in _spoken_names(one))
-    raise ArgumentError(
-        f"step {step.name} has no variant {head}{did_you_mean(head, names)}; it has "
-        f"{', '.join(names)}"
+def _canonical(value: JsonValue) -> str:
+    # 1 and 1.0 are the same number.
+    whole = int(value) if isinstance(value, float) and value.is_integer() else value
+    return json.dumps(whole, sort_keys=True)
+
+
+def _without_sweeps(draft: DraftCall) -> DraftCall:
+    kept = {name: value for name, value in draft.call.params.items() if not _is_sweep(value)}
+    if len(kept) == len(draft.call.params):
+        return draft
+    return replace(draft, call=draft.call.model_copy(update={"params": kept}))
+
+
+def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
+    if draft.kind is None or not draft.kind.is_source:
+        return True
+    log.report(
+        (*draft.location, "use"),
+        f"{draft.method} is a source, and sources take no variants, so nothing of it can be "
+        f"swept; datasets can: {{a: {{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
+        shown=(*draft.location, "params"),
     )
+    return False
 
 
-def _spoken_names(variant: DraftVariant) -> tuple[str, ...]:
-    # A step without variants answers to its method's name, so that `plane.hough2d.cell_m` works in
-    # recipes with and without variants; what was swept answers to the name that it had before, too.
-    method = variant.call.method.partition(".")[2]
-    before = (variant.family or method,) if variant.swept else ()
-    return (*before, variant.call.name or method)
+def _variants(
+    draft: DraftCall, sweeps: _Sweeps, taken: set[str]
+) -> Iterator[tuple[DraftCall, tuple[Override, ...]]]:
+    """Make a variant of each combination of the values."""
+    combinations = [
+        dict(zip(sweeps, chosen, strict=True)) for chosen in itertools.product(*sweeps.values())
+    ]
+    names = variant_names(
+        draft.name, [{name: value for name, (value, _) in one.items()} for one in combinations]
+    )
+    for name, one in zip(names, combinations, strict=True):
+        free = next(text for text in _numbered(name) if text not in taken)
+        taken.add(free)
+        overrides = tuple(
+            Override(report=report, keys=(parameter,), value=value)
+            for parameter, (value, report) in one.items()
+        )
+        swept = {parameter: value for parameter, (value, _) in one.items()}
+        yield replace(draft, name=free, swept=swept, family=draft.name), overrides
 
 
-def _parameters(variant: DraftVariant) -> tuple[str, ...]:
-    return tuple(variant.info.method.Params.model_fields) if variant.info else ()
+def _numbered(name: str) -> Iterator[str]:
+    yield name
+    for count in itertools.count(2):
+        yield f"{name[: _LETTERS - len(str(count)) - 1]}-{count}"
 
 
-def _may_have(variant: DraftVariant, name: str) -> bool:
-    # A method that cannot be loaded is a problem of its own and may have any parameter.
-    return variant.info is None or name in _parameters(variant)
+def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) -> list[str]:
+    """Name the combinations of a sweep, whatever their order: exact values, else an index.
+
+    Args:
+        before: name of the variant that is swept, or nothing.
+        combinations: parameter -> value, the same parameters in each.
+
+    >>> variant_names("", [{"tolerance_m": 0.02}, {"tolerance_m": 1e-07}])
+    ['tolerance_m-0_02', 'tolerance_m-1em07']
+    >>> variant_names("fine", [{"mode": "A b"}, {"mode": "c"}])
+    ['fine-sweep-1', 'fine-sweep-2']
+    """
+    head = [before] if before else []
+    words = [[_word(value) for value in one.values()] for one in combinations]
+    parameters = list(combinations[0])
+    longest = sum(max(map(len, column)) for column in zip(*words, strict=True))
+    room = _LETTERS - longest - 2 * len(parameters) + 1 - sum(len(part) + 1 for part in head)
+    each = room // len(parameters)
+    short = [name.lower()[:each].rstrip("_-") for name in parameters]
+    is_plain = all(re.fullmatch(r"[a-z][a-z0-9_-]*", name) for name in short)
+    is_told = all(
+        len(cut) >= min(_MIN_LETTERS, len(name))
+        for cut, name in zip(short, parameters, strict=True)
+    )
+    if all(all(row) for row in words) and is_plain and is_told and len({*short}) == len(short):
+        pairs = [zip(short, row, strict=True) for row in words]
+        names = ["-".join([*head, *(f"{a}-{b}" for a, b in row)]) for row in pairs]
+        if max(Counter(names).values()) == 1:
+            return names
+    # Counted in the order of the values, so that the order of the list changes nothing.
+    keys = [[_ordered(one[name]) for name in sorted(one)] for one in combinations]
+    in_order = sorted(range(len(keys)), key=keys.__getitem__)
+    before = before[: _LETTERS - len(f"-{SWEEP}-{len(keys)}")]
+    head = [before] if before else []
+    return ["-".join([*head, SWEEP, str(1 + in_order.index(k))]) for k in range(len(keys))]
+
+
+def _ordered(value: JsonValue) -> tuple[int, float, str]:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return 0, float(value), ""
+    return 1, 0.0, _canonical(value)
+
+
+def _word(value: JsonValue) -> str:
+    """Return a value as a word of a name that states it exactly; empty where there is none."""
+    if value is None or isinstance(value, bool):
+        return {True: "true", False: "false", None: "none"}[value]
+    if isinstance(value, int | float):
+        # A name has neither points nor signs.
+        text = _canonical(value).lower()
+        return text.replace("+", "").replace("-", "m").replace(".", "_")
+    if isinstance(value, str):
+        return value if re.fullmatch(r"[a-z0-9_]+(-[a-z0-9_]+)*", value) else ""
+    items = [_word(one) for one in value] if isinstance(value, list) else []
+    is_flat = not any(isinstance(one, list) for one in value)
+    return "-".join(items) if is_flat and items and all(items) else ""
+
+
+# How values are written ---------------------------------------------------------------------------
+
+# Each unit in the first of its family, under the ends that names of parameters have.
+_FAMILIES: Final[tuple[Mapping[str, float], ...]] = (
+    {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "um": 1e-6, "µm": 1e-6},
+    {"deg": 1.0, "rad": 180.0 / math.pi, "°": 1.0, "gon": 0.9},
+    {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
+    {"px": 1.0},
+)
+_WORDS: Final = {
+    "m": "metres",
+    "mm": "millimetres",
+    "deg": "degrees",
+    "rad": "radians",
+    "s": "seconds",
+}
+_NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zµ°]*)")
+_LEAVES: Final[Mapping[object, str]] = {
+    int: "number",
+    float: "number",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
+}
+
+
+def written_form(annotation: object, description: str) -> str:
+    """Return how a list or mapping of plain values is written; empty for other values.
+
+    Args:
+        annotation: the type of a parameter.
+        description: of it; where it writes such a value itself, this is returned.
+
+    >>> written_form(tuple[tuple[float, float], ...] | None, "")
+    '[[number, number], ...]'
+    >>> written_form(tuple[tuple[float, float], ...], "Points [[x, y], ...] in metres.")
+    '[[x, y], ...]'
+    >>> written_form(float, "A length [m].")
+    ''
+    """
+    forms = [form for form in map(_form, _alternatives(annotation)) if form != "null"]
+    if not all(forms) or not any(form[0] in "[{" for form in forms):
+        return ""
+    return " or ".join(dict.fromkeys(_bracketed(description)) or forms)
+
+
+def _alternatives(annotation: object) -> tuple[object, ...]:
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
+
+
+def _form(annotation: object) -> str:
+    """Return how a value of a type is written; empty where parts of it are no plain values."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _form(parts[0])
+    if origin is Literal:
+        return "text"
+    inner = [_form(part) for part in parts if part is not Ellipsis]
+    if not inner or not all(inner):
+        return _LEAVES.get(annotation, "")
+    if origin is tuple or origin is list:
+        more = [] if origin is tuple and Ellipsis not in parts else ["..."]
+        return f"[{', '.join((*inner, *more))}]"
+    if origin is dict:
+        return f"{{name: {inner[1]}, ...}}"
+    return " or ".join(inner) if len(_alternatives(annotation)) > 1 else ""
+
+
+def _bracketed(text: str) -> Iterator[str]:
+    """Lists and mappings that a text writes, outermost brackets each."""
+    depth, start = 0, 0
+    for place, letter in enumerate(text):
+        if letter in "[{":
+            start = start if depth else place
+            depth += 1
+        elif letter in "]}" and depth:
+            depth -= 1
+            if not depth:
+                yield text[start : place + 1]
+
+
+def meant_number(parameter: str, text: object) -> str:
+    """Return how a number is written that was given as text; empty where it looks like none.
+
+    >>> meant_number("tolerance_m", "0,02")
+    '; decimals have a point: 0.02'
+    >>> meant_number("tolerance_m", "5 cm")
+    '; it is in metres, and no unit stands behind it: 0.05'
+    """
+    found = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
+    if found is None:
+        return ""
+    value = float(found[1].replace(",", "."))
+    unit = found[2]
+    if not unit:
+        has_comma = "," in found[1]
+        return f"; decimals have a point: {value:g}" if has_comma else "; write it without quotes"
+    own = parameter.rpartition("_")[2]
+    factor = _factor(unit, own)
+    if factor is None:
+        return "; no unit stands behind a number"
+    return f"; it is in {_WORDS.get(own, own)}, and no unit stands behind it: {value * factor:g}"
+
+
+def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
+    """Name the parameter that holds the same in another unit; empty where there is none.
+
+    >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
+    ' (it is gsd_m, in metres: gsd_m: 0.05)'
+    """
+    stem, _, unit = name.rpartition("_")
+    for other in known:
+        its_stem, _, own = other.rpartition("_")
+        factor = _factor(unit, own)
+        if stem and stem == its_stem and factor is not None and unit != own:
+            written = ""
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                written = f": {other}: {value * factor:g}"
+            return f" (it is {other}, in {_WORDS.get(own, own)}{written})"
+    return ""
+
+
+def _factor(given: str, wanted: str) -> float | None:
+    """By what a number in one unit is multiplied to be one in the other."""
+    for family in _FAMILIES:
+        if given in family and wanted in family:
+            return family[given] / family[wanted]
+    return None

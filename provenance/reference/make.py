@@ -39,8 +39,8 @@ def make(name: str) -> Path:
     from orthoflow.engine.scheduling import execute
     from orthoflow.engine.store import Store
     from orthoflow.records.writing import build_record
-    from orthoflow.workflow.cells import expand_cells
     from orthoflow.workflow.document import load_workflow
+    from orthoflow.workflow.expand import expand_cells
 
     catalog = discover_catalog()
     recipe, sets, embed = RECORDS[name]

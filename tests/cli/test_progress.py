@@ -34,7 +34,7 @@ from orthoflow.engine.events import (
 )
 from orthoflow.engine.plan import PlannedCell
 from orthoflow.engine.results import CellResult
-from orthoflow.workflow.cells import Cell
+from orthoflow.workflow.expand import Cell
 
 OK = CellResult(status="ok", started="2026-01-02T03:04:05.000Z", wall_s=1.25, compile_s=1.9)
 COMPILED = dataclasses.replace(OK, compile_s=45.0)

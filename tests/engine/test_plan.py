@@ -20,7 +20,7 @@ from orthoflow.engine.results import ProductRef, RecordedFile
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.system import usable_cores
-from orthoflow.workflow.cells import Cell, WorkflowInput
+from orthoflow.workflow.expand import Cell, WorkflowInput
 from tests.engine_world import World, forget_toys
 
 CHAIN = """

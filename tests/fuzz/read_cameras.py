@@ -24,8 +24,7 @@ from orthoflow.files.publishing import publish_cameras
 from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photo, Photos, Product
 from orthoflow.sdk import Method
 from orthoflow.testing.trials import Trial, run_trial
-from orthoflow.workflow.drafting import draft_workflow
-from orthoflow.workflow.recognising import recognised
+from orthoflow.workflow.draft import draft_workflow, recognised
 from tests import photo_files, scan_files
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import mutate_bytes, mutate_e57, mutate_json, mutate_png, mutate_text

@@ -13,8 +13,8 @@ from orthoflow.records.distances import ProductDistance, RunProducts, product_di
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import write_run
-from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.expand import expand_cells
 from tests.engine_world import World, forget_toys
 
 WORKFLOW = """

@@ -21,8 +21,8 @@ from orthoflow.engine.store import Store
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
 from orthoflow.records.runs import Run
-from orthoflow.workflow.cells import expand_cells
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.expand import expand_cells
 from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Ended, Shell, metrics_of
 from tests.scan_files import write_las

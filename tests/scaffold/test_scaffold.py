@@ -20,9 +20,9 @@ from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, unwritten, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
-from orthoflow.workflow.cells import expand_cells
+from orthoflow.workflow.checks import doubts_about
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.doubts import doubts_about
+from orthoflow.workflow.expand import expand_cells
 from tests.long_loops import IS_LONG
 
 ROOT = Path(__file__).resolve().parents[2]

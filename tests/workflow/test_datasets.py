@@ -9,13 +9,13 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
-from orthoflow.workflow.cells import Cell, expand_cells
+from orthoflow.files.yaml_positions import Position, Table
+from orthoflow.workflow.checks import doubts_about
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.doubts import doubts_about
-from orthoflow.workflow.format import Workflow
-from orthoflow.workflow.inputs import resolve_input_files
-from orthoflow.workflow.problems import InvalidWorkflowError
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
+from orthoflow.workflow.inputs import read_rows, resolve_input_files
+from orthoflow.workflow.model import Workflow, resolved_json, workflow_from_resolved
+from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog
 
 ROOMS = """\
 orthoflow: 1
@@ -313,8 +313,8 @@ MAPPINGS = {
     "a file alone": (
         "datasets: {hall: hall.e57}",
         (
-            "rooms.yaml:18:18: datasets.hall: expected what the dataset gives, as in {scan: FILE}, "
-            'got the text "hall.e57"'
+            "rooms.yaml:18:18: datasets.hall: expected a mapping such as {scan: FILE}, got the "
+            'text "hall.e57"'
         ),
     ),
     "there twice": (
@@ -456,12 +456,16 @@ def test_a_mistake_of_a_table_gets_a_place_and_a_sentence(
 
 def test_a_table_that_is_no_text_is_refused(catalog: Catalog, folder: Path) -> None:
     (folder / "rooms.csv").write_bytes(b"name\nh\xe4ll\n")
-    assert "rooms.csv:2: expected UTF-8 text, got the byte 0xe4" in refused(
+    assert "rooms.csv:2:2: expected UTF-8 text, got the byte 0xe4" in refused(
         ROOMS, catalog, datasets="rooms.csv"
     )
     (folder / "rooms.csv").write_bytes(b"name\n" + b"x" * 4_000_000)
-    assert "rooms.csv has more than 4000000 bytes" in refused(ROOMS, catalog, datasets="rooms.csv")
-    assert refused(ROOMS, catalog, datasets=".").startswith("--datasets .: the table of datasets")
+    assert "a table of datasets has at most 4000000 bytes" in refused(
+        ROOMS, catalog, datasets="rooms.csv"
+    )
+    assert refused(ROOMS, catalog, datasets=".").startswith(
+        "--datasets .: . cannot be read: it is a folder"
+    )
 
 
 @pytest.mark.usefixtures("folder")
@@ -509,7 +513,7 @@ def test_files_say_in_which_line_of_a_table_they_are_named(catalog: Catalog) -> 
         # Those of the workflow itself stand in none.
         (load(ROOMS + TWO, catalog), {"hall": "", "stairs": ""}),
     ):
-        found = {name: one.inputs["scan"].said_in for name, one in workflow.datasets.items()}
+        found = {name: one.inputs["scan"].table for name, one in workflow.datasets.items()}
         assert found == said
 
 
@@ -545,3 +549,120 @@ def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None
     coarse = load(ROOMS + "datasets: {hall: {set: {wall.gsd_m: 3}}, attic: {}}\n", catalog)
     (said,) = set(doubts_about(coarse)) - set(doubts_about(load(ROOMS, catalog)))
     assert said.startswith("wall.gsd_m of dataset hall is 3 m, which can hardly be meant")
+
+
+# --- tables ---
+
+
+def rows_of(text: str) -> tuple[Table, list[str]]:
+    log = ProblemLog(file="rooms.csv", lines=tuple(text.split("\n")))
+    table = read_rows(log)
+    return table, [f"{one.line}:{one.column} {one.message}" for one in log._in_file]
+
+
+def plain_of(table: Table) -> dict[str, object]:
+    """What a table says, without places."""
+    return {
+        entry.key: plain_of(entry.value)
+        if isinstance(entry.value, Table)
+        else getattr(entry.value, "value", entry.value)
+        for entry in table
+    }
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_line_is_a_dataset_with_its_files_and_its_settings(mark: str) -> None:
+    text = "\n".join(
+        [
+            "# rooms",
+            "name,scan,plane.tolerance_m,plane.is_exact",
+            "hall,hall.e57,0.02,true",
+            "",
+            "attic, attic.laz ,3,",
+            "cellar,,,",
+        ]
+    ).replace(",", mark)
+    table, problems = rows_of(text)
+    assert problems == []
+    assert plain_of(table) == {
+        "hall": {"scan": "hall.e57", "set": {"plane.tolerance_m": 0.02, "plane.is_exact": True}},
+        "attic": {"scan": "attic.laz", "set": {"plane.tolerance_m": 3}},
+        "cellar": {},
+    }
+    hall, attic, cellar = table
+    assert [one.position.line for one in (hall, attic, cellar)] == [3, 5, 6]
+    assert table.position == Position(line=1, column=1)
+    assert isinstance(attic.value, Table)
+    scan, settings = attic.value
+    # Keys have the place of their column in the header, values their own.
+    assert scan.position == Position(line=2, column=6)
+    assert scan.value.position == Position(line=5, column=7)
+    assert isinstance(settings.value, Table)
+    (tolerance,) = settings.value
+    assert tolerance.position == Position(line=2, column=11)
+    assert tolerance.value.position == Position(line=5, column=19)
+
+
+def test_the_separator_is_the_first_of_three_that_the_header_has() -> None:
+    table, problems = rows_of('name;scan,a;"plane.x"\nhall;a,b;1\n')
+    assert problems == []
+    assert plain_of(table) == {"hall": {"scan,a": "a,b", "set": {"plane.x": 1}}}
+    table, _ = rows_of("name\nhall\n")
+    assert plain_of(table) == {"hall": {}}
+    # A header of one column says nothing of it.
+    table, problems = rows_of("name\nhall;attic\n")
+    assert plain_of(table) == {"hall;attic": {}}
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [("7", 7), ("-7", -7), ("0.5", 0.5), ("hall", "hall"), ("true", True), ('"7"', 7)],
+)
+def test_settings_are_read_as_yaml(written: str, value: object) -> None:
+    table, problems = rows_of(f"name;p.q\nhall;{written}\n")
+    assert problems == []
+    found = plain_of(table)["hall"]
+    assert found == {"set": {"p.q": value}}
+    assert type(found["set"]["p.q"]) is type(value)  # type: ignore[index]
+
+
+def test_a_setting_that_is_no_yaml_is_told() -> None:
+    table, problems = rows_of("name;p.q;p.r\nhall;[1;3\n")
+    assert problems == ["2:6 the value cannot be read as YAML; quote it"]
+    assert plain_of(table) == {"hall": {"set": {"p.r": 3}}}
+
+
+# --- seeds ---
+
+
+@pytest.mark.usefixtures("folder")
+def test_seeds_of_datasets_reach_what_is_random_and_what_follows(catalog: Catalog) -> None:
+    text = ROOMS.replace("seed: 5", "seed: 5") + (
+        "datasets: {a: {set: {seed: 1}}, b: {set: {seed: {sweep: [2, 3]}}}, c: {}}\n"
+    )
+    found = cells(text, catalog)
+    rooms = [address for address in found if address.startswith("room")]
+    assert rooms == [
+        *("room@data=a,seed=1", "room@data=b,seed=2", "room@data=b,seed=3"),
+        "room@data=c,seed=5",
+    ]
+    assert found["room@data=b,seed=3"].seed == derive_seed(3, "simulate.room", 0)
+    assert "wall@data=c,seed=5,plane=hough2d" in found
+    # What is not random, and takes nothing random, runs once.
+    assert "shots" in found
+    assert load(text, catalog).datasets["b"].seeds == (2, 3)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_column_of_seeds_is_a_factor(catalog: Catalog) -> None:
+    named = table("name,seed\na,7\nb,8\n")
+    found = [address for address in cells(ROOMS, catalog, datasets=named) if "room" in address]
+    assert found == ["room@data=a,seed=7", "room@data=b,seed=8"]
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("seed", ["-1", "one", "1.5", "{sweep: [1]}", "{sweep: [1, 1]}", "[1, 2]"])
+def test_a_seed_of_a_dataset_is_a_whole_number(seed: str, catalog: Catalog) -> None:
+    text = f"{ROOMS}datasets: {{a: {{set: {{seed: {seed}}}}}}}\n"
+    assert "rooms.yaml:18:" in refused(text, catalog)
+    assert "datasets.a.set.seed" in refused(text, catalog)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from pathlib import Path
@@ -10,10 +11,13 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.files.yaml_positions import Scalar
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import (
+from orthoflow.workflow.model import seconds_in
+from orthoflow.workflow.source import (
     InvalidArgumentsError,
     InvalidWorkflowError,
+    Problem,
     UnusablePluginError,
 )
 from tests.laboratories import (
@@ -130,7 +134,10 @@ def test_of_a_long_line_only_the_part_around_the_mistake_is_shown(
         load_workflow(write, catalog)
     seed, _ = caught.value.problems
     head, line, caret = str(seed).splitlines()
-    assert head == "flow.yaml:1:22: seed: expected a whole number from 0 on, got -1"
+    assert head == (
+        "flow.yaml:1:22: seed: expected a whole number from 0 on, or {sweep: [NUMBER, NUMBER, "
+        "...]}, got -1"
+    )
     assert len(line) <= 124
     assert line[caret.index("^") :].startswith("-1")
 
@@ -147,9 +154,9 @@ def test_a_file_of_megabytes_is_refused_before_it_is_parsed(catalog: Catalog, wr
         load_workflow(write, catalog)
 
 
-def test_of_a_device_no_more_is_read_than_a_file_may_have(catalog: Catalog, write: Path) -> None:
+def test_a_device_is_no_file_of_parameters(catalog: Catalog, write: Path) -> None:
     write.write_text(GOOD)
-    with pytest.raises(InvalidArgumentsError, match="/dev/zero is too large: a file of parameters"):
+    with pytest.raises(InvalidArgumentsError, match="/dev/zero cannot be read: it is a folder"):
         load_workflow(write, catalog, set_files=["/dev/zero"])
 
 
@@ -224,3 +231,48 @@ def test_mistakes_of_the_file_come_before_broken_plugins(
     steps = "x: {use: plane.broken, in: {clod: cloud.cloud}}"
     found = problems(with_steps(steps), write, catalog)
     assert [path for _, _, path, _ in found] == ["steps.x.use", "steps.x.in.clod"]
+
+
+@pytest.mark.parametrize(
+    ("written", "seconds"),
+    [
+        ("90s", 90.0),
+        ("1.5 s", 1.5),
+        ("30min", 1800.0),
+        ("2h", 7200.0),
+        ("0.5  h", 1800.0),
+        (1, 1.0),
+        (0.25, 0.25),
+        *((wrong, None) for wrong in (0, -1, True, None, math.inf, math.nan, 0.0)),
+        *((wrong, None) for wrong in ("0s", "s", "5", "5m", "5 hours", "-5s", "1.s", "1,5s", "")),
+    ],
+)
+def test_times_have_a_number_and_a_unit(written: Scalar, seconds: float | None) -> None:
+    assert seconds_in(written) == seconds
+
+
+def problem(text: str, column: int, *, line: int = 3, path: str = "steps.a") -> str:
+    return str(
+        Problem(file="a.yaml", line=line, column=column, path=path, message="odd", text=text)
+    )
+
+
+def test_a_problem_stands_over_the_line_that_it_is_about() -> None:
+    assert problem("  use: plane", 8) == ("a.yaml:3:8: steps.a: odd\n    use: plane\n         ^")
+    assert problem("x\ty", 3) == "a.yaml:3:3: steps.a: odd\n    x y\n      ^"
+    assert problem("", 1, path="") == "a.yaml:3:1: odd"
+    assert problem("  \t ", 1) == "a.yaml:3:1: steps.a: odd"
+    assert problem("a: b", 1, line=0) == "a.yaml: steps.a: odd\n    a: b\n    ^"
+
+
+@pytest.mark.parametrize(
+    ("n_letters", "column"),
+    [(120, 1), (120, 61), (120, 120), (121, 61), (121, 62), (121, 121), (300, 100), (300, 300)],
+)
+def test_of_a_long_line_what_is_around_the_column_is_shown(n_letters: int, column: int) -> None:
+    text = "".join(chr(ord("a") + k % 26) for k in range(n_letters))
+    _, shown, caret = problem(text, column).splitlines()
+    start = 0 if n_letters == 120 else max(0, column - 61)
+    assert shown == f"    {text[start : start + 120]}"
+    assert shown[caret.index("^")] == text[column - 1]
+    assert caret == " " * (caret.index("^")) + "^"

@@ -15,14 +15,14 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import InputError
 from orthoflow.workflow import inputs
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.format import WorkflowInputSpec
 from orthoflow.workflow.inputs import (
     present_inputs,
     read_input_options,
     resolve_input_files,
     some_of,
 )
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.model import WorkflowInputSpec
+from orthoflow.workflow.source import ProblemLog
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import InvalidWorkflowError
+from orthoflow.workflow.source import InvalidWorkflowError
 from tests.laboratories import (
     GOOD,
     problems,
@@ -94,7 +94,7 @@ CASES = {
     "unless a step": (
         STEP % ", unless: cloud.cloud",
         "steps.x.unless",
-        "expected an input such as inputs.scan, got cloud.cloud",
+        'expected an input such as inputs.scan, got the text "cloud.cloud"',
     ),
     "if an unknown input": (
         STEP % ", if: inputs.scam",
@@ -313,12 +313,12 @@ COMPARISONS = {
     ),
     "metric without step": (
         "{metrics: [rms_mm]}",
-        "compare.metrics",
-        "expected step.metric, * allowed, got rms_mm",
+        "compare.metrics[0]",
+        'expected step.metric, * allowed, got the text "rms_mm"',
     ),
     "metric of an unknown step": (
         "{metrics: [plan.rms_mm]}",
-        "compare.metrics",
+        "compare.metrics[0]",
         "there is no step plan for plan.rms_mm (did you mean plane?)",
     ),
 }
@@ -411,8 +411,8 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
     assert asked("[plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*']") == []
     whose = "`orthoflow plugins show METHOD` lists those of plane.hough2d, plane.ransac"
     assert asked("[plane.rsm_mm, 'plan*.depth', orient.rsm_mm]") == [
-        f"compare.metrics: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
-        f"compare.metrics: step plane reports no metric depth; {whose}",
+        f"compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
+        f"compare.metrics[1]: step plane reports no metric depth; {whose}",
     ]
     # Each where it stands in the list.
     text = GOOD.replace('"*.wall_s"]', "plane.rsm_mm, plane]")

@@ -1,25 +1,29 @@
-"""`--set` and `--input`: parameters and files from the command line."""
+"""Parameters: `--set`, files of them, sweeps, and how values are written."""
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
+import re
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
+import jsonschema
 import pytest
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.errors import ArgumentError, PluginError
-from orthoflow.files.yaml_positions import Position
+from orthoflow.catalog.discovery import NAME_PATTERN
+from orthoflow.errors import ArgumentError, OrthoflowError
+from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
-from orthoflow.workflow import parameters as module
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import InvalidArgumentsError, InvalidWorkflowError, ProblemLog
-from tests.laboratories import (
-    GOOD,
-    load,
-)
+from orthoflow.workflow.expand import expand_cells
+from orthoflow.workflow.model import Workflow, resolved_json, workflow_from_resolved
+from orthoflow.workflow.parameters import meant_number, meant_parameter, variant_names
+from orthoflow.workflow.source import InvalidArgumentsError, InvalidWorkflowError
+from orthoflow.workflow.views import workflow_schema
+from tests.laboratories import GOOD, load, with_steps
 
 SETS = {
     "plain": ("wall.gsd_m=0.002", "wall", "", "gsd_m", 0.002),
@@ -76,83 +80,60 @@ def test_parameters_that_disagree_are_told_where_the_method_stands(
     assert problem.message.endswith("cell_m 0.06 must not exceed tolerance_m")
 
 
-def test_a_parameter_without_a_default_is_asked_for() -> None:
-    class Params(MethodParams):
-        height_m: float = Field(description="Height.")
-
-    with pytest.raises(ValidationError) as caught:
-        Params.model_validate({})
-    told: Any = SimpleNamespace(id="plane.level")
-    reporter = module._Reporter(
-        variant=told, info=told, as_set={}, reports={}, log=told, blame=None
+class Params(MethodParams):
+    near: tuple[tuple[float, float, float], ...] = Field((), description="At [[x, y, z], ...].")
+    crop: tuple[float, float, float, float] | tuple[tuple[float, float], ...] | None = Field(
+        None, description="Part."
     )
-    (details,) = caught.value.errors()
-    assert reporter._message(details) == "plane.level needs parameter height_m"
+    ink: dict[str, tuple[float, float]] = Field(default_factory=dict, description="Inks.")
+    height_m: float = Field(description="Height.")
+
+    @field_validator("height_m")
+    @classmethod
+    def _fails(cls, value: float) -> float:
+        if value == 13:
+            raise RuntimeError("the moon is full")
+        return value
+
+
+def problems_of(catalog: Catalog, monkeypatch: pytest.MonkeyPatch, params: str) -> list[str]:
+    """What is wrong with parameters of a method that has those above."""
+    monkeypatch.setattr(catalog.method("plane.hough2d").load(), "Params", Params)
+    text = with_steps(f"x: {{use: plane.hough2d, in: {{cloud: cloud.cloud}}, params: {params}}}")
+    with pytest.raises(OrthoflowError) as caught:
+        load(text, Path("flow.yaml"), catalog)
+    return [f"{item.path}: {item.message}" for item in caught.value.problems]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("params", "said"),
     [
-        ({"near": [1, 2, 3]}, "near is written [[x, y, z], ...], got [1, 2, 3]"),
-        ({"near": 5}, "near is written [[x, y, z], ...], got 5"),
-        ({"near": [[1, 2, "a"]]}, 'near[0][2]: input should be a valid number, got the text "a"'),
+        ("{}", "params: plane.hough2d needs parameter height_m"),
+        ("{near: [1, 2, 3]}", "params.near: near is written [[x, y, z], ...], got [1, 2, 3]"),
+        ("{near: 5}", "params.near: near is written [[x, y, z], ...], got 5"),
         (
-            {"crop": [0, 0, 2]},
+            "{near: [[1, 2, a]]}",
+            'params.near[0][2]: input should be a valid number, got the text "a"',
+        ),
+        (
+            "{crop: [0, 0, 2]}",
             "crop is written [number, number, number, number] or [[number, number], ...], got [0,",
         ),
-        ({"ink": {"a": 1, "b": 2}}, 'ink is written {name: [number, number], ...}, got {"a": 1'),
+        ("{ink: {a: 1, b: 2}}", 'ink is written {name: [number, number], ...}, got {"a": 1'),
+        (
+            "{height_m: 13}",
+            "checking the parameters of plane.hough2d failed: RuntimeError: the moon is full",
+        ),
     ],
 )
-def test_a_list_of_another_form_is_one_problem(value: dict[str, Any], told: str) -> None:
-    class Params(MethodParams):
-        near: tuple[tuple[float, float, float], ...] = Field((), description="At [[x, y, z], ...].")
-        crop: tuple[float, float, float, float] | tuple[tuple[float, float], ...] | None = Field(
-            None, description="Part."
-        )
-        ink: dict[str, tuple[float, float]] = Field(default_factory=dict, description="Inks.")
-
-    problems: list[str] = []
-    draft: Any = SimpleNamespace(
-        params=None, info=SimpleNamespace(id="a.b", method=SimpleNamespace(Params=Params))
-    )
-    ((key, given),) = value.items()
-    override = module.Override(report=problems.append, keys=(key,), value=given)
-    module.resolve_params(draft, [override], ProblemLog(file="flow.yaml", lines=("x",)))
-    (problem,) = problems
-    assert problem.startswith(told)
-
-
-def test_a_validator_that_fails_is_a_fault_of_its_plugin() -> None:
-    class Params(MethodParams):
-        height_m: float = Field(1.0, description="Height.")
-
-        @field_validator("height_m")
-        @classmethod
-        def _fails(cls, _value: float) -> float:
-            raise RuntimeError("the moon is full")
-
-    log = ProblemLog(file="flow.yaml", lines=("x",))
-    draft: Any = SimpleNamespace(
-        params=None,
-        info=SimpleNamespace(id="plane.level", method=SimpleNamespace(Params=Params)),
-        position=Position(line=1, column=1),
-        path="steps.x",
-    )
-    override = module.Override(report=lambda _: None, keys=("height_m",), value=2.0)
-    found = module.resolve_params(draft, [override], log)
-    assert (found.resolved, found.as_set) == ({}, {"height_m": 2.0})
-    with pytest.raises(
-        PluginError, match=r"checking the parameters of plane\.level failed: .*moon"
-    ):
-        log.raise_any()
-
-
-def test_the_last_of_two_sets_wins_and_can_mend_a_value_of_the_file(
-    catalog: Catalog, write: Path
+@pytest.mark.usefixtures("write")
+def test_what_is_wrong_with_a_parameter_is_one_problem(
+    params: str, said: str, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = GOOD.replace("gsd_m: 1", "gsd_m: -1")
-    workflow = load(text, write, catalog, "wall.gsd_m=2", "wall.gsd_m=3")
-    assert workflow.steps["wall"].variants[0].params == {"gsd_m": 3.0}
+    if params not in ("{}", "{height_m: 13}"):
+        params = params.replace("{", "{height_m: 1, ", 1)
+    (problem,) = problems_of(catalog, monkeypatch, params)
+    assert said.removeprefix("params: ") in problem
 
 
 BAD_SETS = {
@@ -194,3 +175,420 @@ def test_all_options_that_do_not_fit_are_named_together(catalog: Catalog, write:
     ]
     assert "there is no input scam (did you mean scan?)" in str(caught.value)
     assert "--input scan: expected NAME=PATH" in str(caught.value)
+
+
+# --- sweeps ---
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+ROOM = """\
+orthoflow: 1
+name: swept
+inputs:
+  scan: {optional: true}
+steps:
+  room: {use: simulate.room}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  plane:
+    use: plane.hough2d
+    in: {cloud: room.cloud}
+    params: {cell_m: 0.01, tolerance_m: {sweep: [0.02, 0.05, 0.1]}}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: plane.planes}}
+"""
+
+
+def load_swept(catalog: Catalog, text: str = ROOM, **options: object) -> Workflow:
+    Path("swept.yaml").write_text(text, encoding="utf-8")
+    return load_workflow("swept.yaml", catalog, **options)  # type: ignore[arg-type]
+
+
+def values_of(workflow: Workflow, parameter: str = "tolerance_m") -> dict[str, object]:
+    return {one.name: one.params[parameter] for one in workflow.steps["plane"].variants}
+
+
+def test_each_value_is_a_variant_whose_name_says_it(catalog: Catalog) -> None:
+    workflow = load_swept(catalog)
+    assert values_of(workflow) == {
+        "tolerance_m-0_02": 0.02,
+        "tolerance_m-0_05": 0.05,
+        "tolerance_m-0_1": 0.1,
+    }
+    assert {one.params_set["cell_m"] for one in workflow.steps["plane"].variants} == {0.01}
+
+
+def test_a_sweep_is_a_comparison_of_all_its_values(catalog: Catalog) -> None:
+    workflow = load_swept(catalog)
+    assert workflow.baseline == {"plane": "tolerance_m-0_02"}
+    addresses = [cell.address for cell in expand_cells(workflow, catalog)]
+    assert [address for address in addresses if address.startswith("wall")] == [
+        f"wall@plane=tolerance_m-{value}" for value in ("0_02", "0_05", "0_1")
+    ]
+    named = load_swept(catalog, f"{ROOM}compare: {{baseline: {{plane: tolerance_m-0_05}}}}\n")
+    assert named.baseline == {"plane": "tolerance_m-0_05"}
+
+
+TWO = (
+    ROOM[: ROOM.index("    use: plane.hough2d")]
+    + """\
+    in: {cloud: room.cloud}
+    variants:
+      hough2d: {use: plane.hough2d, params: {tolerance_m: {sweep: [0.02, 0.05]}}}
+      ransac: {use: plane.ransac, params: {tolerance_m: {sweep: [0.02, 0.05]}}}
+compare: {baseline: {plane: hough2d-tolerance_m-0_05},
+          exclude: [{plane: ransac-tolerance_m-0_02}]}
+"""
+)
+
+
+def test_a_value_that_is_not_swept_any_more_stands_for_its_variant(catalog: Catalog) -> None:
+    one = load_swept(catalog, TWO, sets=["plane.hough2d.tolerance_m=0.03"])
+    assert one.baseline == {"plane": "hough2d"}
+    assert one.compare is not None
+    assert one.compare.exclude == ({"plane": "ransac-tolerance_m-0_02"},)
+    # What was to be left out of a sweep is no reason to leave out its only value.
+    other = load_swept(catalog, TWO, sets=["plane.ransac.tolerance_m=0.03"])
+    assert other.compare is not None
+    assert other.compare.exclude == ()
+    assert other.baseline == {"plane": "hough2d-tolerance_m-0_05"}
+    alone = f"{ROOM}compare: {{baseline: {{plane: tolerance_m-0_05}}}}\n"
+    assert load_swept(catalog, alone, sets=["plane.tolerance_m=0.03"]).baseline == {}
+    with pytest.raises(InvalidWorkflowError, match="has no variant ransac-tolerance_m-0_07"):
+        load_swept(catalog, TWO.replace("hough2d-tolerance_m-0_05}", "ransac-tolerance_m-0_07}"))
+
+
+def test_several_sweeps_make_all_combinations_and_a_variant_stands_in_front(
+    catalog: Catalog,
+) -> None:
+    text = (
+        ROOM[: ROOM.index("    use: plane.hough2d")]
+        + """\
+    in: {cloud: room.cloud}
+    variants:
+      ransac: {use: plane.ransac}
+      fine:
+        use: plane.hough2d
+        params: {cell_m: {sweep: [0.01, 0.02]}, tolerance_m: {sweep: [0.05, 1]}}
+"""
+    )
+    names = list(values_of(load_swept(catalog, text)))
+    assert names == [
+        "ransac",
+        "fine-cell_m-0_01-toleranc-0_05",
+        "fine-cell_m-0_01-toleranc-1",
+        "fine-cell_m-0_02-toleranc-0_05",
+        "fine-cell_m-0_02-toleranc-1",
+    ]
+
+
+def test_a_swept_variant_is_still_known_by_its_own_name(catalog: Catalog) -> None:
+    text = (
+        ROOM[: ROOM.index("    use: plane.hough2d")]
+        + """\
+    in: {cloud: room.cloud}
+    variants:
+      ransac: {use: plane.ransac}
+      fine: {use: plane.hough2d, params: {tolerance_m: {sweep: [0.05, 0.1]}}}
+"""
+    )
+    workflow = load_swept(catalog, f"{text}compare: {{baseline: {{plane: fine}}}}\n")
+    assert workflow.baseline == {"plane": "fine-tolerance_m-0_05"}
+    without = load_swept(catalog, f"{text}compare: {{exclude: [{{plane: fine}}]}}\n")
+    cells = [cell for cell in expand_cells(without, catalog) if cell.step == "plane"]
+    assert [cell.assignment["plane"] for cell in cells] == ["ransac"]
+
+
+def test_repeats_belong_to_every_value(catalog: Catalog) -> None:
+    workflow = load_swept(catalog, ROOM.replace("    in: {cloud", "    repeat: 2\n    in: {cloud"))
+    cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == "plane"]
+    assert [(cell.params["tolerance_m"], cell.repeat) for cell in cells] == [
+        (value, repeat) for value in (0.02, 0.05, 0.1) for repeat in (0, 1)
+    ]
+
+
+def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog: Catalog) -> None:
+    plain = load_swept(catalog, sets=["plane.tolerance_m=0.03"])
+    assert values_of(plain) == {"": 0.03}
+    assert plain.compare is None
+    other = load_swept(
+        catalog, sets=["plane.tolerance_m=0.03", "plane.cell_m={sweep: [0.001, 0.002]}"]
+    )
+    assert values_of(other, "cell_m") == {"cell_m-0_001": 0.001, "cell_m-0_002": 0.002}
+    again = load_swept(catalog, sets=["plane.hough2d.tolerance_m.sweep=[0.5, 0.6]"])
+    assert list(values_of(again).values()) == [0.5, 0.6]
+    beside = load_swept(catalog, sets=["plane.cell_m=0.005"])
+    assert set(values_of(beside, "cell_m").values()) == {0.005}
+    assert len(beside.steps["plane"].variants) == 3
+
+
+def test_a_record_holds_the_variants_that_a_sweep_became(catalog: Catalog) -> None:
+    workflow = load_swept(catalog)
+    again = workflow_from_resolved(resolved_json(workflow), workflow.source)
+    assert values_of(again) == values_of(workflow)
+    assert again.baseline == workflow.baseline
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        ("{sweep: [0.02]}", "tolerance_m.sweep: expected 2 to 100 values in a list, got 1"),
+        ("{sweep: 0.02}", "expected 2 to 100 values in a list, got 0.02"),
+        ("{sweep: [0.02, wide]}", "tolerance_m.sweep[1]: input should be a valid number, got the"),
+        ("{sweep: [0.02, 0.05], step: 1}", "unknown key step"),
+        ("{sweep: [1, 0.02, 1.0]}", "tolerance_m.sweep[2]: 1.0 is swept twice; leave one of them"),
+        ("[0.02, 0.05]", "number, got a list; to try each: {sweep: [0.02, 0.05]}"),
+        ("{sweep: [0.02, 0.001]}", "cell_m 0.01 must not exceed tolerance_m"),
+    ],
+)
+def test_what_is_wrong_with_a_sweep_is_told_once_at_its_place(
+    catalog: Catalog, written: str, said: str
+) -> None:
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load_swept(catalog, ROOM.replace("{sweep: [0.02, 0.05, 0.1]}", written))
+    [problem] = caught.value.problems
+    assert said in str(problem)
+    assert problem.line == 11
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("plane.tolerance_m={sweep: [1]}", "with 2 to 100 values and nothing beside it"),
+        ("plane.tolerance_m={sweep: [1, 2], to: 3}", "nothing beside it"),
+        ("plane.tolerance_m={sweep: [1, 2, 1]}", "1 is swept twice"),
+        ("plane.tolerance_m=[1, 2]", r"to try each: {sweep: \[1, 2\]}"),
+        ("cloud.up={sweep: [x, z]}", "sources take no variants, so nothing of it can be swept"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_refused_on_the_command_line(
+    catalog: Catalog, text: str, said: str
+) -> None:
+    with pytest.raises((InvalidArgumentsError, InvalidWorkflowError), match=said):
+        load_swept(catalog, sets=[text])
+
+
+def test_a_dataset_cannot_set_what_is_swept(catalog: Catalog) -> None:
+    text = f"{ROOM}datasets: {{a: {{set: {{plane.tolerance_m: 0.5}}}}}}\n"
+    with pytest.raises(InvalidWorkflowError, match="tolerance_m is swept in step plane"):
+        load_swept(catalog, text)
+
+
+@pytest.mark.parametrize(
+    ("variant", "step"),
+    [
+        (
+            "hough2d",
+            "{variants: {hough2d: {use: plane.hough2d, %s}, ransac: {use: plane.ransac}}, %s}",
+        ),
+        ("hough2d", "{use: plane.hough2d, %s, %s}"),
+    ],
+    ids=["of several", "alone"],
+)
+def test_a_dataset_names_a_swept_variant_as_set_does(
+    catalog: Catalog, variant: str, step: str
+) -> None:
+    swept = step % ("params: {tolerance_m: {sweep: [0.02, 0.05]}}", "in: {cloud: room.cloud}")
+    text = f"orthoflow: 1\nname: swept\nsteps: {{room: {{use: simulate.room}}, plane: {swept}}}\n"
+    given = f"{text}datasets: {{a: {{set: {{plane.{variant}.cell_m: 0.005}}}}}}\n"
+    calls = load_swept(catalog, given).datasets["a"].calls
+    assert [call.params["cell_m"] for call in calls.values()] == [0.005, 0.005]
+    refused = f"{text}datasets: {{a: {{set: {{plane.{variant}.tolerance_m: 0.5}}}}}}\n"
+    with pytest.raises(InvalidWorkflowError, match="tolerance_m is swept in step plane"):
+        load_swept(catalog, refused)
+
+
+def test_over_datasets_every_value_runs_on_each(catalog: Catalog) -> None:
+    text = f"{ROOM}datasets: {{a: {{set: {{plane.cell_m: 0.005}}}}, b: {{}}}}\n"
+    cells = [
+        cell for cell in expand_cells(load_swept(catalog, text), catalog) if cell.step == "plane"
+    ]
+    found = {
+        (cell.assignment["data"], cell.params["tolerance_m"], cell.params["cell_m"])
+        for cell in cells
+    }
+    assert found == {
+        (data, value, cell_m)
+        for data, cell_m in (("a", 0.005), ("b", 0.01))
+        for value in (0.02, 0.05, 0.1)
+    }
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ([0.1, 0.10000001], ["p-0_1", "p-0_10000001"]),
+        ([0.5, 0.25, 1e-7, -1.5], ["p-0_5", "p-0_25", "p-1em07", "p-m1_5"]),
+        ([1.0, 20, True, None], ["p-1", "p-20", "p-true", "p-none"]),
+        (["fine", "very-fast"], ["p-fine", "p-very-fast"]),
+        ([[1, 0], [0.5, 1]], ["p-1-0", "p-0_5-1"]),
+        # What no name can state exactly gets an index.
+        (["Fast Mode!", "fast mode"], ["sweep-1", "sweep-2"]),
+        (["", "x"], ["sweep-1", "sweep-2"]),
+        ([{"k": 1}, {"k": 2}], ["sweep-1", "sweep-2"]),
+        ([[1, [2, 3]], [[1, 2], 3]], ["sweep-1", "sweep-2"]),
+        (["x" * 40, "y"], ["sweep-1", "sweep-2"]),
+        ([0.1, "0_1"], ["sweep-1", "sweep-2"]),
+        ([3, "a b", 1], ["sweep-2", "sweep-3", "sweep-1"]),
+    ],
+)
+def test_a_name_states_its_value_exactly_or_is_an_index_whatever_the_order(
+    values: list[JsonValue], names: list[str]
+) -> None:
+    made = dict(zip(names, values, strict=True))
+    for order in itertools.permutations(values[:4]):
+        one = [{"p": value} for value in (*order, *values[4:])]
+        found = variant_names("", one)
+        assert {name: row["p"] for name, row in zip(found, one, strict=True)} == made
+        assert all(re.fullmatch(NAME_PATTERN, name) for name in found)
+
+
+def test_parameters_are_cut_as_far_as_they_stay_apart_and_then_are_an_index() -> None:
+    two = [{"sigma_corner_max_cells": 100, "sigma_wall_max_cells": 5}]
+    assert variant_names("fine", two) == ["fine-sigma_corn-100-sigma_wall-5"]
+    alike = [{"sigma_corner_a": 100000, "sigma_corner_b": 500000}]
+    assert variant_names("fine", alike) == ["fine-sweep-1"]
+    # `angle_step_deg` as `a` before a number that follows `max_tilt_deg` would say nothing.
+    many = [dict.fromkeys(("tolerance", "thinning", "cell", "tilt", "share", "angle"), 0.25)]
+    assert variant_names("", many) == ["sweep-1"]
+    assert len(variant_names("x" * 32, many)[0]) <= 32
+
+
+def test_two_lists_in_another_order_make_the_same_variants(catalog: Catalog) -> None:
+    def swept(values: str) -> dict[str, object]:
+        return values_of(load_swept(catalog, ROOM.replace("[0.02, 0.05, 0.1]", values)))
+
+    assert swept("[0.05, 0.10000001, 0.1]") == swept("[0.1, 0.05, 0.10000001]")
+    variant = load_swept(catalog).steps["plane"].variant("tolerance_m-0_05")
+    assert variant.swept == {"tolerance_m": 0.05}
+
+
+def test_editors_are_told_that_a_value_may_be_a_sweep(catalog: Catalog) -> None:
+    schema = workflow_schema(catalog)
+    document = {
+        "orthoflow": 1,
+        "steps": {
+            "plane": {
+                "use": "plane.hough2d",
+                "in": {"cloud": "room.cloud"},
+                "params": {"tolerance_m": {"sweep": [0.02, 0.05]}},
+            }
+        },
+    }
+    jsonschema.validate(document, schema)
+    document["steps"]["plane"]["params"] = {"tolerance_m": {"sweep": []}}  # type: ignore[index]
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document, schema)
+
+
+# --- files of parameters ---
+
+
+def test_a_file_of_parameters_is_gone_before_by_what_is_set(
+    catalog: Catalog, tmp_path: Path
+) -> None:
+    (tmp_path / "fine.yaml").write_text("plane.cell_m: 0.004\nwall.gsd_m: 0.002\n")
+    (tmp_path / "finer.yaml").write_text(
+        "plane.cell_m: 0.003\nplane.tolerance_m: {sweep: [1, 2]}\n"
+    )
+    workflow = load_swept(catalog, set_files=["fine.yaml", "finer.yaml"], sets=["wall.gsd_m=0.001"])
+    assert set(values_of(workflow, "cell_m").values()) == {0.003}
+    assert list(values_of(workflow).values()) == [1, 2]
+    assert workflow.steps["wall"].variant("").params["gsd_m"] == 0.001
+    # The record says what the files said, not where they lie.
+    assert json.loads(resolved_json(workflow))["overrides"] == [
+        "--set plane.cell_m=0.004",
+        "--set wall.gsd_m=0.002",
+        "--set plane.cell_m=0.003",
+        '--set plane.tolerance_m={"sweep": [1, 2]}',
+        "--set wall.gsd_m=0.001",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("plane.celm: 1\n", "fine.yaml:1:1: plane.celm: there is no parameter celm"),
+        ("wall.gsd_m: fine\n", "fine.yaml:1:13: wall.gsd_m: input should be a valid number"),
+        ("wall: {gsd_m: 1}\n", "fine.yaml:1:1: wall: expected step.parameter"),
+        ("- 1\n", "fine.yaml:1:1: .*expected a mapping, got a list"),
+        ("wall.gsd_m: [1\n", "fine.yaml:1:13: this is not YAML: the bracket"),
+    ],
+)
+def test_mistakes_in_a_file_of_parameters_are_told_at_their_place(
+    catalog: Catalog, tmp_path: Path, text: str, said: str
+) -> None:
+    (tmp_path / "fine.yaml").write_text(text)
+    with pytest.raises(InvalidWorkflowError, match=said):
+        load_swept(catalog, set_files=["fine.yaml"])
+
+
+def test_a_missing_file_of_parameters_is_an_argument_that_is_wrong(catalog: Catalog) -> None:
+    with pytest.raises(InvalidArgumentsError, match=r"--set-file nix\.yaml: nix\.yaml cannot"):
+        load_swept(catalog, set_files=["nix.yaml"])
+
+
+# --- how values are written ---
+
+
+@pytest.mark.parametrize(
+    ("parameter", "text", "said"),
+    [
+        ("gsd_m", "0,003", "; decimals have a point: 0.003"),
+        ("gsd_m", "3mm", "; it is in metres, and no unit stands behind it: 0.003"),
+        ("gsd_m", "5 cm", "; it is in metres, and no unit stands behind it: 0.05"),
+        ("gsd_m", "0,5 cm", "; it is in metres, and no unit stands behind it: 0.005"),
+        ("max_tilt_deg", "10°", "; it is in degrees, and no unit stands behind it: 10"),
+        ("noise_mm", "0.002 m", "; it is in millimetres, and no unit stands behind it: 2"),
+        ("min_share", "5 m", "; no unit stands behind a number"),
+        ("gsd_m", "5 deg", "; no unit stands behind a number"),
+        ("gsd_m", "0.003", "; write it without quotes"),
+        ("gsd_m", "fine", ""),
+        ("gsd_m", "1.2.3", ""),
+        ("gsd_m", [1], ""),
+    ],
+)
+def test_a_number_in_words_gets_its_value(parameter: str, text: object, said: str) -> None:
+    assert meant_number(parameter, text) == said
+
+
+@pytest.mark.parametrize(
+    ("parameter", "words", "units"),
+    [
+        (
+            "gsd_m",
+            "metres",
+            {"m": 1, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "µm": 1e-6, "km": 1000},
+        ),
+        ("noise_mm", "millimetres", {"mm": 1, "um": 0.001, "m": 1000}),
+        ("tilt_deg", "degrees", {"deg": 1, "°": 1, "rad": 180 / math.pi, "gon": 360 / 400}),
+        ("tilt_rad", "radians", {"rad": 1, "°": math.pi / 180}),
+        ("limit_s", "seconds", {"s": 1, "ms": 0.001, "min": 60, "h": 60 * 60}),
+        ("shift_px", "px", {"px": 1}),
+    ],
+)
+def test_units_of_one_family_are_reckoned_into_each_other(
+    parameter: str, words: str, units: dict[str, float]
+) -> None:
+    for unit, factor in units.items():
+        assert meant_number(parameter, f"3 {unit}") == (
+            f"; it is in {words}, and no unit stands behind it: {3 * factor:g}"
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("gsd_mm", 50, " (it is gsd_m, in metres: gsd_m: 0.05)"),
+        ("gsd_cm", "5", " (it is gsd_m, in metres)"),
+        ("tilt_rad", math.pi, " (it is tilt_deg, in degrees: tilt_deg: 180)"),
+        ("tilt_m", 1, ""),
+        ("gsd_m", 1, ""),
+        ("mm", 1, ""),
+        ("gsd_mm", True, " (it is gsd_m, in metres)"),
+    ],
+)
+def test_a_name_with_another_unit_is_led_to_ours(name: str, value: object, said: str) -> None:
+    assert meant_parameter(name, ["crs", "gsd_m", "tilt_deg"], value) == said  # type: ignore[arg-type]

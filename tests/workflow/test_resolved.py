@@ -12,8 +12,7 @@ import pytest
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.format import Workflow
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.model import Workflow, resolved_json, workflow_from_resolved
 
 RECIPES = sorted((Path(__file__).resolve().parents[2] / "workflows").glob("*.yaml"))
 
@@ -60,12 +59,12 @@ def changed(change: Callable[[dict[str, object]], object]) -> str:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("not JSON", r"the resolved workflow cannot be read: JSONDecodeError"),
-        ("[]", r"the resolved workflow cannot be read: TypeError"),
-        ("{}", r"the resolved workflow cannot be read: KeyError 'orthoflow'"),
+        ("not JSON", r"the resolved workflow cannot be read: : Invalid JSON"),
+        ("[]", r"the resolved workflow cannot be read: : Input should be an object"),
+        ("{}", r"the resolved workflow cannot be read: orthoflow: Field required"),
         (
             changed(lambda document: document.update(orthoflow=2)),
-            r"the resolved workflow has format 2, this orthoflow reads 1",
+            r"the resolved workflow cannot be read: orthoflow: Input should be 1",
         ),
         (
             changed(lambda document: document.pop("seed")),
@@ -91,12 +90,6 @@ def test_other_text_is_refused_in_a_sentence(text: str, sentence: str) -> None:
         workflow_from_resolved(text, "")
 
 
-def test_paths_of_the_command_line_are_not_recorded(tmp_path: Path) -> None:
-    document = json.loads(resolved_json(loaded(RECIPES[0])))
-    assert document["orthoflow"] == 1
-    assert str(tmp_path.anchor + "home") not in json.dumps(document)
-
-
 def _first(document: Any, key: str) -> Any:
     return next(iter(document[key].values()))
 
@@ -112,7 +105,7 @@ CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "a billion repeats": (
         lambda d: _first(d, "steps")["variants"][0].update(repeat=10**9),
-        "is repeated 1000000000 times",
+        r"variants\.0\.repeat: Input should be less than or equal to 10000",
     ),
     "no variants": (lambda d: _first(d, "steps").update(variants=[]), "has 0 variants"),
     "a hidden variant": (

@@ -13,11 +13,17 @@ from ruamel.yaml import YAML
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.mermaid import mermaid
-from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
-from orthoflow.workflow.resolved import resolved_json
-from orthoflow.workflow.schema import workflow_schema
-from tests.laboratories import GOOD, laboratory_catalog, load, write_distribution
+from orthoflow.workflow.model import resolved_json
+from orthoflow.workflow.source import InvalidWorkflowError, shipped_workflow, shipped_workflows
+from orthoflow.workflow.views import mermaid, workflow_schema
+from tests import workflow_format
+from tests.laboratories import (
+    GOOD,
+    laboratory_catalog,
+    load,
+    with_steps,
+    write_distribution,
+)
 
 
 def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
@@ -161,3 +167,72 @@ def test_a_shipped_recipe_is_found_from_anywhere(
 def test_a_file_of_that_name_comes_before_the_recipe(catalog: Catalog, write: Path) -> None:
     write.with_name("direct").write_text(GOOD)
     assert load_workflow("direct", catalog).name == "palace-room"
+
+
+# --- the reference of the format ---
+
+KEYS = {name: (section, key, info) for name, section, key, info in workflow_format.all_keys()}
+
+
+def test_the_reference_is_made_of_the_models() -> None:
+    written = workflow_format.REFERENCE.read_text(encoding="utf-8")
+    assert written == workflow_format.reference(), f"run {workflow_format.COMMAND}"
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_the_example_of_a_key_fits_its_model_and_its_schema(name: str) -> None:
+    section, key, info = KEYS[name]
+    assert (info.description or "").endswith(".")
+    (example,) = info.examples or []
+    section.model_validate({key: example})
+    schema = section.model_json_schema()
+    schema["required"] = []
+    jsonschema.Draft202012Validator(schema).validate({key: example})
+
+
+def test_the_example_of_the_reference_is_a_workflow(tmp_path: Path) -> None:
+    path = tmp_path / "example.yaml"
+    path.write_text(workflow_format.EXAMPLE, encoding="utf-8")
+    catalog = discover_catalog()
+    assert load_workflow(path, catalog).name == "palace-room"
+    document = YAML(typ="safe", pure=True).load(workflow_format.EXAMPLE)
+    jsonschema.Draft202012Validator(workflow_schema(catalog)).validate(document)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "{use: plane.hough2d, in: {cloud: cloud.cloud}, variants: {a: {use: plane.ransac}}}",
+        "{params: {cell_m: 1}, in: {cloud: cloud.cloud}, variants: {a: {use: plane.hough2d}}}",
+        "{use: plane.hough2d, in: {cloud: cloud.cloud}, unless: cloud.cloud}",
+        "{use: plane.hough2d, in: {cloud: []}}",
+        "{in: {cloud: cloud.cloud}, variants: {}}",
+        "{in: {cloud: cloud.cloud}}",
+    ],
+)
+def test_reader_and_schema_refuse_the_same_steps(
+    step: str, catalog: Catalog, tmp_path: Path
+) -> None:
+    text = with_steps(f"x: {step}")
+    path = tmp_path / "flow.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InvalidWorkflowError):
+        load_workflow(path, catalog)
+    document = YAML(typ="safe", pure=True).load(text)
+    validator = jsonschema.Draft202012Validator(workflow_schema(catalog))
+    assert list(validator.iter_errors(document))
+
+
+@pytest.mark.parametrize("metrics", ["a.n_points", "[]", "[a]", "['a.*', '*.wall_s']"])
+def test_reader_and_schema_agree_on_metrics(metrics: str, catalog: Catalog, tmp_path: Path) -> None:
+    text = f"orthoflow: 1\nsteps: {{a: {{use: simulate.room}}}}\ncompare: {{metrics: {metrics}}}\n"
+    path = tmp_path / "flow.yaml"
+    path.write_text(text, encoding="utf-8")
+    document = YAML(typ="safe", pure=True).load(text)
+    is_valid = jsonschema.Draft202012Validator(workflow_schema(catalog)).is_valid(document)
+    try:
+        load_workflow(path, catalog)
+    except InvalidWorkflowError:
+        assert not is_valid
+    else:
+        assert is_valid

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, WorkflowError
-from orthoflow.workflow import comparison
-from orthoflow.workflow.cells import (
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.expand import (
     Cell,
     CellOutput,
     Selection,
@@ -20,7 +21,7 @@ from orthoflow.workflow.cells import (
     derive_seed,
     expand_cells,
 )
-from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.model import resolved_json, workflow_from_resolved
 from tests.laboratories import GOOD, load
 
 TWO_ORTHOS = """\
@@ -212,20 +213,121 @@ def test_an_inspection_looks_at_every_repeat_of_what_has_randomness(
         assert check.seed == cells["check"].seed
 
 
+def test_repeats_reach_what_lies_between_them_and_an_inspection(
+    catalog: Catalog, write: Path
+) -> None:
+    through_walls = JUDGED.replace("planes: plane.planes", "planes: other.planes")
+    for text in (through_walls, through_walls.replace("         planes: other.planes", "        ")):
+        cells = cells_of(text.replace("room.truth,\n        }", "room.truth}"), write, catalog)
+        for step in ("other", "wall", "ortho", "mosaic", "check"):
+            assert addresses(cells, step) == [step, f"{step}#1", f"{step}#2"]
+        assert addresses(cells, "room") == ["room"]
+        for repeat in (1, 2):
+            check = cells[f"check#{repeat}"]
+            assert set(check.sources) <= {
+                f"mosaic#{repeat}",
+                f"wall#{repeat}",
+                "room",
+                f"other#{repeat}",
+            }
+            assert cells[f"wall#{repeat}"].inputs["planes"].address == f"other#{repeat}"  # type: ignore[union-attr]
+            # What differs is what it looks at, not how it looks.
+            assert check.seed == cells["check"].seed
+
+
+def test_repeats_that_only_time_a_method_reach_nothing(catalog: Catalog, write: Path) -> None:
+    text = JUDGED.replace("other: {use: plane.ransac", "other: {use: plane.hough2d")
+    assert addresses(cells_of(text, write, catalog), "check") == ["check"]
+
+
 @pytest.mark.parametrize(
-    ("what", "instead"),
+    ("metrics", "repeated"),
     [
-        # Repeats that only time a method are all alike.
-        ("other: {use: plane.ransac", "other: {use: plane.hough2d"),
-        # Walls of the first repeat beside planes of another would be no result of anything.
-        ("planes: plane.planes", "planes: other.planes"),
+        ("other.rms_mm", ["other"]),
+        ("wall.n_cells, other.rms_mm", ["other", "wall"]),
+        ("'*.wall_s'", ["other", "wall", "ortho", "mosaic", "check"]),
+        ("mosaic.*", ["other", "wall", "ortho", "mosaic"]),
     ],
 )
-def test_an_inspection_is_not_repeated_for_what_does_not_differ_or_fit(
-    catalog: Catalog, write: Path, what: str, instead: str
+def test_repeats_reach_the_steps_that_the_comparison_names(
+    metrics: str, repeated: list[str], catalog: Catalog, write: Path
 ) -> None:
-    assert what in JUDGED
-    assert addresses(cells_of(JUDGED.replace(what, instead), write, catalog), "check") == ["check"]
+    text = JUDGED.replace("planes: plane.planes", "planes: other.planes")
+    cells = cells_of(f"{text}compare: {{metrics: [{metrics}]}}\n", write, catalog)
+    assert [cell.step for cell in cells.values() if cell.repeat == 1] == repeated
+
+
+def test_repeats_of_two_steps_go_together(catalog: Catalog, write: Path) -> None:
+    text = (
+        JUDGED.replace("planes: plane.planes", "planes: other.planes")
+        .replace(
+            "plane: {use: plane.hough2d, in: {cloud: room.cloud}}",
+            "plane: {use: plane.ransac, in: {cloud: room.cloud}, repeat: 2}",
+        )
+        .replace("truth: room.truth", "truth: room.truth, labels: plane.labels")
+    )
+    cells = cells_of(text, write, catalog)
+    assert addresses(cells, "check") == ["check", "check#1", "check#2"]
+    labels = [cells[f"check{mark}"].inputs.get("labels") for mark in ("", "#1", "#2")]
+    assert [str(one) for one in labels] in (
+        ["plane.labels", "plane#1.labels", "plane.labels"],
+        ["None", "None", "None"],
+    )
+
+
+SEEDED = JUDGED.replace("orthoflow: 1\n", "orthoflow: 1\nseed: {sweep: [1, 2, 3]}\n").replace(
+    ", repeat: 3", ""
+)
+
+
+def test_a_sweep_of_seeds_is_a_factor_of_all_that_is_random(catalog: Catalog, write: Path) -> None:
+    cells = cells_of(SEEDED, write, catalog)
+    for step in ("room", "other", "check"):
+        assert addresses(cells, step) == [f"{step}@seed={seed}" for seed in (1, 2, 3)]
+    assert cells["other@seed=2"].seed == derive_seed(2, "plane.ransac", 0)
+    assert cells["check@seed=2"].assignment == {"seed": "2"}
+    assert str(cells["check@seed=2"].inputs["planes"]) == "other@seed=2.planes"
+    workflow = load_workflow(write, catalog)
+    assert (workflow.seed, workflow.seeds) == (1, (1, 2, 3))
+    again = workflow_from_resolved(resolved_json(workflow), workflow.source)
+    assert again.seeds == workflow.seeds
+
+
+def test_seeds_stand_before_variants_and_can_be_left_out(catalog: Catalog, write: Path) -> None:
+    text = SEEDED.replace(
+        "other: {use: plane.ransac, in: {cloud: room.cloud}}",
+        "other: {in: {cloud: room.cloud}, "
+        "variants: {a: {use: plane.ransac}, b: {use: plane.hough2d}}}",
+    )
+    cells = cells_of(f"{text}compare: {{exclude: [{{seed: 3, other: b}}]}}\n", write, catalog)
+    assert addresses(cells, "other") == [
+        *("other@seed=1,other=a", "other@seed=1,other=b"),
+        *("other@seed=2,other=a", "other@seed=2,other=b", "other@seed=3,other=a"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seed", "said"),
+    [
+        ("{sweep: [1]}", "seed.sweep: expected 2 to 100 values in a list, got"),
+        ("{sweep: [1, -2]}", "seed.sweep[1]: expected a whole number from 0 on, got -2"),
+        ("{sweep: [1, 2, 1]}", "seed.sweep: 1 is swept twice"),
+        ("{swep: [1, 2]}", "seed.swep: unknown key swep (did you mean sweep?)"),
+        ("true", "seed: expected a whole number from 0 on, or {sweep: [NUMBER, NUMBER, ...]}, got"),
+    ],
+)
+def test_a_sweep_of_seeds_has_whole_numbers(
+    seed: str, said: str, catalog: Catalog, write: Path
+) -> None:
+    with pytest.raises(WorkflowError, match=re.escape(said)):
+        load(SEEDED.replace("{sweep: [1, 2, 3]}", seed), write, catalog)
+
+
+def test_a_step_cannot_be_called_seed_beside_seeds(catalog: Catalog, write: Path) -> None:
+    text = SEEDED.replace("other", "seed")
+    with pytest.raises(WorkflowError, match="a step is called seed, which stands for the seed"):
+        load(text, write, catalog)
+    assert "seed" in cells_of(JUDGED.replace("other", "seed"), write, catalog)
 
 
 def test_the_seed_is_the_start_of_a_digest_and_exact_in_a_double() -> None:
@@ -358,16 +460,6 @@ def test_cells_of_one_step_on_one_dataset_are_compared() -> None:
     assert compared_cells(cells[:2]) == frozenset()
 
 
-def test_deviations_from_the_baseline_come_each_once() -> None:
-    varied = {"plane": ("a", "b"), "wall": ("u", "v", "w")}
-    assert list(comparison._one_at_a_time(varied, {"plane": "a", "wall": "v"})) == [
-        {"plane": "a", "wall": "v"},
-        {"plane": "b", "wall": "v"},
-        {"plane": "a", "wall": "u"},
-        {"plane": "a", "wall": "w"},
-    ]
-
-
 @pytest.mark.parametrize(("design", "n_cells"), [("one-at-a-time", 7), ("product", 8)])
 def test_cells_are_counted_as_they_will_be_with_the_repeats_of_the_baseline(
     design: str, n_cells: int, catalog: Catalog, write: Path
@@ -376,10 +468,7 @@ def test_cells_are_counted_as_they_will_be_with_the_repeats_of_the_baseline(
     compare = f"compare: {{design: {design}, baseline: {{plane: ransac, orient: bundle}}}}\n"
     text = text.partition("compare:")[0] + compare
     cells = cells_of(text, write, catalog)
-    workflow = load_workflow(write, catalog)
     assert len(addresses(cells, "orient")) == n_cells
-    assert comparison._count_cells(workflow, ["plane", "orient"]) == n_cells
-    assert comparison._count_cells(workflow, ["cloud"]) == 1
 
 
 def test_more_combinations_than_anybody_can_run_are_refused(catalog: Catalog, write: Path) -> None:

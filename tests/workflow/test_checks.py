@@ -8,9 +8,14 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.workflow.doubts import doubts_about
-from orthoflow.workflow.format import StepVariant, Workflow, WorkflowInputSpec, WorkflowStep
-from orthoflow.workflow.shapes import Reference
+from orthoflow.workflow.checks import doubts_about
+from orthoflow.workflow.model import (
+    Reference,
+    StepVariant,
+    Workflow,
+    WorkflowInputSpec,
+    WorkflowStep,
+)
 from tests.laboratories import GOOD, load
 
 

@@ -1,0 +1,454 @@
+"""How the parts of a workflow fit together: wiring, comparison, and what can hardly be meant."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Final
+
+from orthoflow.catalog.wording import did_you_mean
+from orthoflow.files.yaml_positions import Table
+from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
+from orthoflow.sdk.hooks import FILES
+from orthoflow.workflow.inputs import some_of
+from orthoflow.workflow.model import (
+    DATA,
+    INPUTS,
+    SEED,
+    CompareSection,
+    Comparison,
+    Reference,
+    StepVariant,
+    Workflow,
+    is_acyclic,
+)
+from orthoflow.workflow.parameters import DraftStep
+from orthoflow.workflow.source import Location, ProblemLog
+
+_WILDCARDS: Final = frozenset("*?[")
+
+
+# Wiring -------------------------------------------------------------------------------------------
+
+
+def check_wiring(
+    steps: Sequence[DraftStep],
+    step_names: Collection[str],
+    input_names: Collection[str],
+    log: ProblemLog,
+) -> None:
+    """Report everything that is wrong with how steps are wired.
+
+    Args:
+        steps: all steps that could be read.
+        step_names: names of all steps in the file, readable or not.
+        input_names: names of all inputs.
+        log: takes the problems.
+    """
+    wiring = _Wiring(
+        steps={step.name: step for step in steps},
+        step_names=step_names,
+        input_names=input_names,
+        log=log,
+    )
+    for step in steps:
+        wiring.check_step(step)
+    _check_cycles(steps, log)
+
+
+def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
+    """All references of a step, each with its port and its place."""
+    for port, references in step.inputs.items():
+        for index, reference in enumerate(references):
+            yield port, (*step.location, "in", port, index), reference
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Wiring:
+    steps: Mapping[str, DraftStep]
+    step_names: Collection[str]
+    input_names: Collection[str]
+    log: ProblemLog
+
+    def check_step(self, step: DraftStep) -> None:
+        accepted = _accepted_ports(step)
+        for port in step.inputs if accepted is not None else ():
+            if port not in (accepted or {}):
+                self.log.report(
+                    (*step.location, "in", port),
+                    f"{step.calls[0].method} has no input port {port}"
+                    f"{did_you_mean(port, accepted or {})}; it has "
+                    f"{', '.join(accepted or {}) or 'none'}",
+                    at_key=True,
+                )
+        for port, location, reference in _placed(step):
+            found = self._type_of(location, reference)
+            wanted = (accepted or {}).get(port)
+            if found is not None and wanted is not None and found != wanted:
+                message = f"expected {_article(wanted)}, but {reference} gives {_article(found)}"
+                self.log.report(location, message)
+        for key, condition in (("if", step.only_if), ("unless", step.unless)):
+            if condition is not None:
+                self._type_of((*step.location, key), condition)
+        self._check_required(step)
+
+    def _type_of(self, location: Location, reference: Reference) -> str | None:
+        """Return the product type behind a reference; None when unknown, which is reported."""
+        if reference.is_input:
+            if reference.name in self.input_names:
+                return FILES
+            self.log.report(
+                location,
+                f"there is no input {reference.name}"
+                f"{did_you_mean(reference.name, self.input_names)}; inputs: "
+                f"{', '.join(self.input_names) or 'none'}",
+            )
+            return None
+        if reference.source not in self.step_names:
+            known = [*self.step_names, INPUTS]
+            self.log.report(
+                location,
+                f"there is no step {reference.source}{did_you_mean(reference.source, known)}; "
+                f"steps: {', '.join(self.step_names)}",
+            )
+            return None
+        source = self.steps.get(reference.source)
+        given = _given_ports(source) if source else None
+        if given is not None and reference.name not in given:
+            self.log.report(
+                location,
+                f"step {reference.source} has no output port {reference.name}"
+                f"{did_you_mean(reference.name, given)}; it has {', '.join(given)}",
+            )
+        return (given or {}).get(reference.name)
+
+    def _check_required(self, step: DraftStep) -> None:
+        for call in step.calls:
+            for port in call.info.takes.values() if call.info else ():
+                if port.required and port.name not in self._wired(step):
+                    self.log.report(
+                        (*call.location, "use"),
+                        f"{call.method} needs port {port.name}, {_article(port.type_name)}, "
+                        "which is not wired",
+                        shown=(*step.location, "in"),
+                    )
+
+    def _wired(self, step: DraftStep) -> Collection[str]:
+        # Ports whose references cannot be read are wired all the same.
+        table = self.log.value((*step.location, "in"))
+        return {entry.key for entry in table} if isinstance(table, Table) else step.inputs
+
+
+def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
+    """Port -> product type of a step; None when its kind is unknown."""
+    for call in step.calls:
+        if call.kind is not None and not call.kind.is_source:
+            return call.kind.outputs if are_given else call.kind.inputs
+        if call.info is not None:
+            takes = {port.name: port.type_name for port in call.info.takes.values()}
+            return call.info.gives if are_given else takes
+    return None
+
+
+def _accepted_ports(step: DraftStep) -> Mapping[str, str] | None:
+    return _ports(step, are_given=False)
+
+
+def _given_ports(step: DraftStep) -> Mapping[str, str] | None:
+    return _ports(step, are_given=True)
+
+
+def _article(type_name: str) -> str:
+    return "files of an input" if type_name == FILES else f"the product {type_name}"
+
+
+def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
+    wires: dict[tuple[str, str], tuple[Location, Reference]] = {}
+    names = {step.name for step in steps}
+    for step in steps:
+        for _, location, reference in _placed(step):
+            if reference.source in names:
+                wires.setdefault((reference.source, step.name), (location, reference))
+    sources: dict[str, list[str]] = {}
+    for source, user in wires:
+        sources.setdefault(user, []).append(source)
+    if is_acyclic(sources):
+        return
+    import networkx as nx  # noqa: PLC0415 - takes a quarter of a command's start, for a mistake only
+
+    graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
+    for members in nx.strongly_connected_components(graph):
+        inside = graph.subgraph(members)
+        if inside.number_of_edges() == 0:
+            continue
+        edges = [(str(edge[0]), str(edge[1])) for edge in nx.find_cycle(inside)]
+        places = {edge: log.position(wires[edge][0]) for edge in edges}
+        first = min(range(len(edges)), key=lambda index: places[edges[index]])
+        edges = edges[first:] + edges[:first]
+        listed = ", ".join(
+            f"{edge[1]} takes {wires[edge][1]} (line {places[edge].line})" for edge in edges
+        )
+        log.report(wires[edges[0]][0], f"the steps form a cycle: {listed}")
+
+
+# The comparison -----------------------------------------------------------------------------------
+
+
+def check_comparison(
+    section: CompareSection | None,
+    steps: Sequence[DraftStep],
+    step_names: Sequence[str],
+    datasets: Sequence[str],
+    seeds: Sequence[int],
+    log: ProblemLog,
+) -> Comparison | None:
+    """Check the section `compare` against steps, datasets and seeds; None without one."""
+    if section is None:
+        return None
+    names = {step.name: _variant_names(step) for step in steps if step.is_varied}
+    factors = dict(names)
+    if datasets:
+        factors[DATA] = list(datasets)
+    if seeds:
+        factors[SEED] = [str(seed) for seed in seeds]
+    baseline = {
+        step: variant
+        for step, written in section.baseline.items()
+        if (variant := _current(steps, step, written)) != ""
+    }
+    baseline = _known(baseline, ("compare", "baseline"), names, log)
+    excluded: list[dict[str, str]] = []
+    for index, combination in enumerate(section.exclude):
+        if any(_current(steps, step, name) != name for step, name in combination.items()):
+            continue  # it names a value that is not swept now
+        known = _known(combination, ("compare", "exclude", index), factors, log)
+        if known:
+            excluded += _spelled_out(known, steps)
+    comparison = Comparison(
+        design=section.design,
+        baseline={**first_variants(steps), **next(_spelled_out(baseline, steps))},
+        exclude=tuple(excluded),
+        metrics=section.metrics,
+    )
+    _check_baseline(comparison, log)
+    for index, pattern in enumerate(section.metrics):
+        if problem := _metric_problem(pattern, steps, step_names):
+            log.report(("compare", "metrics", index), problem)
+    return comparison
+
+
+def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
+    for combination in comparison.exclude:
+        if combination.items() <= comparison.baseline.items():
+            listed = ", ".join(f"{step}: {variant}" for step, variant in combination.items())
+            log.report(
+                ("compare",),
+                f"the baseline contains the excluded combination {{{listed}}}; name another "
+                "baseline",
+                at_key=True,
+                shown=("compare", "exclude"),
+            )
+
+
+def _variant_names(step: DraftStep) -> list[str]:
+    # A variant that was swept is still known by its own name.
+    return list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
+
+
+def _families(step: DraftStep) -> dict[str, list[str]]:
+    """Of variants that were swept: name -> the variants that its values became."""
+    found: dict[str, list[str]] = {}
+    for call in step.calls:
+        if call.family:
+            found.setdefault(call.family, []).append(call.name)
+    return found
+
+
+def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
+    """Return the variant that a name stands for now.
+
+    Of a call that the file sweeps and the command line gives one value, the names of swept values
+    stand for the call: empty for a step without other variants.
+    """
+    draft = next((one for one in steps if one.name == step), None)
+    fitting = [
+        call.name
+        for call in (draft.calls if draft else ())
+        if call.is_unswept and (not call.name or variant.startswith(f"{call.name}-"))
+    ]
+    return max(fitting, key=len, default=variant)
+
+
+def _spelled_out(
+    assignment: Mapping[str, str], steps: Sequence[DraftStep]
+) -> Iterator[dict[str, str]]:
+    """Return an assignment for each value of a swept variant that it names, in their order."""
+    families = {step.name: _families(step) for step in steps}
+    several = [
+        families.get(step, {}).get(variant, [variant]) for step, variant in assignment.items()
+    ]
+    for names in itertools.product(*several):
+        yield dict(zip(assignment, names, strict=True))
+
+
+def first_variants(steps: Sequence[DraftStep]) -> dict[str, str]:
+    """The first variant of every varied step."""
+    return {step.name: step.calls[0].name for step in steps if step.is_varied and step.calls}
+
+
+def _known(
+    assignment: Mapping[str, str],
+    location: Location,
+    names: Mapping[str, Sequence[str]],
+    log: ProblemLog,
+) -> dict[str, str]:
+    """Keep what names a factor and one of its levels; report the rest."""
+    chosen: dict[str, str] = {}
+    for factor, level in assignment.items():
+        known = names.get(factor)
+        if known is None:
+            log.report(
+                (*location, factor),
+                f"there is no step {factor} with variants{did_you_mean(factor, names)}; with "
+                f"variants: {', '.join(names) or 'none'}",
+                at_key=True,
+            )
+        elif level in known:
+            chosen[factor] = level
+        else:
+            what, have = {
+                DATA: ("there is no dataset", "datasets:"),
+                SEED: ("there is no seed", "seeds:"),
+            }.get(factor, (f"step {factor} has no variant", "it has"))
+            log.report(
+                (*location, factor),
+                f"{what} {level}{did_you_mean(level, known)}; {have} {some_of(known)}",
+            )
+    return chosen
+
+
+def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
+    """Return why a pattern of metrics finds nothing; empty where it may find something."""
+    step, _, metric = pattern.partition(".")
+    if not _has_wildcard(step) and step not in step_names:
+        return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
+    chosen = [one for one in steps if fnmatchcase(one.name, step)]
+    calls = [call for one in chosen for call in one.calls]
+    methods = [call.info.method for call in calls if call.info is not None]
+    if not methods or len(methods) < len(calls):
+        return ""
+    declared = [spec.name for method in methods for spec in method.metric_specs()]
+    known = [
+        *dict.fromkeys(name for name in declared if not _has_wildcard(name)),
+        *MEASURED_BY_THE_ENGINE,
+    ]
+    is_possible = any(fnmatchcase(name, metric) for name in known)
+    if _has_wildcard(metric):
+        # What two patterns have in common is not searched for.
+        is_possible = is_possible or any(map(_has_wildcard, declared))
+    if is_possible or any(not method.metrics or method.may_report(metric) for method in methods):
+        return ""
+    names = " and ".join(one.name for one in chosen)
+    ids = ", ".join(dict.fromkeys(call.method for call in calls))
+    return (
+        f"step {names} reports no metric {metric}{did_you_mean(metric, known)}; `orthoflow plugins "
+        f"show METHOD` lists those of {ids}"
+    )
+
+
+def _has_wildcard(text: str) -> bool:
+    return not _WILDCARDS.isdisjoint(text)
+
+
+# What is allowed and can hardly be meant ----------------------------------------------------------
+
+_GSD: Final = "gsd_m"
+_CROP: Final = "crop"
+# The kind whose methods find photos on walls.
+_MATCHING: Final = "match."
+# Cells of walls and plans: finer than any scan, coarser than anything that is drawn of a building.
+_MIN_GSD_M: Final = 0.0001
+_MAX_GSD_M: Final = 0.5
+_MILLIMETRES: Final = 1000.0
+
+
+def doubts_about(workflow: Workflow) -> tuple[str, ...]:
+    """Return a sentence for each thing that is allowed and can hardly be meant."""
+    return (
+        *_unused_inputs(workflow),
+        *_idle_datasets(workflow),
+        *_cell_sizes(workflow),
+        *_cropped_matching(workflow),
+    )
+
+
+def _taken_inputs(workflow: Workflow) -> set[str]:
+    return {
+        name
+        for step in workflow.steps.values()
+        for name in (*(one.name for one in step.references if one.is_input), *step.conditions)
+    }
+
+
+def _unused_inputs(workflow: Workflow) -> Iterator[str]:
+    taken = _taken_inputs(workflow)
+    for name in workflow.inputs:
+        if name not in taken:
+            yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
+
+
+def _idle_datasets(workflow: Workflow) -> Iterator[str]:
+    is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(_taken_inputs(workflow))
+    if workflow.datasets and is_idle and not workflow.has_data_seeds:
+        yield "the datasets change nothing: they name no input that a step takes, and no parameter"
+
+
+def _cell_sizes(workflow: Workflow) -> Iterator[str]:
+    for whose, step, variant in _calls(workflow, _GSD):
+        gsd_m = variant.params.get(_GSD)
+        if isinstance(gsd_m, int | float) and not _MIN_GSD_M <= gsd_m <= _MAX_GSD_M:
+            place = ".".join(part for part in (step, variant.name, _GSD) if part)
+            meant_m = gsd_m / _MILLIMETRES
+            hint = ""
+            if _MIN_GSD_M <= meant_m <= _MAX_GSD_M:
+                hint = f"; {gsd_m:g} mm are written {_GSD}: {meant_m:g}"
+            yield (
+                f"{place}{whose} is {gsd_m:g} m, which can hardly be meant: cells are "
+                f"{_MIN_GSD_M:g} to {_MAX_GSD_M:g} m wide{hint}"
+            )
+
+
+def _cropped_matching(workflow: Workflow) -> Iterator[str]:
+    cropped = {
+        step
+        for _, step, variant in _calls(workflow, _CROP)
+        if variant.params.get(_CROP) is not None
+    }
+    matching = [
+        step
+        for step in workflow.steps.values()
+        if any(variant.method.startswith(_MATCHING) for variant in step.variants)
+    ]
+    # Whose cameras are given needs no matching.
+    if any(step.unless and workflow.inputs[step.unless].files for step in matching):
+        return
+    for first in matching[:1]:
+        for wall in cropped.intersection(first.upstream()):
+            yield (
+                f"{wall}.{_CROP} leaves {first.name} less to match photos to: fewer are oriented, "
+                "and less well; run without it first, and hand on the cameras which that run "
+                "found: --input cameras=RUN/products/orient/cameras.json"
+            )
+
+
+def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
+    """Whose, of which step and how: all calls, of datasets those that set the parameter."""
+    for step in workflow.steps.values():
+        for variant in step.variants:
+            yield "", step.name, variant
+    for dataset in workflow.chosen_data:
+        if parameter in {key.rpartition(".")[2] for key in dataset.sets}:
+            for (name, _), variant in dataset.calls.items():
+                yield f" of dataset {dataset.name}", name, variant

@@ -1,0 +1,673 @@
+"""Cells: what a workflow's steps and variants become, one per method call that really differs.
+
+All of them first; `--only`, `--from` and `--until` then choose among them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import itertools
+import json
+import math
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from typing import Final, TypeAlias
+
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.wording import did_you_mean
+from orthoflow.errors import ArgumentError, WorkflowError
+from orthoflow.products.product import JsonValue
+from orthoflow.workflow.inputs import present_inputs
+from orthoflow.workflow.model import (
+    DATA,
+    SEED,
+    Dataset,
+    Reference,
+    StepVariant,
+    Workflow,
+    WorkflowStep,
+)
+from orthoflow.workflow.parameters import MethodInfo, describe_method
+
+# Factor -> level: the dataset, the seed, and step -> variant.
+Assignment: TypeAlias = dict[str, str]
+MOST_CELLS: Final = 20_000
+# The kind whose methods measure how good what others made is.
+_JUDGING: Final = "inspect"
+# How the reason of a cell begins that lacks optional data, unlike one behind a failure.
+NOT_ASKED_FOR: Final = "only "
+_SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellOutput:
+    """An output of another cell."""
+
+    address: str
+    port: str
+
+    def __str__(self) -> str:
+        return f"{self.address}.{self.port}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkflowInput:
+    """One of the workflow's inputs, by its own name: `scan`, or `scan@hall` of a dataset."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"inputs.{self.name}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One method call of a run.
+
+    Attributes:
+        address: `step`, or `step@step=variant,...` with the variants that reach it in graph
+            order, `data=name` and `seed=n` in front where it depends on them, and `#n` behind it
+            for repeats 1, 2, ...
+        step: name of the step.
+        assignment: step -> variant for every varied step that reaches this cell, itself included,
+            with `data` -> dataset and `seed` -> seed in front.
+        repeat: 0 for the first, which downstream cells use; repeats reach the steps that the
+            workflow compares, and those between.
+        method: method id.
+        params: resolved parameters, defaults included, JSON.
+        params_set: parameters as written in the file or set on the command line, JSON.
+        inputs: port -> where it comes from; ports that the method ignores and optional ones that
+            are absent are left out.
+        seed: derived from (seed of the workflow or of the assignment, method id, repeat).
+        cores: cores asked for in `resources`, or None for all.
+        timeout_s: seconds, or None.
+        skip_reason: why the cell will not run (optional data absent), empty when it will.
+    """
+
+    address: str
+    step: str
+    method: str
+    assignment: Mapping[str, str] = field(default_factory=dict)
+    repeat: int = 0
+    params: Mapping[str, JsonValue] = field(default_factory=dict)
+    params_set: Mapping[str, JsonValue] = field(default_factory=dict)
+    inputs: Mapping[str, CellOutput | WorkflowInput] = field(default_factory=dict)
+    seed: int = 0
+    cores: int | None = None
+    timeout_s: float | None = None
+    skip_reason: str = ""
+
+    @property
+    def setting(self) -> str:
+        """How its parameters are named where they are set: `step`, or `step.variant`."""
+        variant = self.assignment.get(self.step)
+        return f"{self.step}.{variant}" if variant else self.step
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Addresses of the cells that it takes products of."""
+        return tuple(one.address for one in self.inputs.values() if isinstance(one, CellOutput))
+
+
+def compared_cells(cells: Iterable[Cell]) -> frozenset[str]:
+    """Return the addresses of cells whose times stand beside each other: variants and repeats.
+
+    Those of one step on one dataset; what differs in its data alone is no comparison of methods.
+    """
+    similar: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    for cell in cells:
+        similar[cell.step, cell.assignment.get(DATA, "")].append(cell.address)
+    return frozenset(
+        address for addresses in similar.values() if len(addresses) > 1 for address in addresses
+    )
+
+
+def is_plain(cells: Iterable[Cell]) -> bool:
+    """Whether nothing varies, so that each step is its only cell."""
+    return all(cell.address == cell.step for cell in cells)
+
+
+def variants_text(assignment: Mapping[str, str]) -> str:
+    """Write which variants are chosen, `plane=ransac, orient=pnp`; empty for none."""
+    return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
+
+
+def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
+    """Derive the seed of a cell: the same method gets the same seed wherever it stands."""
+    preimage = json.dumps(["orthoflow/seed", 1, workflow_seed, method_id, repeat])
+    digest = hashlib.sha256(preimage.encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
+
+
+# The graph of steps -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StepGraph:
+    """Which steps take products of which.
+
+    Attributes:
+        sources: step -> steps whose products it takes.
+        users: step -> steps that take its products.
+    """
+
+    sources: Mapping[str, Collection[str]]
+    users: Mapping[str, Collection[str]]
+
+    def before(self, name: str) -> set[str]:
+        """All that a step needs, directly or not."""
+        return _reached(self.sources, [name])
+
+    def after(self, name: str) -> set[str]:
+        """All that need a step, directly or not."""
+        return _reached(self.users, [name])
+
+
+def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set[str]:
+    reached: set[str] = set()
+    waiting = [name for start in starts for name in edges[start]]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting.extend(edges[name])
+    return reached
+
+
+def step_graph(steps: Mapping[str, WorkflowStep]) -> StepGraph:
+    """Return the graph of steps."""
+    sources = {name: set(step.upstream()) for name, step in steps.items()}
+    users: dict[str, set[str]] = {name: set() for name in steps}
+    for name, needed in sources.items():
+        for source in needed:
+            users[source].add(name)
+    return StepGraph(sources, users)
+
+
+def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
+    """Order steps so that each stands behind all it needs, else in the order of the file."""
+    graph, names = step_graph(steps), tuple(steps)
+    rank = {name: index for index, name in enumerate(names)}
+    n_missing = {name: len(sources) for name, sources in graph.sources.items()}
+    ready = [rank[name] for name in names if n_missing[name] == 0]
+    ordered: list[str] = []
+    while ready:
+        ordered.append(names[heapq.heappop(ready)])
+        for user in graph.users[ordered[-1]]:
+            n_missing[user] -= 1
+            if n_missing[user] == 0:
+                heapq.heappush(ready, rank[user])
+    return tuple(ordered)
+
+
+# Selections ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Names of steps; what is given together narrows the selection.
+
+    Attributes:
+        only: these steps.
+        from_: these steps and what follows from them.
+        until: these steps and what they are made from.
+
+    Whatever the chosen steps need comes along, from the cache where it is there.
+    """
+
+    only: tuple[str, ...] = ()
+    from_: tuple[str, ...] = ()
+    until: tuple[str, ...] = ()
+
+    @property
+    def by_option(self) -> Mapping[str, tuple[str, ...]]:
+        """Command-line option -> names of steps."""
+        return {"--only": self.only, "--from": self.from_, "--until": self.until}
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The options, each as given; none where nothing is left out."""
+        named = self.by_option.items()
+        return tuple(f"{option} {name}" for option, names in named for name in names)
+
+
+EVERYTHING: Final = Selection()
+
+
+def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
+    """Refuse names of steps that are not there, e.g. of `--force`.
+
+    Raises:
+        ArgumentError: a name is unknown.
+    """
+    for name in names:
+        if name not in workflow.steps:
+            raise ArgumentError(
+                f"{option} {name}: workflow {workflow.name} has no step {name}"
+                f"{did_you_mean(name, workflow.steps)}; steps: {', '.join(workflow.steps)}"
+            )
+
+
+def select_cells(
+    workflow: Workflow, cells: tuple[Cell, ...], selection: Selection
+) -> tuple[Cell, ...]:
+    """Keep the cells of the chosen steps and the cells that those need.
+
+    Raises:
+        ArgumentError: a step is unknown, or nothing is left.
+    """
+    for option, names in selection.by_option.items():
+        check_step_names(workflow, names, option)
+    graph = step_graph(workflow.steps)
+    chosen = set(workflow.steps)
+    if selection.from_:
+        chosen &= {step for name in selection.from_ for step in (name, *graph.after(name))}
+    if selection.until:
+        chosen &= {step for name in selection.until for step in (name, *graph.before(name))}
+    if selection.only:
+        chosen &= set(selection.only)
+    if not chosen:
+        raise ArgumentError(
+            f"no step of workflow {workflow.name} is left by {' '.join(selection.options)} together"
+        )
+    sources = {cell.address: cell.sources for cell in cells}
+    wanted = [cell.address for cell in cells if cell.step in chosen]
+    kept = {*wanted, *_reached(sources, wanted)}
+    return tuple(cell for cell in cells if cell.address in kept)
+
+
+# Combinations -------------------------------------------------------------------------------------
+
+
+def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
+    """Return the combinations of variants that reach a step, each once, the last step fastest.
+
+    Args:
+        workflow: the workflow.
+        steps: the steps that matter, in graph order: the step itself and what lies before it.
+    """
+    varied = {
+        name: tuple(variant.name for variant in workflow.steps[name].variants)
+        for name in steps
+        if workflow.steps[name].is_varied
+    }
+    baseline = {name: workflow.baseline[name] for name in varied}
+    if workflow.compare is None:
+        yield baseline
+    elif workflow.compare.design == "product":
+        for names in itertools.product(*varied.values()):
+            yield dict(zip(varied, names, strict=True))
+    else:
+        yield dict(baseline)
+        for step, variants in varied.items():
+            for name in variants:
+                if name != baseline[step]:
+                    yield {**baseline, step: name}
+
+
+def _count(workflow: Workflow, steps: Sequence[str]) -> int:
+    """Count the cells of a step and its repeats, without building them."""
+    *before, name = steps
+    step = workflow.steps[name]
+    repeats = {variant.name: variant.repeat for variant in step.variants}
+    first = repeats[workflow.baseline[name] if step.is_varied else step.variants[0].name]
+    if workflow.compare is None:
+        return first
+    others = [
+        len(workflow.steps[other].variants) for other in before if workflow.steps[other].is_varied
+    ]
+    if workflow.compare.design == "product":
+        return math.prod(others) * sum(repeats.values())
+    return sum(count - 1 for count in others) * first + sum(repeats.values())
+
+
+def _require_few(workflow: Workflow, count: int) -> None:
+    """Refuse more cells than anybody can run.
+
+    Raises:
+        WorkflowError: there are.
+    """
+    if count <= MOST_CELLS:
+        return
+    factors, fewer = "combinations", "fewer variants"
+    if workflow.has_seeds:
+        factors, fewer = f"seeds, {factors}", f"fewer seeds, {fewer}"
+    if workflow.chosen_data:
+        factors, fewer = f"datasets, {factors}", f"fewer datasets (--only-data), {fewer}"
+    raise WorkflowError(
+        f"the comparison of {workflow.name} runs its steps {count} times ({factors} of "
+        f"variants, and repeats), more than {MOST_CELLS}; use design: one-at-a-time, {fewer} "
+        "or a smaller repeat"
+    )
+
+
+def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
+    """Whether an assignment contains a combination that the comparison leaves out."""
+    excluded = workflow.compare.exclude if workflow.compare else ()
+    return any(combination.items() <= assignment.items() for combination in excluded)
+
+
+# Expansion ----------------------------------------------------------------------------------------
+
+
+def expand_cells(
+    workflow: Workflow, catalog: Catalog, *, selection: Selection = EVERYTHING
+) -> tuple[Cell, ...]:
+    """Expand a workflow into cells, each behind all it needs.
+
+    Looks at the files of optional inputs, because absent data decide which cells can run.
+
+    Raises:
+        ArgumentError: the selection names steps that are not there, or leaves nothing.
+        InputError: an optional input was named on the command line and is not there.
+        PluginError: a method cannot be loaded.
+    """
+    expansion = _Expansion(
+        workflow=workflow,
+        present=present_inputs(workflow),
+        methods={
+            variant.method: describe_method(catalog, variant.method)
+            for step in workflow.steps.values()
+            for variant in step.variants
+        },
+        rank={name: index for index, name in enumerate(topological_steps(workflow.steps))},
+    )
+    return select_cells(workflow, expansion.expand(), selection)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Node:
+    """A cell together with what decides whether it is there.
+
+    Attributes:
+        cell: the cell.
+        dependence: the factors that its product depends on; for a skipped cell, those that its
+            being skipped depends on, which may be fewer than its address names.
+        causes: with or without which inputs it would not be skipped.
+    """
+
+    cell: Cell
+    dependence: Assignment
+    causes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Choice:
+    """What a port takes: the first candidate that is present, or none."""
+
+    source: CellOutput | WorkflowInput | None
+    dependence: Assignment
+    causes: tuple[str, ...] = ()
+
+
+class _ExcludedError(Exception):
+    """The combination is left out of the comparison."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Expansion:
+    workflow: Workflow
+    present: frozenset[str]
+    methods: Mapping[str, MethodInfo]
+    rank: Mapping[str, int]
+    nodes: dict[str, dict[frozenset[tuple[str, str]], _Node]] = field(default_factory=dict)
+
+    def expand(self) -> tuple[Cell, ...]:
+        """Return all cells in topological order, the first of each repeat before the others."""
+        workflow = self.workflow
+        graph = step_graph(workflow.steps)
+        relevant = {
+            name: sorted(graph.before(name) | {name}, key=self.rank.__getitem__)
+            for name in self.rank
+        }
+        outer = {name: self._outer(steps) for name, steps in relevant.items()}
+        _require_few(
+            workflow,
+            sum(_count(workflow, steps) * len(outer[name]) for name, steps in relevant.items()),
+        )
+        compared = _compared_steps(workflow)
+        repeated = compared | _reached(graph.sources, compared)
+        cells: dict[str, Cell] = {}
+        for name, steps in relevant.items():
+            step = workflow.steps[name]
+            made: dict[frozenset[tuple[str, str]], _Node] = {}
+            self.nodes[name] = made
+            for fixed in outer[name]:
+                for varied in combinations(workflow, steps):
+                    assignment = {**fixed, **varied}
+                    try:
+                        node = self._node(step, assignment)
+                    except _ExcludedError:
+                        continue
+                    made[frozenset(assignment.items())] = node
+                    if node.cell.address not in cells:
+                        cells[node.cell.address] = node.cell
+                        for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
+                            cells[cell.address] = cell
+                        _require_few(workflow, len(cells))
+        # What leads only to an inspection that is skipped needs no repeats.
+        judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
+        needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}
+        return tuple(
+            cell
+            for cell in cells.values()
+            if cell.repeat < self._own_repeats(cell) or cell.address in needed
+        )
+
+    def _own_repeats(self, cell: Cell) -> int:
+        """Return how often the file has a cell repeated."""
+        step = self.workflow.steps[cell.step]
+        return step.variant(cell.assignment.get(step.name, "")).repeat
+
+    def _outer(self, steps: Iterable[str]) -> list[Assignment]:
+        """Return the datasets and seeds that a step runs on, as far as they may reach it."""
+        workflow = self.workflow
+        is_random = workflow.has_seeds and any(map(self._is_random, steps))
+        by_data = any(map(self._takes_data, steps)) or (is_random and workflow.has_data_seeds)
+        chosen: tuple[Dataset | None, ...] = workflow.chosen_data if by_data else (None,)
+        return [
+            {**({DATA: dataset.name} if dataset else {}), **by_seed}
+            for dataset in chosen
+            for by_seed in (
+                [{SEED: str(seed)} for seed in workflow.seeds_of(dataset)] if is_random else [{}]
+            )
+        ]
+
+    def _is_random(self, name: str) -> bool:
+        """Whether seeds change something of a step itself."""
+        return any(map(self._uses_seed, self.workflow.steps[name].variants))
+
+    def _uses_seed(self, variant: StepVariant) -> bool:
+        return self.methods[variant.method].method.determinism != "exact"
+
+    def _takes_data(self, name: str) -> bool:
+        """Whether datasets change something of a step itself."""
+        step = self.workflow.steps[name]
+        names = step.conditions | {one.name for one in step.references if one.is_input}
+        calls = ((name, variant.name) for variant in step.variants)
+        return not (
+            names.isdisjoint(self.workflow.data_inputs)
+            and self.workflow.data_calls.isdisjoint(calls)
+        )
+
+    def _repeats(
+        self, cell: Cell, before: Mapping[str, Cell], *, is_reached: bool
+    ) -> Iterator[Cell]:
+        """Return the repeats 1, 2, ... of a cell: its own, and those of what it is made of.
+
+        Repeat n of a cell takes repeat n of all that has one, and the first of all else.
+        """
+        if cell.skip_reason:
+            return
+        own = self._own_repeats(cell)
+        for repeat in range(1, MOST_CELLS):
+            inputs = {
+                port: replace(source, address=again)
+                if is_reached
+                and isinstance(source, CellOutput)
+                and self._differs(again := f"{source.address}#{repeat}", before)
+                else source
+                for port, source in cell.inputs.items()
+            }
+            if repeat >= own and inputs == cell.inputs:
+                return
+            seed = cell.seed
+            if repeat < own:
+                root = int(cell.assignment.get(SEED, self.workflow.seed))
+                seed = derive_seed(root, cell.method, repeat)
+            address = f"{cell.address}#{repeat}"
+            yield replace(cell, address=address, repeat=repeat, inputs=inputs, seed=seed)
+
+    def _differs(self, address: str, before: Mapping[str, Cell]) -> bool:
+        """Whether there is a repeat of that address, and it may differ from the first.
+
+        Repeats of a method without randomness only time it.
+        """
+        cell = before.get(address)
+        if cell is None:
+            return False
+        is_random = self.methods[cell.method].method.determinism != "exact"
+        return is_random or any("#" in source for source in cell.sources)
+
+    def _node(self, step: WorkflowStep, full: Mapping[str, str]) -> _Node:
+        workflow = self.workflow
+        variant = step.variant(full.get(step.name, ""))
+        own = {step.name: variant.name} if step.is_varied else {}
+        by_data = {DATA: full[DATA]} if DATA in full else {}
+        if (step.name, variant.name) in workflow.data_calls:
+            own |= by_data
+            calls = workflow.datasets[full[DATA]].calls
+            variant = calls.get((step.name, variant.name), variant)
+        if workflow.has_seeds and self._uses_seed(variant):
+            own |= {SEED: full[SEED], **(by_data if workflow.has_data_seeds else {})}
+        # Whether a step is needed may depend on the data too.
+        always = {} if step.conditions.isdisjoint(workflow.data_inputs) else by_data
+        own |= always
+        if _is_excluded(workflow, own):
+            raise _ExcludedError
+        if cause := self._stopped_by(step, full):
+            cell = self._cell(step, variant, own, {}, _reason(cause))
+            return _Node(cell=cell, dependence=always, causes=(cause,))
+        choices = {
+            port: self._choose(step.inputs[port], full)
+            for port in self.methods[variant.method].takes
+            if port in step.inputs
+        }
+        assignment = dict(own)
+        for choice in choices.values():
+            assignment |= choice.dependence
+        if _is_excluded(workflow, assignment):
+            raise _ExcludedError
+        inputs = {port: choice.source for port, choice in choices.items() if choice.source}
+        missing = next((port for port in choices if self._is_missing(variant, port, choices)), "")
+        if not missing:
+            cell = self._cell(step, variant, assignment, inputs, "")
+            return _Node(cell=cell, dependence=assignment)
+        choice = choices[missing]
+        dependence = dict(choice.dependence) | always
+        if not self._all_require(step, missing):
+            dependence |= own
+        cell = self._cell(step, variant, assignment, inputs, _reason(*choice.causes))
+        return _Node(cell=cell, dependence=dependence, causes=choice.causes)
+
+    def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
+        """Return why a step is skipped, whatever it takes; empty where it is not."""
+        if step.unless and self._input_name(step.unless, full) in self.present:
+            return f"without the input {step.unless}"
+        if step.only_if and self._input_name(step.only_if, full) not in self.present:
+            return f"with the input {step.only_if}"
+        return ""
+
+    def _choose(self, references: tuple[Reference, ...], full: Mapping[str, str]) -> _Choice:
+        dependence: Assignment = {}
+        causes: dict[str, None] = {}
+        for reference in references:
+            if reference.is_input:
+                if reference.name in self.workflow.data_inputs:
+                    dependence[DATA] = full[DATA]
+                name = self._input_name(reference.name, full)
+                if name in self.present:
+                    return _Choice(source=WorkflowInput(name=name), dependence=dependence)
+                causes[f"with the input {reference.name}"] = None
+                continue
+            node = self._upstream(reference.source, full)
+            # What a passed-over candidate depends on decides this choice as well.
+            dependence |= node.dependence
+            if not node.cell.skip_reason:
+                output = CellOutput(address=node.cell.address, port=reference.name)
+                return _Choice(source=output, dependence=dependence)
+            causes.update(dict.fromkeys(node.causes))
+        return _Choice(source=None, dependence=dependence, causes=tuple(causes))
+
+    def _input_name(self, name: str, full: Mapping[str, str]) -> str:
+        """The own name of an input: that of the dataset, where it names files for it."""
+        dataset = self.workflow.datasets.get(full.get(DATA, ""))
+        return dataset.inputs[name].name if dataset and name in dataset.inputs else name
+
+    def _upstream(self, step: str, full: Mapping[str, str]) -> _Node:
+        made = self.nodes[step]
+        names = {name for name, _ in next(iter(made), ())}
+        node = made.get(frozenset((name, chosen) for name, chosen in full.items() if name in names))
+        if node is None:
+            raise _ExcludedError
+        return node
+
+    def _is_missing(self, variant: StepVariant, port: str, choices: Mapping[str, _Choice]) -> bool:
+        return choices[port].source is None and self.methods[variant.method].takes[port].required
+
+    def _all_require(self, step: WorkflowStep, port: str) -> bool:
+        takes = (self.methods[variant.method].takes for variant in step.variants)
+        return all(port in ports and ports[port].required for ports in takes)
+
+    def _cell(
+        self,
+        step: WorkflowStep,
+        variant: StepVariant,
+        assignment: Mapping[str, str],
+        inputs: Mapping[str, CellOutput | WorkflowInput],
+        skip_reason: str,
+    ) -> Cell:
+        # The dataset and the seed stand before the steps.
+        rank = {DATA: -2, SEED: -1, **self.rank}
+        ordered = dict(sorted(assignment.items(), key=lambda item: rank[item[0]]))
+        listed = ",".join(f"{name}={chosen}" for name, chosen in ordered.items())
+        return Cell(
+            address=f"{step.name}@{listed}" if listed else step.name,
+            step=step.name,
+            method=variant.method,
+            assignment=ordered,
+            params=variant.params,
+            params_set=variant.params_set,
+            inputs=inputs,
+            seed=derive_seed(int(assignment.get(SEED, self.workflow.seed)), variant.method, 0),
+            cores=variant.cores,
+            timeout_s=variant.timeout_s,
+            skip_reason=skip_reason,
+        )
+
+
+def _compared_steps(workflow: Workflow) -> set[str]:
+    """Return the steps that the workflow compares, which repeats of what lies before them reach.
+
+    The steps that `compare.metrics` names and all inspections that its wildcards cover, without
+    `metrics` all inspections.
+    """
+    metrics = workflow.compare.metrics if workflow.compare else ()
+    patterns = [pattern.partition(".")[0] for pattern in metrics] or ["*"]
+    return {
+        step.name
+        for step in workflow.steps.values()
+        if step.name in patterns
+        or (
+            any(variant.method.partition(".")[0] == _JUDGING for variant in step.variants)
+            and any(fnmatchcase(step.name, pattern) for pattern in patterns)
+        )
+    }
+
+
+def _reason(*causes: str) -> str:
+    """Return why a cell is skipped: any of the causes would do."""
+    return f"{NOT_ASKED_FOR}{' or '.join(causes)}"

@@ -1,0 +1,999 @@
+"""The workflow format: what a file may hold, and the checked workflow that it becomes.
+
+The models of the file are the format: its checks, the JSON Schema and `docs/workflow-format.md`
+are made of them. What one key has to do with another is checked in `document` and `checks`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    WithJsonSchema,
+)
+from pydantic_core import PydanticCustomError
+
+from orthoflow.catalog.discovery import NAME_PATTERN
+from orthoflow.errors import WorkflowError
+from orthoflow.products.product import JsonValue
+
+if TYPE_CHECKING:
+    from orthoflow.workflow.source import Problem
+
+FORMAT: Final = 1
+# Errors of the models whose message is shown as it is.
+FORMAT_TOO_NEW: Final = "format_too_new"
+NOT_A_NAME: Final = "not_a_name"
+MOST_REPEATS: Final = 10_000
+# More values than a reader follows in a curve, and more runs than anybody waits for.
+MOST_SWEPT: Final = 100
+MOST_EXCLUDED: Final = 500
+# Records keep numbers of fewer than a hundred digits.
+_MOST_OF_A_NUMBER: Final = 10**80
+INPUTS: Final = "inputs"
+# Factors of addresses beside the steps: which dataset, and which seed.
+DATA: Final = "data"
+SEED: Final = "seed"
+NAME_RULE: Final = (
+    "a name starts with a lower-case letter, has at most 32 lower-case letters, digits, - or _, "
+    "and is not that of a device (con, prn, aux, nul, com1, lpt1 ...)"
+)
+Design = Literal["product", "one-at-a-time"]
+_TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")
+_SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
+_REFERENCE: Final = re.compile(rf"({NAME_PATTERN})\.({NAME_PATTERN})")
+_METRIC: Final = r"[^.]+\.(.|\n)+"
+
+
+# Values -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Expected:
+    """How messages and the documentation name what a value must be.
+
+    Attributes:
+        words: what is expected: `true or false`.
+        noun: one item of a list.
+        choices: the words of a choice.
+    """
+
+    words: str
+    noun: str = "value"
+    choices: tuple[str, ...] = ()
+
+
+def _check_name(name: str) -> str:
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise PydanticCustomError(
+            NOT_A_NAME, f"{{name}} cannot be a name: {NAME_RULE}", {"name": repr(name)}
+        )
+    return name
+
+
+def seconds_in(raw: object) -> float | None:
+    """Return the seconds that a time stands for, e.g. 1800 for `30min`; None for no time.
+
+    >>> seconds_in("30min"), seconds_in(2), seconds_in("soon")
+    (1800.0, 2.0, None)
+    """
+    seconds = 0.0
+    if isinstance(raw, int | float) and not isinstance(raw, bool):
+        seconds = float(raw)
+    elif isinstance(raw, str) and (match := _TIME.fullmatch(raw)):
+        seconds = float(match[1]) * _SECONDS[match[2]]
+    return seconds if math.isfinite(seconds) and seconds > 0 else None
+
+
+def _seconds(raw: object) -> float:
+    seconds = seconds_in(raw)
+    if seconds is None:
+        raise PydanticCustomError("time", "no time")
+    return seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """Where a port may take its product from.
+
+    Attributes:
+        source: name of a step, or `inputs`.
+        name: output port of the step, or name of the input.
+    """
+
+    source: str
+    name: str
+
+    @property
+    def is_input(self) -> bool:
+        """Whether it names an input of the workflow."""
+        return self.source == INPUTS
+
+    def __str__(self) -> str:
+        return f"{self.source}.{self.name}"
+
+
+def _reference(raw: object) -> Reference:
+    match = _REFERENCE.fullmatch(raw) if isinstance(raw, str) else None
+    if match is None:
+        raise PydanticCustomError("reference", "no reference")
+    return Reference(source=match[1], name=match[2])
+
+
+def _input_reference(raw: object) -> Reference:
+    reference = _reference(raw)
+    if not reference.is_input:
+        raise PydanticCustomError("reference", "no input")
+    return reference
+
+
+def _listed(raw: object) -> object:
+    return raw if isinstance(raw, list) else [raw]
+
+
+def _format_version(version: int) -> int:
+    if version > FORMAT:
+        raise PydanticCustomError(
+            FORMAT_TOO_NEW,
+            f"the file has workflow format {version}, this orthoflow reads {FORMAT}; upgrade "
+            "orthoflow",
+        )
+    return version
+
+
+_Name: TypeAlias = Annotated[
+    str, AfterValidator(_check_name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
+]
+_Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1), Expected("a text")]
+_Flag: TypeAlias = Annotated[bool, Strict(), Expected("true or false")]
+# Whole numbers; `true` is none.
+_Positive: TypeAlias = Annotated[
+    int,
+    Strict(),
+    Field(ge=1, le=_MOST_OF_A_NUMBER),
+    Expected("a whole number from 1 on"),
+    WithJsonSchema({"type": "integer", "minimum": 1}),
+]
+_Seed: TypeAlias = Annotated[
+    int,
+    Strict(),
+    Field(ge=0, le=_MOST_OF_A_NUMBER),
+    Expected("a whole number from 0 on"),
+    WithJsonSchema({"type": "integer", "minimum": 0}),
+]
+_Repeats: TypeAlias = Annotated[
+    int,
+    Strict(),
+    Field(ge=1, le=MOST_REPEATS),
+    Expected(f"a whole number from 1 to {MOST_REPEATS}"),
+]
+_Seconds: TypeAlias = Annotated[
+    float,
+    BeforeValidator(_seconds),
+    Expected("a time such as 90s, 30min, 2h or a number of seconds above 0"),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "exclusiveMinimum": 0},
+                {"type": "string", "pattern": f"^{_TIME.pattern}$"},
+            ]
+        }
+    ),
+]
+_Source: TypeAlias = Annotated[
+    Reference,
+    BeforeValidator(_reference),
+    Expected("step.port or inputs.name"),
+    WithJsonSchema({"type": "string", "pattern": rf"^{NAME_PATTERN}\.{NAME_PATTERN}$"}),
+]
+_InputSource: TypeAlias = Annotated[
+    Reference,
+    BeforeValidator(_input_reference),
+    Expected("an input such as inputs.scan"),
+    WithJsonSchema({"type": "string", "pattern": rf"^{INPUTS}\.{NAME_PATTERN}$"}),
+]
+_Metric: TypeAlias = Annotated[
+    str, Strict(), Field(pattern=rf"^{_METRIC}$"), Expected("step.metric, * allowed")
+]
+# A seed is a level as any other.
+_Level: TypeAlias = Annotated[
+    str,
+    Field(min_length=1),
+    BeforeValidator(lambda raw: str(raw) if type(raw) is int else raw),
+    Expected("a text"),
+    WithJsonSchema({"type": ["string", "integer"]}),
+]
+_Assignment: TypeAlias = Annotated[dict[str, _Level], Expected("a mapping step: variant")]
+# One value, or a list of at least one.
+_Files: TypeAlias = Annotated[
+    tuple[_Text, ...],
+    Field(min_length=1),
+    BeforeValidator(
+        _listed, json_schema_input_type=_Text | Annotated[tuple[_Text, ...], Field(min_length=1)]
+    ),
+    Expected("a text, or a list of them", "text"),
+]
+_Sources: TypeAlias = Annotated[
+    tuple[_Source, ...],
+    Field(min_length=1),
+    BeforeValidator(
+        _listed,
+        json_schema_input_type=_Source | Annotated[tuple[_Source, ...], Field(min_length=1)],
+    ),
+    Expected("step.port or inputs.name, or a list of them", "reference"),
+]
+_Metrics: TypeAlias = Annotated[
+    tuple[_Metric, ...],
+    Field(min_length=1),
+    BeforeValidator(
+        _listed,
+        json_schema_input_type=_Metric | Annotated[tuple[_Metric, ...], Field(min_length=1)],
+    ),
+    Expected("step.metric, * allowed, or a list of them", "text"),
+]
+
+
+# The file -----------------------------------------------------------------------------------------
+
+
+class FileSection(BaseModel):
+    """A mapping of the file whose keys the format fixes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+class InputSection(FileSection):
+    """A folder stands for the files in it and in its subfolders, a pattern for the files it matches
+    (`**` for folders at any depth). A file that is named, and is not optional, has to be there.
+    """  # noqa: D205 - the text of the reference
+
+    files: _Files = Field(
+        (),
+        description="A file, a folder, a pattern, or a list of them; relative paths start at the "
+        "workflow. Without it, `--input NAME=PATH` gives some.",
+        examples=["data/photos/*.jpg"],
+    )
+    optional: _Flag = Field(
+        default=False,
+        description="The workflow can do without it: steps that need it are skipped when it is "
+        "absent.",
+        examples=[True],
+    )
+
+
+class ResourcesSection(FileSection):
+    """What a method may take of the machine."""
+
+    cores: _Positive | None = Field(
+        None,
+        description="How many cores the method may use; without it all, shared by the steps that "
+        "run at the same time.",
+        examples=[2],
+    )
+
+
+class SweepSection(FileSection):
+    """In the place of a value a parameter may be given several: `tolerance_m: {sweep: [0.02,
+    0.05]}` makes the variants `tolerance_m-0_02` and `tolerance_m-0_05` of the step, or of its
+    variant, whose name then stands in front, and by which `baseline` and `exclude` still know it.
+    A name states exact values, or an index (`sweep-1`) that `orthoflow plan` explains. Several
+    swept parameters make all combinations. A workflow with a sweep is a comparison, with `compare`
+    or without, and its report draws the metrics over the parameter. `--set STEP.PARAM=VALUE` takes
+    the place of a sweep, and `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    """  # noqa: D205
+
+    sweep: Annotated[
+        list[Any],
+        Field(min_length=2, max_length=MOST_SWEPT),
+        Expected(f"2 to {MOST_SWEPT} values in a list"),
+    ] = Field(
+        description="Values of the parameter, each of which makes a variant.",
+        examples=[[0.02, 0.05, 0.1]],
+    )
+
+
+class CallSection(FileSection):
+    """How one method is called. All variants of a step share its wiring (`in`, `if`, `unless`)."""
+
+    use: _Text | None = Field(
+        None,
+        description="The method, as `kind.method`; `orthoflow plugins list` names all. Needed, "
+        "unless the step has variants.",
+        examples=["plane.hough2d"],
+    )
+    params: Annotated[dict[str, Any], Expected("a mapping")] = Field(
+        {},
+        description="Parameters of the method, each a value or a sweep; `orthoflow plugins show "
+        "ID` lists them.",
+        examples=[{"gsd_m": 0.003, "tolerance_m": {"sweep": [0.02, 0.05, 0.1]}}],
+    )
+    repeat: _Repeats = Field(
+        1,
+        description="How many runs with seeds of their own; of a method without randomness, to "
+        "time it. Repeats reach every later step that the comparison names in `metrics` (without "
+        "`metrics`: every inspection), and the steps between; all else uses the first.",
+        examples=[10],
+    )
+    resources: Annotated[ResourcesSection, Expected("a mapping")] = Field(
+        ResourcesSection(),
+        description="What the method may take of the machine.",
+        examples=[{"cores": 2}],
+    )
+    timeout: _Seconds | None = Field(
+        None,
+        description="The step is ended, and has failed, when it takes longer. Without it there is "
+        "no limit.",
+        examples=["30min"],
+    )
+
+
+class StepSection(CallSection):
+    """A step calls one method, or has variants that each call one; then what belongs to a call
+    stands in the variants. A step that lacks a required product, because optional data are
+    absent, is skipped with all that needs it. Steps may stand in any order.
+    """  # noqa: D205
+
+    in_: Annotated[
+        dict[str, _Sources],
+        Expected("a mapping from ports to step.port or inputs.name, or to lists of these"),
+    ] = Field(
+        {},
+        alias="in",
+        description="Where each port's product comes from; of a list, the first that is present.",
+        examples=[{"cloud": "cloud.cloud", "planes": ["given.planes", "plane.planes"]}],
+    )
+    if_: _InputSource | None = Field(
+        None,
+        alias="if",
+        description="The step is skipped unless this input is given, also where its ports do "
+        "without.",
+        examples=["inputs.other"],
+    )
+    unless: _InputSource | None = Field(
+        None,
+        description="The step is skipped when this input is given.",
+        examples=["inputs.scan"],
+    )
+    variants: Annotated[
+        dict[_Name, Annotated[CallSection, Expected("a mapping")]] | None,
+        Expected("a mapping from names to method calls"),
+    ] = Field(
+        None,
+        description="Alternatives of one kind, each with its own parameters, in the place of "
+        "`use`.",
+        examples=[{"fine": {"use": "plane.hough2d"}, "quick": {"use": "plane.ransac"}}],
+    )
+
+
+class DatasetSection(BaseModel):
+    """What hangs on the data runs once per dataset, with `data=<name>` first in its address; all
+    else runs once. An input that a dataset does not name is that of the workflow. Instead of the
+    mapping there may be a CSV file with a line per dataset: the column `name`, a column per input,
+    and columns such as `room.noise_m` for parameters; an empty place says nothing, and relative
+    paths start at the CSV file. `--datasets FILE` takes the place of the section, `--only-data A,B`
+    chooses among the names.
+    """  # noqa: D205
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    __pydantic_extra__: dict[str, _Files]
+
+    set: Annotated[dict[str, Any], Expected("a mapping step.parameter: value")] = Field(
+        {},
+        description="Parameters for this dataset alone, named as behind `--set`, which goes before "
+        "them; and `seed`, a number or a sweep of them.",
+        examples=[{"room.noise_m": 0.004, "plane.ransac.tolerance_m": 0.03, "seed": 7}],
+    )
+
+
+class DatasetsSection(FileSection):
+    """The datasets of a file, of a table, or given from Python."""
+
+    datasets: Annotated[
+        dict[_Name, Annotated[DatasetSection, Expected("a mapping such as {scan: FILE}")]],
+        Expected("a mapping from names to datasets"),
+    ]
+
+
+class CompareSection(FileSection):
+    """Variants fan out: every step behind them runs once per combination that really differs.
+    Tables list each of these runs as a step of its own, by its address: the step, the dataset,
+    seed and variants that make it and the repeat, `ortho@plane=ransac,orient=pnp#2`; columns and
+    keys of files call the address `cell`. Without a comparison only the baseline runs, the first
+    variant of each step.
+    """  # noqa: D205
+
+    design: Annotated[
+        Design,
+        Expected("`product` or `one-at-a-time`", choices=typing.get_args(Design)),
+    ] = Field(
+        "product",
+        description="All combinations of variants, or the baseline and every single deviation "
+        "from it.",
+        examples=["one-at-a-time"],
+    )
+    baseline: _Assignment = Field(
+        {},
+        description="The variant of each step that others are compared with, and that a report "
+        "shows; without it the first of each step.",
+        examples=[{"plane": "hough2d", "orient": "bundle"}],
+    )
+    exclude: Annotated[
+        list[Annotated[_Assignment, Field(min_length=1), Expected("step: variant")]],
+        Field(max_length=MOST_EXCLUDED),
+        Expected("a list of mappings step: variant"),
+    ] = Field(
+        [],
+        description="Combinations that are left out, wherever they occur.",
+        examples=[[{"plane": "ransac", "orient": "pnp"}]],
+    )
+    metrics: _Metrics = Field(
+        (),
+        description="What the report's tables show, as `step.metric`; `*` stands for anything. "
+        "Without it, the metrics that judge quality.",
+        examples=[["plane.rms_mm", "*.wall_s"]],
+    )
+
+
+class SeedSweep(FileSection):
+    """Several seeds: what is random runs once for each, with `seed=<n>` in its address."""
+
+    sweep: Annotated[
+        list[_Seed],
+        Field(min_length=2, max_length=MOST_SWEPT),
+        Expected(f"2 to {MOST_SWEPT} values in a list"),
+    ]
+
+
+class WorkflowFile(FileSection):
+    """A workflow file is YAML 1.2 and data only: no templates, no expressions, no environment
+    variables, no tags. Every key and every name occurs once.
+    """  # noqa: D205
+
+    orthoflow: Annotated[
+        _Positive,
+        AfterValidator(_format_version),
+        WithJsonSchema({"const": FORMAT}),
+    ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
+    name: Annotated[_Name, Expected("a name")] | None = Field(
+        None,
+        description="Name of the workflow; the folder of a run begins with it. Without it, the "
+        "file's name.",
+        examples=["palace-room"],
+    )
+    seed: Annotated[_Seed | SeedSweep, Expected("a whole number from 0 on, or a sweep")] = Field(
+        0,
+        description="Root of all seeds: one follows from it, the method and the repeat. A sweep "
+        "makes a factor of it.",
+        examples=[1729],
+    )
+    inputs: Annotated[
+        dict[_Name, Annotated[InputSection, Expected("a mapping")]],
+        Expected("a mapping"),
+    ] = Field(
+        {},
+        description="Files from outside; steps name them `inputs.<name>`.",
+        examples=[{"scan": {"files": "data/room.e57"}, "photos": {"optional": True}}],
+    )
+    datasets: Annotated[
+        dict[_Name, Annotated[DatasetSection, Expected("a mapping such as {scan: FILE}")]] | str,
+        Expected("a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"),
+    ] = Field(
+        {},
+        description="What the workflow runs on, one after the other; the runs are one comparison. "
+        "A mapping, or a CSV file.",
+        examples=[{"hall": {"scan": "data/hall.e57"}, "stairs": {"scan": "data/stairs.e57"}}],
+    )
+    steps: Annotated[
+        dict[_Name, Annotated[StepSection, Expected("a mapping")]],
+        Expected("a mapping"),
+    ] = Field(
+        {},
+        description="What is done, each step by the method of a plugin.",
+        examples=[{"cloud": {"use": "read.scan", "in": {"files": "inputs.scan"}}}],
+    )
+    compare: Annotated[CompareSection, Expected("a mapping")] | None = Field(
+        None,
+        description="Which combinations of variants run, and what of them is compared.",
+        examples=[{"design": "product", "baseline": {"plane": "hough2d"}}],
+    )
+
+
+def annotation_at(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[object, Expected]:
+    """Return the type of what stands at a location of a model, and what is expected there."""
+    here: object = model
+    expected = Expected("a mapping")
+    for part in loc:
+        metadata: Sequence[object] = ()
+        if isinstance(here, type) and issubclass(here, BaseModel):
+            fields = {info.alias or name: info for name, info in here.model_fields.items()}
+            if part in fields:
+                here, metadata = fields[str(part)].annotation, fields[str(part)].metadata
+            else:
+                here = _Files
+        else:
+            arguments = typing.get_args(here) or (None,)
+            here = arguments[1] if typing.get_origin(here) is dict else arguments[0]
+        here, inner = _unwrapped(here)
+        found = [item for item in (*inner, *metadata) if isinstance(item, Expected)]
+        expected = found[-1] if found else Expected("a value")
+    return here, expected
+
+
+def _unwrapped(annotation: object) -> tuple[object, tuple[object, ...]]:
+    """Return a type without `Annotated` and `| None`, and what it was annotated with."""
+    metadata: tuple[object, ...] = ()
+    while True:
+        arguments = typing.get_args(annotation)
+        if typing.get_origin(annotation) is Annotated:
+            annotation, metadata = arguments[0], (*arguments[1:], *metadata)
+        elif type(None) in arguments:
+            annotation = next(item for item in arguments if item is not type(None))
+        else:
+            return annotation, metadata
+
+
+# The checked workflow -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkflowInputSpec:
+    """An input as the file or the command line names it; nothing is looked up yet.
+
+    Attributes:
+        name: name of the input.
+        files: files, folders and glob patterns; empty when none were given.
+        optional: steps that need it are skipped when it is absent.
+        folder: what relative paths start from: the workflow's folder, or the working directory
+            for paths from the command line.
+        is_given: named with `--input`, so it must exist even when optional.
+        table: the table of datasets and the line in it that name the files, `rooms.csv:3`; empty
+            for the workflow itself.
+        place: where they are named; None for what comes from no file.
+    """
+
+    name: str
+    files: tuple[str, ...] = ()
+    optional: bool = False
+    folder: Path = Path()
+    is_given: bool = False
+    table: str = ""
+    place: Problem | None = field(default=None, compare=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepVariant:
+    """One of a step's alternatives; a step without variants has exactly one, named ``.
+
+    Attributes:
+        name: name of the variant, empty for a step without variants.
+        method: method id.
+        params: resolved parameters, defaults included, JSON.
+        params_set: parameters as written in the file or set on the command line, JSON.
+        repeat: how many runs, with seeds of their own where the method is random.
+        cores: cores asked for, None for all.
+        timeout_s: seconds, None for no limit.
+        swept: parameters that are swept -> the values of this variant; a part of `params_set`.
+    """
+
+    name: str
+    method: str
+    params: Mapping[str, JsonValue] = field(default_factory=dict)
+    params_set: Mapping[str, JsonValue] = field(default_factory=dict)
+    repeat: int = 1
+    cores: int | None = None
+    timeout_s: float | None = None
+    swept: Mapping[str, JsonValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkflowStep:
+    """A step.
+
+    Attributes:
+        name: name of the step.
+        variants: alternatives in the order of the file.
+        inputs: port -> references; the first that is present wins.
+        only_if: the step is skipped when this input is absent; empty for always.
+        unless: the step is skipped when this input is present; empty for always.
+        is_varied: the file lists variants, even if only one.
+    """
+
+    name: str
+    variants: tuple[StepVariant, ...]
+    inputs: Mapping[str, tuple[Reference, ...]] = field(default_factory=dict)
+    only_if: str = ""
+    unless: str = ""
+    is_varied: bool = False
+
+    def variant(self, name: str) -> StepVariant:
+        """Return the variant of that name."""
+        return next(variant for variant in self.variants if variant.name == name)
+
+    @property
+    def conditions(self) -> frozenset[str]:
+        """Inputs whose presence alone decides whether the step runs."""
+        return frozenset((self.only_if, self.unless)) - {""}
+
+    @property
+    def references(self) -> tuple[Reference, ...]:
+        """Where the ports may take their products from."""
+        return tuple(item for references in self.inputs.values() for item in references)
+
+    def upstream(self) -> tuple[str, ...]:
+        """Names of the steps that the ports may take products from, each once."""
+        return tuple(dict.fromkeys(one.source for one in self.references if not one.is_input))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """One of the datasets that a workflow runs on.
+
+    Attributes:
+        name: name of the dataset.
+        inputs: input -> its files; that of the input `scan` has the name `scan@<dataset>`.
+        sets: parameters as written, `step.parameter` -> JSON.
+        seeds: roots of all seeds on this dataset; empty for those of the workflow.
+        calls: (step, variant) -> the method call with these parameters, where they change it; not
+            kept in records, whose cells state it.
+    """
+
+    name: str
+    inputs: Mapping[str, WorkflowInputSpec] = field(default_factory=dict)
+    sets: Mapping[str, JsonValue] = field(default_factory=dict)
+    seeds: tuple[int, ...] = ()
+    calls: Mapping[tuple[str, str], StepVariant] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What to compare.
+
+    Attributes:
+        design: all combinations of variants, or the baseline and every single deviation from it.
+        baseline: step -> variant, for every varied step.
+        exclude: combinations to leave out; a cell whose assignment contains one is dropped.
+        metrics: `step.metric` patterns for the report, `*` allowed.
+    """
+
+    design: Design = "product"
+    baseline: Mapping[str, str] = field(default_factory=dict)
+    exclude: tuple[Mapping[str, str], ...] = ()
+    metrics: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workflow:
+    """A workflow that was checked against the catalog.
+
+    Attributes:
+        name: name of the workflow.
+        path: the file it was read from.
+        source: text of the file as written.
+        seed: root of all seeds; of a sweep, the first.
+        seeds: roots of all seeds where they are swept; empty otherwise.
+        inputs: by name.
+        steps: by name, in the order of the file.
+        compare: what to compare; None when only the baseline runs.
+        overrides: `--set ...` and `--input ...` that changed the document, in order; of files
+            only the names are kept.
+        datasets: by name; empty when the workflow runs once, on its inputs.
+        only_data: names of the datasets to run on; empty for all.
+    """
+
+    name: str
+    path: Path
+    source: str
+    seed: int
+    inputs: Mapping[str, WorkflowInputSpec]
+    steps: Mapping[str, WorkflowStep]
+    compare: Comparison | None = None
+    overrides: tuple[str, ...] = ()
+    datasets: Mapping[str, Dataset] = field(default_factory=dict)
+    only_data: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+
+    @property
+    def chosen_data(self) -> tuple[Dataset, ...]:
+        """The datasets to run on, in the order of the file."""
+        chosen = self.only_data or tuple(self.datasets)
+        return tuple(item for item in self.datasets.values() if item.name in chosen)
+
+    @cached_property
+    def data_inputs(self) -> frozenset[str]:
+        """Inputs that datasets name; of all datasets, so that a choice moves no address."""
+        return frozenset(name for item in self.datasets.values() for name in item.inputs)
+
+    @cached_property
+    def data_calls(self) -> frozenset[tuple[str, str]]:
+        """(step, variant) of the method calls whose parameters datasets change."""
+        return frozenset(call for item in self.datasets.values() for call in item.calls)
+
+    @cached_property
+    def has_data_seeds(self) -> bool:
+        """Whether datasets have seeds of their own."""
+        return any(item.seeds for item in self.datasets.values())
+
+    @cached_property
+    def has_seeds(self) -> bool:
+        """Whether the seed is a factor, so that addresses of what is random name it."""
+        return bool(self.seeds) or self.has_data_seeds
+
+    def seeds_of(self, dataset: Dataset | None) -> tuple[int, ...]:
+        """Return the roots of the seeds on a dataset."""
+        return (dataset.seeds if dataset else ()) or self.seeds or (self.seed,)
+
+    @cached_property
+    def input_specs(self) -> Mapping[str, WorkflowInputSpec]:
+        """Every input that cells may take, by its own name: `scan`, `scan@hall`."""
+        chosen = self.chosen_data
+        shared = {
+            name: spec
+            for name, spec in self.inputs.items()
+            if not chosen or any(name not in item.inputs for item in chosen)
+        }
+        return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
+
+    def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
+        """Put other inputs, by their own names, in the place of those that are there."""
+        datasets = {
+            item.name: replace(
+                item, inputs={name: specs.get(one.name, one) for name, one in item.inputs.items()}
+            )
+            for item in self.datasets.values()
+        }
+        inputs = {name: specs.get(name, spec) for name, spec in self.inputs.items()}
+        return replace(self, inputs=inputs, datasets=datasets)
+
+    @property
+    def baseline(self) -> dict[str, str]:
+        """Variant of every varied step that runs when nothing is compared."""
+        chosen = self.compare.baseline if self.compare else {}
+        return {
+            step.name: chosen.get(step.name, step.variants[0].name)
+            for step in self.steps.values()
+            if step.is_varied
+        }
+
+
+# The resolved form, as records keep it ------------------------------------------------------------
+
+_PLACE: Final = "the resolved workflow"
+
+
+def _reference_in(text: object) -> Reference:
+    source, _, name = str(text).partition(".")
+    return Reference(source=source, name=name)
+
+
+class _ResolvedVariant(BaseModel, extra="forbid"):
+    name: str
+    method: str = Field(alias="use")
+    params: dict[str, Any]
+    params_set: dict[str, Any]
+    repeat: int = Field(ge=1, le=MOST_REPEATS)
+    cores: int | None = Field(ge=1)
+    timeout_s: float | None = Field(gt=0, allow_inf_nan=False)
+    swept: dict[str, Any] = {}
+
+
+class _ResolvedStep(BaseModel):
+    inputs: dict[str, list[str]] = Field(alias="in")
+    only_if: str = Field(alias="if", default="")
+    unless: str
+    is_varied: bool
+    variants: list[_ResolvedVariant]
+
+
+class _ResolvedInput(BaseModel):
+    files: tuple[str, ...]
+    optional: bool
+
+    def spec(self, name: str) -> WorkflowInputSpec:
+        return WorkflowInputSpec(name=name, files=self.files, optional=self.optional)
+
+
+class _ResolvedDataset(BaseModel):
+    inputs: dict[str, _ResolvedInput]
+    sets: dict[str, Any] = Field(alias="set")
+    seeds: tuple[int, ...] = ()
+
+
+_ResolvedName: TypeAlias = Annotated[str, AfterValidator(_check_name)]
+
+
+class _Resolved(BaseModel):
+    """The form of a resolved workflow: whoever wrote the record may have written anything."""
+
+    orthoflow: Literal[1]
+    name: _ResolvedName
+    seed: int
+    seeds: tuple[int, ...] = ()
+    inputs: dict[_ResolvedName, _ResolvedInput]
+    steps: dict[_ResolvedName, _ResolvedStep]
+    compare: Comparison | None
+    overrides: tuple[str, ...]
+    datasets: dict[_ResolvedName, _ResolvedDataset] = {}
+
+
+def resolved_json(workflow: Workflow) -> str:
+    """Return the workflow with all defaults and overrides as canonical JSON.
+
+    Paths that came from the command line are reduced to their last part: records hold no paths of
+    the machine they were made on.
+    """
+    document: dict[str, object] = {
+        "orthoflow": FORMAT,
+        "name": workflow.name,
+        "seed": workflow.seed,
+        "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
+        "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
+        "compare": asdict(workflow.compare) if workflow.compare else None,
+        "overrides": list(workflow.overrides),
+    }
+    if workflow.seeds:
+        document["seeds"] = list(workflow.seeds)
+    if workflow.datasets:
+        document["datasets"] = {
+            item.name: {
+                "inputs": {name: _input_json(spec) for name, spec in item.inputs.items()},
+                "set": dict(item.sets),
+                **({"seeds": list(item.seeds)} if item.seeds else {}),
+            }
+            for item in workflow.chosen_data
+        }
+    return json.dumps(
+        document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+
+
+def _input_json(spec: WorkflowInputSpec) -> JsonValue:
+    def recorded(name: str) -> str:
+        # A table, unlike the workflow, is not in the record with its folders.
+        is_private = spec.is_given or (spec.table and Path(name).is_absolute())
+        return Path(name).name if is_private else name
+
+    return {"files": [recorded(name) for name in spec.files], "optional": spec.optional}
+
+
+def _step_json(step: WorkflowStep) -> dict[str, object]:
+    variants = []
+    for variant in step.variants:
+        said = asdict(variant)
+        if not said["swept"]:
+            del said["swept"]
+        variants.append({"use": said.pop("method"), **said})
+    return {
+        "in": {port: [str(item) for item in items] for port, items in step.inputs.items()},
+        "unless": step.unless,
+        **({"if": step.only_if} if step.only_if else {}),
+        "is_varied": step.is_varied,
+        "variants": variants,
+    }
+
+
+def workflow_from_resolved(resolved: str, source: str) -> Workflow:
+    """Build a workflow that was checked and resolved before; no plugin is asked.
+
+    Args:
+        resolved: what `resolved_json` returned.
+        source: text of the workflow file as written.
+
+    Raises:
+        WorkflowError: the text is no resolved workflow, or one of a newer format.
+    """
+    try:
+        workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)
+        _check_resolved(workflow)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise WorkflowError(f"{_PLACE} cannot be read: {place}: {first['msg']}") from error
+    except (ValueError, KeyError, RecursionError) as error:
+        raise WorkflowError(f"{_PLACE} cannot be read: {type(error).__name__} {error}") from error
+    return workflow
+
+
+def _from_resolved(document: _Resolved, source: str) -> Workflow:
+    return Workflow(
+        name=document.name,
+        path=Path(f"{document.name}.yaml"),
+        source=source,
+        seed=document.seed,
+        seeds=document.seeds,
+        inputs={name: given.spec(name) for name, given in document.inputs.items()},
+        steps={
+            name: WorkflowStep(
+                name=name,
+                variants=tuple(StepVariant(**dict(variant)) for variant in given.variants),
+                inputs={port: tuple(map(_reference_in, t)) for port, t in given.inputs.items()},
+                only_if=given.only_if,
+                unless=given.unless,
+                is_varied=given.is_varied,
+            )
+            for name, given in document.steps.items()
+        },
+        compare=document.compare,
+        overrides=document.overrides,
+        datasets={
+            data: Dataset(
+                name=data,
+                inputs={name: item.spec(f"{name}@{data}") for name, item in given.inputs.items()},
+                sets=given.sets,
+                seeds=given.seeds,
+            )
+            for data, given in document.datasets.items()
+        },
+    )
+
+
+def _check_resolved(workflow: Workflow) -> None:
+    """Check what the checks of a file have checked, since a record may have been changed.
+
+    Raises:
+        ValueError: a value is out of range, or names what is not there.
+    """
+    factors = factors_of(workflow)
+    for dataset in workflow.datasets.values():
+        if unknown := dataset.inputs.keys() - workflow.inputs.keys():
+            raise ValueError(f"dataset {dataset.name} names an unknown input {min(unknown)!r}")
+    if taken := factors & workflow.steps.keys():
+        raise ValueError(f"a step is called {min(taken)}, which is a factor of addresses")
+    for step in workflow.steps.values():
+        _check_resolved_step(workflow, step)
+    if not is_acyclic({name: step.upstream() for name, step in workflow.steps.items()}):
+        raise ValueError("its steps need each other in a circle")
+    compare = workflow.compare or Comparison()
+    named = [pair for one in (compare.baseline, *compare.exclude) for pair in one.items()]
+    for name, variant in named:
+        if name not in factors and variant not in [
+            one.name for one in workflow.steps[name].variants
+        ]:
+            raise ValueError(f"step {name} has no variant of the comparison")
+
+
+def _check_resolved_step(workflow: Workflow, step: WorkflowStep) -> None:
+    if not step.variants or not (step.is_varied or len(step.variants) == 1):
+        raise ValueError(f"step {step.name} has {len(step.variants)} variants")
+    if not step.is_varied and step.variants[0].name:
+        raise ValueError(f"step {step.name} has a variant, and is said to have none")
+    for variant in step.variants if step.is_varied else ():
+        _check_name(variant.name)
+    if len({variant.name for variant in step.variants}) != len(step.variants):
+        raise ValueError(f"step {step.name} has two variants of one name")
+    if not step.conditions <= workflow.inputs.keys():
+        raise ValueError(f"step {step.name} depends on an unknown input")
+    for reference in step.references:
+        known = workflow.inputs if reference.is_input else workflow.steps
+        if (reference.name if reference.is_input else reference.source) not in known:
+            raise ValueError(f"step {step.name} takes {reference}, which is not there")
+
+
+def factors_of(workflow: Workflow) -> frozenset[str]:
+    """Return the factors of addresses that are no steps: `data`, `seed`."""
+    data = {DATA} if workflow.datasets else set()
+    return frozenset(data | ({SEED} if workflow.has_seeds else set()))
+
+
+def is_acyclic(sources: Mapping[str, Sequence[str]]) -> bool:
+    """Whether no step needs itself, directly or through others."""
+    try:
+        TopologicalSorter(sources).prepare()
+    except CycleError:
+        return False
+    return True
