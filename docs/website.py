@@ -39,7 +39,9 @@ from orthoflow.report.metric_words import metric_words, spelt_out
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.sdk import Method, port_specs
 from orthoflow.sdk.units import unit_of
-from orthoflow.workflow.parameters import describe_method
+from orthoflow.workflow.parameters import (
+    describe_method,
+)
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 DOCS: Final = ROOT / "docs"

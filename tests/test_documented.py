@@ -30,7 +30,9 @@ from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.calibration import lens_for, read_calibration
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.source import shipped_workflow
+from orthoflow.workflow.source import (
+    shipped_workflow,
+)
 from tests.documented import (
     ROOT,
     TEXTS,

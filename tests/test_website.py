@@ -11,7 +11,9 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.workflow.parameters import describe_method
+from orthoflow.workflow.parameters import (
+    describe_method,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 

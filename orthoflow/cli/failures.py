@@ -15,7 +15,9 @@ from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import OrthoflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.model import Workflow
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
 
 EXIT_GOOD: Final = 0
 EXIT_CELL_FAILED: Final = 1

@@ -13,7 +13,9 @@ import click
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
     from orthoflow.products.product import JsonValue
-    from orthoflow.workflow.model import Workflow
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
 
 # Any: click decorates functions as well as commands.
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)

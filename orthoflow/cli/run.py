@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
     from orthoflow.records.writing import WrittenRun
-    from orthoflow.workflow.model import Workflow
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
 
 
 @click.command(cls=Command)

@@ -31,7 +31,9 @@ from orthoflow.cli.tables import (
     say_verify,
     size,
 )
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell

@@ -163,7 +163,9 @@ def _results(catalog: Catalog, wanted: Collection[_Call] | None) -> dict[str, Ce
 
 
 def _recipes() -> dict[Path, tuple[str, ...]]:
-    from orthoflow.workflow.source import shipped_workflow
+    from orthoflow.workflow.source import (
+        shipped_workflow,
+    )
 
     return {shipped_workflow(name): sets for name, sets in _RECIPES.items()}
 

@@ -30,7 +30,9 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.system import usable_cores
 from orthoflow.workflow.expand import Cell, CellOutput, Selection, check_step_names, select_cells
 from orthoflow.workflow.inputs import resolve_input_files
-from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.model import (
+    Workflow,
+)
 
 ExecutorName = Literal["local", "inline", "dask"]
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]

@@ -23,7 +23,9 @@ from orthoflow.products.product import JsonValue
 from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
 from orthoflow.records.metrics import cell_metrics, is_rounding
 from orthoflow.records.runs import Run
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,7 +23,9 @@ from orthoflow.records.input_files import embedded_inputs
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files
 from orthoflow.records.runs import PAGES_FOLDER, Run
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 _DATASETS = "datasets"
 

@@ -30,8 +30,13 @@ from orthoflow.workflow.inputs import (
     resolve_input_files,
     written_files,
 )
-from orthoflow.workflow.model import Workflow, WorkflowInputSpec
-from orthoflow.workflow.source import ProblemLog
+from orthoflow.workflow.model import (
+    Workflow,
+    WorkflowInputSpec,
+)
+from orthoflow.workflow.problems import (
+    ProblemLog,
+)
 
 # Of a folder that files may lie in; what lies in a larger one is found by its name alone.
 _MOST_LISTED: Final = 10_000

@@ -22,7 +22,13 @@ from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.model import StepVariant, Workflow, workflow_from_resolved
+from orthoflow.workflow.model import (
+    StepVariant,
+    Workflow,
+)
+from orthoflow.workflow.resolved import (
+    workflow_from_resolved,
+)
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 

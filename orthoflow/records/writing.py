@@ -39,7 +39,10 @@ from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.model import resolved_json, workflow_from_resolved
+from orthoflow.workflow.resolved import (
+    resolved_json,
+    workflow_from_resolved,
+)
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
@@ -47,7 +50,9 @@ if TYPE_CHECKING:
     from orthoflow.engine.scheduling import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.workflow.expand import Cell
-    from orthoflow.workflow.model import Workflow
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4

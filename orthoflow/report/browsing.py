@@ -26,7 +26,9 @@ from orthoflow.report.metric_words import words_of
 from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 

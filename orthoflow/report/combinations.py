@@ -21,7 +21,9 @@ from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report.rankings import Sense, count_of_photos, sense_of
 from orthoflow.workflow.expand import variants_text
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 # Walls that differ by more are two.
 _TURNED_DEG: Final = 10.0

@@ -25,7 +25,9 @@ from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, cost_share, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
 from orthoflow.workflow.expand import NOT_ASKED_FOR, variants_text
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 _NOTHING: Final = "-"
 # Distances to a plane are of the points that its tolerances let in.

@@ -29,7 +29,9 @@ from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.rankings import Sense, cost_share, is_yes_or_no
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120

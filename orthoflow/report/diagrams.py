@@ -12,7 +12,9 @@ from orthoflow.foreign_text import shown
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run
 from orthoflow.report.numbers import seconds_in_words
-from orthoflow.workflow.model import DATA
+from orthoflow.workflow.model import (
+    DATA,
+)
 
 _BOX_WIDTH: Final = 220
 _BOX_HEIGHT: Final = 46

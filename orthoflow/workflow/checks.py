@@ -24,8 +24,13 @@ from orthoflow.workflow.model import (
     Workflow,
     is_acyclic,
 )
-from orthoflow.workflow.parameters import DraftStep
-from orthoflow.workflow.source import Location, ProblemLog
+from orthoflow.workflow.parameters import (
+    DraftStep,
+)
+from orthoflow.workflow.problems import (
+    Location,
+    ProblemLog,
+)
 
 _WILDCARDS: Final = frozenset("*?[")
 
@@ -267,7 +272,7 @@ def _families(step: DraftStep) -> dict[str, list[str]]:
 
 
 def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
-    """Return the variant that a name stands for now.
+    """Return the variant that a name stands for once overrides are in.
 
     Of a call that the file sweeps and the command line gives one value, the names of swept values
     stand for the call: empty for a step without other variants.

@@ -50,9 +50,11 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.source import (
+from orthoflow.workflow.problems import (
     Location,
     ProblemLog,
+)
+from orthoflow.workflow.source import (
     as_plain,
     find_workflow,
     read_text,

@@ -22,7 +22,9 @@ from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.sdk.lines import text_of_path
-from orthoflow.workflow.source import shipped_workflow
+from orthoflow.workflow.source import (
+    shipped_workflow,
+)
 
 FileKind: TypeAlias = Literal[
     "scan", "photos", "calibration", "checkpoints", "ties", "cameras", "other", "unknown"

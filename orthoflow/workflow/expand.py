@@ -30,7 +30,10 @@ from orthoflow.workflow.model import (
     Workflow,
     WorkflowStep,
 )
-from orthoflow.workflow.parameters import MethodInfo, describe_method
+from orthoflow.workflow.parameters import (
+    MethodInfo,
+    describe_method,
+)
 
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]

@@ -51,7 +51,14 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.source import Location, ProblemLog, read_text, validate
+from orthoflow.workflow.problems import (
+    Location,
+    ProblemLog,
+)
+from orthoflow.workflow.source import (
+    read_text,
+    validate,
+)
 
 # Files and folders that are looked at for one input: `/**` would go on for hours.
 MOST_LOOKED_AT: Final = 100_000

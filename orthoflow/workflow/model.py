@@ -6,16 +6,15 @@ are made of them. What one key has to do with another is checked in `document` a
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import (
     AfterValidator,
@@ -24,17 +23,13 @@ from pydantic import (
     ConfigDict,
     Field,
     Strict,
-    ValidationError,
     WithJsonSchema,
 )
 from pydantic_core import PydanticCustomError
 
 from orthoflow.catalog.discovery import NAME_PATTERN
-from orthoflow.errors import WorkflowError
 from orthoflow.products.product import JsonValue
-
-if TYPE_CHECKING:
-    from orthoflow.workflow.source import Problem
+from orthoflow.workflow.problems import Problem
 
 FORMAT: Final = 1
 # Errors of the models whose message is shown as it is.
@@ -79,7 +74,12 @@ class Expected:
     choices: tuple[str, ...] = ()
 
 
-def _check_name(name: str) -> str:
+def check_name(name: str) -> str:
+    """Return a name that addresses and files can have.
+
+    Raises:
+        PydanticCustomError: it is none; a `ValueError`.
+    """
     if not re.fullmatch(NAME_PATTERN, name):
         raise PydanticCustomError(
             NOT_A_NAME, f"{{name}} cannot be a name: {NAME_RULE}", {"name": repr(name)}
@@ -158,7 +158,7 @@ def _format_version(version: int) -> int:
 
 
 _Name: TypeAlias = Annotated[
-    str, AfterValidator(_check_name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
+    str, AfterValidator(check_name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
 ]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1), Expected("a text")]
 _Flag: TypeAlias = Annotated[bool, Strict(), Expected("true or false")]
@@ -769,219 +769,6 @@ class Workflow:
             for step in self.steps.values()
             if step.is_varied
         }
-
-
-# The resolved form, as records keep it ------------------------------------------------------------
-
-_PLACE: Final = "the resolved workflow"
-
-
-def _reference_in(text: object) -> Reference:
-    source, _, name = str(text).partition(".")
-    return Reference(source=source, name=name)
-
-
-class _ResolvedVariant(BaseModel, extra="forbid"):
-    name: str
-    method: str = Field(alias="use")
-    params: dict[str, Any]
-    params_set: dict[str, Any]
-    repeat: int = Field(ge=1, le=MOST_REPEATS)
-    cores: int | None = Field(ge=1)
-    timeout_s: float | None = Field(gt=0, allow_inf_nan=False)
-    swept: dict[str, Any] = {}
-
-
-class _ResolvedStep(BaseModel):
-    inputs: dict[str, list[str]] = Field(alias="in")
-    only_if: str = Field(alias="if", default="")
-    unless: str
-    is_varied: bool
-    variants: list[_ResolvedVariant]
-
-
-class _ResolvedInput(BaseModel):
-    files: tuple[str, ...]
-    optional: bool
-
-    def spec(self, name: str) -> WorkflowInputSpec:
-        return WorkflowInputSpec(name=name, files=self.files, optional=self.optional)
-
-
-class _ResolvedDataset(BaseModel):
-    inputs: dict[str, _ResolvedInput]
-    sets: dict[str, Any] = Field(alias="set")
-    seeds: tuple[int, ...] = ()
-
-
-_ResolvedName: TypeAlias = Annotated[str, AfterValidator(_check_name)]
-
-
-class _Resolved(BaseModel):
-    """The form of a resolved workflow: whoever wrote the record may have written anything."""
-
-    orthoflow: Literal[1]
-    name: _ResolvedName
-    seed: int
-    seeds: tuple[int, ...] = ()
-    inputs: dict[_ResolvedName, _ResolvedInput]
-    steps: dict[_ResolvedName, _ResolvedStep]
-    compare: Comparison | None
-    overrides: tuple[str, ...]
-    datasets: dict[_ResolvedName, _ResolvedDataset] = {}
-
-
-def resolved_json(workflow: Workflow) -> str:
-    """Return the workflow with all defaults and overrides as canonical JSON.
-
-    Paths that came from the command line are reduced to their last part: records hold no paths of
-    the machine they were made on.
-    """
-    document: dict[str, object] = {
-        "orthoflow": FORMAT,
-        "name": workflow.name,
-        "seed": workflow.seed,
-        "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
-        "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
-        "compare": asdict(workflow.compare) if workflow.compare else None,
-        "overrides": list(workflow.overrides),
-    }
-    if workflow.seeds:
-        document["seeds"] = list(workflow.seeds)
-    if workflow.datasets:
-        document["datasets"] = {
-            item.name: {
-                "inputs": {name: _input_json(spec) for name, spec in item.inputs.items()},
-                "set": dict(item.sets),
-                **({"seeds": list(item.seeds)} if item.seeds else {}),
-            }
-            for item in workflow.chosen_data
-        }
-    return json.dumps(
-        document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-    )
-
-
-def _input_json(spec: WorkflowInputSpec) -> JsonValue:
-    def recorded(name: str) -> str:
-        # A table, unlike the workflow, is not in the record with its folders.
-        is_private = spec.is_given or (spec.table and Path(name).is_absolute())
-        return Path(name).name if is_private else name
-
-    return {"files": [recorded(name) for name in spec.files], "optional": spec.optional}
-
-
-def _step_json(step: WorkflowStep) -> dict[str, object]:
-    variants = []
-    for variant in step.variants:
-        said = asdict(variant)
-        if not said["swept"]:
-            del said["swept"]
-        variants.append({"use": said.pop("method"), **said})
-    return {
-        "in": {port: [str(item) for item in items] for port, items in step.inputs.items()},
-        "unless": step.unless,
-        **({"if": step.only_if} if step.only_if else {}),
-        "is_varied": step.is_varied,
-        "variants": variants,
-    }
-
-
-def workflow_from_resolved(resolved: str, source: str) -> Workflow:
-    """Build a workflow that was checked and resolved before; no plugin is asked.
-
-    Args:
-        resolved: what `resolved_json` returned.
-        source: text of the workflow file as written.
-
-    Raises:
-        WorkflowError: the text is no resolved workflow, or one of a newer format.
-    """
-    try:
-        workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)
-        _check_resolved(workflow)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise WorkflowError(f"{_PLACE} cannot be read: {place}: {first['msg']}") from error
-    except (ValueError, KeyError, RecursionError) as error:
-        raise WorkflowError(f"{_PLACE} cannot be read: {type(error).__name__} {error}") from error
-    return workflow
-
-
-def _from_resolved(document: _Resolved, source: str) -> Workflow:
-    return Workflow(
-        name=document.name,
-        path=Path(f"{document.name}.yaml"),
-        source=source,
-        seed=document.seed,
-        seeds=document.seeds,
-        inputs={name: given.spec(name) for name, given in document.inputs.items()},
-        steps={
-            name: WorkflowStep(
-                name=name,
-                variants=tuple(StepVariant(**dict(variant)) for variant in given.variants),
-                inputs={port: tuple(map(_reference_in, t)) for port, t in given.inputs.items()},
-                only_if=given.only_if,
-                unless=given.unless,
-                is_varied=given.is_varied,
-            )
-            for name, given in document.steps.items()
-        },
-        compare=document.compare,
-        overrides=document.overrides,
-        datasets={
-            data: Dataset(
-                name=data,
-                inputs={name: item.spec(f"{name}@{data}") for name, item in given.inputs.items()},
-                sets=given.sets,
-                seeds=given.seeds,
-            )
-            for data, given in document.datasets.items()
-        },
-    )
-
-
-def _check_resolved(workflow: Workflow) -> None:
-    """Check what the checks of a file have checked, since a record may have been changed.
-
-    Raises:
-        ValueError: a value is out of range, or names what is not there.
-    """
-    factors = factors_of(workflow)
-    for dataset in workflow.datasets.values():
-        if unknown := dataset.inputs.keys() - workflow.inputs.keys():
-            raise ValueError(f"dataset {dataset.name} names an unknown input {min(unknown)!r}")
-    if taken := factors & workflow.steps.keys():
-        raise ValueError(f"a step is called {min(taken)}, which is a factor of addresses")
-    for step in workflow.steps.values():
-        _check_resolved_step(workflow, step)
-    if not is_acyclic({name: step.upstream() for name, step in workflow.steps.items()}):
-        raise ValueError("its steps need each other in a circle")
-    compare = workflow.compare or Comparison()
-    named = [pair for one in (compare.baseline, *compare.exclude) for pair in one.items()]
-    for name, variant in named:
-        if name not in factors and variant not in [
-            one.name for one in workflow.steps[name].variants
-        ]:
-            raise ValueError(f"step {name} has no variant of the comparison")
-
-
-def _check_resolved_step(workflow: Workflow, step: WorkflowStep) -> None:
-    if not step.variants or not (step.is_varied or len(step.variants) == 1):
-        raise ValueError(f"step {step.name} has {len(step.variants)} variants")
-    if not step.is_varied and step.variants[0].name:
-        raise ValueError(f"step {step.name} has a variant, and is said to have none")
-    for variant in step.variants if step.is_varied else ():
-        _check_name(variant.name)
-    if len({variant.name for variant in step.variants}) != len(step.variants):
-        raise ValueError(f"step {step.name} has two variants of one name")
-    if not step.conditions <= workflow.inputs.keys():
-        raise ValueError(f"step {step.name} depends on an unknown input")
-    for reference in step.references:
-        known = workflow.inputs if reference.is_input else workflow.steps
-        if (reference.name if reference.is_input else reference.source) not in known:
-            raise ValueError(f"step {step.name} takes {reference}, which is not there")
 
 
 def factors_of(workflow: Workflow) -> frozenset[str]:

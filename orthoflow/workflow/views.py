@@ -18,7 +18,10 @@ from orthoflow.workflow.model import (
     WorkflowFile,
     WorkflowStep,
 )
-from orthoflow.workflow.parameters import MethodInfo, describe_method
+from orthoflow.workflow.parameters import (
+    MethodInfo,
+    describe_method,
+)
 
 # Any: JSON.
 Schema: TypeAlias = dict[str, Any]

@@ -15,7 +15,7 @@ from orthoflow.records import replaying
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import write_run
-from orthoflow.workflow import cells
+from orthoflow.workflow import expand as cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from tests.engine_world import World

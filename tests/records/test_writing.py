@@ -28,7 +28,9 @@ from orthoflow.records.verification import verify_run
 from orthoflow.records.writing import executed_and_written, show_unfinished, write_run
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.model import (
+    Workflow,
+)
 from tests import photo_files
 from tests.engine_world import toy_world
 from tests.faulty_files import FaultyFiles

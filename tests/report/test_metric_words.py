@@ -20,7 +20,9 @@ from orthoflow.report.metric_words import (
 )
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
-from orthoflow.workflow.parameters import describe_method
+from orthoflow.workflow.parameters import (
+    describe_method,
+)
 from tests.report_runs import HeldRun, cell, metrics, record
 
 

@@ -14,8 +14,17 @@ from orthoflow.workflow.checks import doubts_about
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
 from orthoflow.workflow.inputs import read_rows, resolve_input_files
-from orthoflow.workflow.model import Workflow, resolved_json, workflow_from_resolved
-from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog
+from orthoflow.workflow.model import (
+    Workflow,
+)
+from orthoflow.workflow.problems import (
+    InvalidWorkflowError,
+    ProblemLog,
+)
+from orthoflow.workflow.resolved import (
+    resolved_json,
+    workflow_from_resolved,
+)
 
 ROOMS = """\
 orthoflow: 1

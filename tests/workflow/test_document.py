@@ -13,8 +13,10 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Scalar
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.model import seconds_in
-from orthoflow.workflow.source import (
+from orthoflow.workflow.model import (
+    seconds_in,
+)
+from orthoflow.workflow.problems import (
     InvalidArgumentsError,
     InvalidWorkflowError,
     Problem,

@@ -21,8 +21,12 @@ from orthoflow.workflow.inputs import (
     resolve_input_files,
     some_of,
 )
-from orthoflow.workflow.model import WorkflowInputSpec
-from orthoflow.workflow.source import ProblemLog
+from orthoflow.workflow.model import (
+    WorkflowInputSpec,
+)
+from orthoflow.workflow.problems import (
+    ProblemLog,
+)
 
 
 @pytest.fixture

@@ -8,7 +8,9 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.source import InvalidWorkflowError
+from orthoflow.workflow.problems import (
+    InvalidWorkflowError,
+)
 from tests.laboratories import (
     GOOD,
     problems,

@@ -19,9 +19,24 @@ from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from orthoflow.workflow.model import Workflow, resolved_json, workflow_from_resolved
-from orthoflow.workflow.parameters import meant_number, meant_parameter, variant_names
-from orthoflow.workflow.source import InvalidArgumentsError, InvalidWorkflowError
+from orthoflow.workflow.hints import (
+    meant_number,
+    meant_parameter,
+)
+from orthoflow.workflow.model import (
+    Workflow,
+)
+from orthoflow.workflow.parameters import (
+    variant_names,
+)
+from orthoflow.workflow.problems import (
+    InvalidArgumentsError,
+    InvalidWorkflowError,
+)
+from orthoflow.workflow.resolved import (
+    resolved_json,
+    workflow_from_resolved,
+)
 from orthoflow.workflow.views import workflow_schema
 from tests.laboratories import GOOD, load, with_steps
 
