@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
+
+# Correlation lengths that are tried, and ends of the classes of distances between points, as shares
+# of the extent of what a photo sees.
+_LENGTHS: Final = (0.03, 0.08, 0.2, 0.5, 1.0)
+_DISTANCES: Final = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
+# The products of all pairs of more points tell nothing new.
+_MAX_POINTS: Final = 180
+_MIN_POINTS: Final = 30
+# An error is taken as shared where that explains the products so many times better; of independent
+# errors it does for one photo in twenty (measured on 16 drawn photos of each kind: 1.0 to 1.4
+# for independent errors, 2.0 to 5.7 for those that reach 1 to 4 m of 8 m).
+_LEAST_GAIN: Final = 1.5
 
 
 def honest_covariance(
@@ -42,6 +59,164 @@ def honest_covariance(
     left_out = _inverses(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
     moves = (cofactors @ left_out)[:, :, 0]
     return widened(plain, (names.size - 1) / names.size * moves.T @ moves)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustedPoints:
+    """Points of one photo after its adjustment, whose places in the world may err together.
+
+    Attributes:
+        places: (n, 3) metres.
+        residuals: (n, 2) observed - computed, in standard deviations.
+        jacobian: (n, 2, p) derivatives by the unknowns, in standard deviations.
+        by_place: (n, 2, 3) derivatives by the place, standard deviations per metre.
+        cofactors: (p, p) of these unknowns in the inverse of the whole normal matrix.
+    """
+
+    places: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    by_place: NDArray[np.float64]
+    cofactors: NDArray[np.float64]
+
+    def thinned(self) -> AdjustedPoints:
+        """Return points spread evenly over all, as many as tell how they err together."""
+        n_points = len(self.places)
+        chosen = np.unique(np.linspace(0, n_points - 1, min(n_points, _MAX_POINTS)).astype(int))
+        return AdjustedPoints(
+            places=self.places[chosen],
+            residuals=self.residuals[chosen],
+            jacobian=self.jacobian[chosen],
+            by_place=self.by_place[chosen],
+            cofactors=self.cofactors,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonError:
+    """An error of places that neighbours share, with a correlation exp(-distance / length).
+
+    Attributes:
+        sigma_m: of each coordinate; 0 where points err independently.
+        length_m: correlation length.
+        sigma_alone: what is left to each observation alone, in its standard deviations.
+    """
+
+    sigma_m: float
+    length_m: float
+    sigma_alone: float
+
+    def correlation(
+        self, places: NDArray[np.float64], others: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the correlation (n, m) of the errors at two sets of places."""
+        return np.asarray(np.exp(-_distances(places, others) / self.length_m), dtype=np.float64)
+
+
+def common_error(photos: Sequence[AdjustedPoints]) -> CommonError:
+    """Estimate the error that neighbouring points share from the products of their residuals.
+
+    An adjustment takes up a part of such an error, the more the longer it reaches; expected
+    products are those of residuals after that. Means of products of pairs within classes of
+    distances are compared with what independent errors and shared ones of each length would
+    give (a variogram by moments; Cressie 1993, Statistics for spatial data, 2.6).
+    """
+    parts = [part.thinned() for part in photos if len(part.places) >= _MIN_POINTS]
+    if not parts:
+        return CommonError(sigma_m=0.0, length_m=math.inf, sigma_alone=1.0)
+    extents = [np.linalg.norm(part.places - part.places.mean(axis=0), axis=1) for part in parts]
+    extent_m = 2.0 * float(np.median([np.percentile(each, 90) for each in extents]))
+    n_classes = len(_DISTANCES) + 1
+    counts, found, alone = (np.zeros(n_classes) for _ in range(3))
+    shared = np.zeros((len(_LENGTHS), n_classes))
+    for part in parts:
+        n_points, n_free = len(part.places), part.cofactors.shape[0]
+        flat = part.jacobian.reshape(-1, n_free)
+        left = np.eye(2 * n_points) - flat @ part.cofactors @ flat.T
+        distance_m = _distances(part.places, part.places)
+        # The first class is each point with itself.
+        kind = np.digitize(distance_m / extent_m, _DISTANCES)
+        kind += 1
+        np.fill_diagonal(kind, 0)
+        kind = np.where(kind >= n_classes, -1, kind)
+
+        counts += _by_class(kind, np.ones_like(distance_m))
+        found += _by_class(kind, part.residuals @ part.residuals.T)
+        alone += _by_class(kind, _traces(left))
+        same = np.einsum("iad,jbd->iajb", part.by_place, part.by_place)
+        for nth, share in enumerate(_LENGTHS):
+            correlation = np.exp(-distance_m / (share * extent_m))
+            errors = (same * correlation[:, None, :, None]).reshape(2 * n_points, 2 * n_points)
+            shared[nth] += _by_class(kind, _traces(left @ errors @ left))
+    weights = 1.0 / np.sqrt(np.maximum(counts, 1.0))
+    # Each point with itself says as much as all the others.
+    weights[0] *= math.sqrt(n_classes)
+    return _fitted_error(found * weights, alone * weights, shared * weights, extent_m)
+
+
+def _by_class(kind: NDArray[np.intp], products: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums of products of pairs by their class; -1 is none."""
+    known = kind >= 0
+    sums = np.bincount(kind[known], weights=products[known], minlength=len(_DISTANCES) + 1)
+    return np.asarray(sums, dtype=np.float64)
+
+
+def _fitted_error(
+    found: NDArray[np.float64],
+    alone: NDArray[np.float64],
+    shared: NDArray[np.float64],
+    extent_m: float,
+) -> CommonError:
+    from scipy.optimize import nnls  # noqa: PLC0415 - most who load this module adjust nothing
+
+    own = max(0.0, float(found @ alone) / max(float(alone @ alone), 1e-300))
+    nothing = CommonError(sigma_m=0.0, length_m=math.inf, sigma_alone=math.sqrt(own))
+    best = float(np.linalg.norm(found - own * alone)) / _LEAST_GAIN, nothing
+    for share, products in zip(_LENGTHS, shared, strict=True):
+        scale = max(float(np.linalg.norm(products)), 1e-300)
+        columns = np.column_stack([alone, products * (np.linalg.norm(alone) / scale)])
+        (own, common), off = nnls(columns, found)
+        error = CommonError(
+            # Rounded: what comes behind must not hang on the order of sums.
+            sigma_m=float(f"{math.sqrt(common * float(np.linalg.norm(alone)) / scale):.4g}"),
+            length_m=float(f"{share * extent_m:.4g}"),
+            sigma_alone=float(f"{math.sqrt(own):.4g}"),
+        )
+        if off < best[0]:
+            best = off, error
+    return best[1]
+
+
+def _distances(places: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(places[:, None] - others[None], axis=2), dtype=np.float64)
+
+
+def _traces(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Traces (n, n) of the 2 x 2 blocks of a matrix (2 n, 2 n)."""
+    return np.asarray(matrix[::2, ::2] + matrix[1::2, 1::2], dtype=np.float64)
+
+
+def with_common_error(
+    covariance: NDArray[np.float64], points: AdjustedPoints, error: CommonError
+) -> NDArray[np.float64]:
+    """Widen the covariance (p, p) of one photo by the error that its points share."""
+    if not error.sigma_m:
+        return covariance
+    some = points.thinned()
+    scale = len(points.places) / len(some.places)
+    pulls = np.einsum("nip,nid->npd", some.jacobian, some.by_place)
+    correlation = error.correlation(some.places, some.places)
+    shared = np.einsum("npd,nqd->pq", pulls, np.einsum("nm,mqd->nqd", correlation, pulls))
+    move = scale * error.sigma_m * points.cofactors
+    spread = error.sigma_alone**2 * points.cofactors + move @ stable(shared) @ move.T
+    return widened(covariance, spread)
+
+
+def stable(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round sums (p, p) so that the number of threads that BLAS took does not show."""
+    scale = np.sqrt(np.maximum(np.diag(sums), 1e-300))
+    unit = np.outer(scale, scale)
+    return np.asarray(np.round(sums / unit, 7) * unit, dtype=np.float64)
 
 
 def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

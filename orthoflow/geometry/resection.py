@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.covariances import honest_covariance
+from orthoflow.geometry.covariances import (
+    AdjustedPoints,
+    common_error,
+    honest_covariance,
+    with_common_error,
+)
 from orthoflow.geometry.lenses import (
     POSE_PARAMETERS,
     LensFreedom,
@@ -151,6 +156,9 @@ def stated(
     covariance = honest_covariance(
         errors.jacobian, errors.residuals, cofactors, groups, sigma0=sigma0
     )
+    points = problem.adjusted_points(camera.shifted(middle), errors, cofactors)
+    if groups is not None:
+        covariance = with_common_error(covariance, points, common_error([points]))
     factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
     to_world = moved_origin(camera, middle, n_free)
     return Resection(
@@ -315,6 +323,22 @@ class _Problem:
         prior = float((self._prior_weights * self._from_prior(camera) ** 2).sum())
         return _Errors(
             residuals=both[:, :, 0], jacobian=both[:, :, 1:], cost=float(loss.sum()) + prior
+        )
+
+    def adjusted_points(
+        self, camera: ViewingCamera, errors: _Errors, cofactors: NDArray[np.float64]
+    ) -> AdjustedPoints:
+        """Return the points with what their errors do to the camera."""
+        linear = linearised(camera, self._seen.points_world, LensFreedom())
+        by_place = whiten(
+            _pixel_covariances(linear, self._seen), linear.by_camera_point @ camera.rotation
+        )
+        return AdjustedPoints(
+            places=self._seen.points_world,
+            residuals=errors.residuals,
+            jacobian=errors.jacobian,
+            by_place=by_place,
+            cofactors=cofactors,
         )
 
     def normal(self, errors: _Errors) -> NDArray[np.float64]:

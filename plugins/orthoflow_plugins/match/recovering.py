@@ -85,7 +85,7 @@ def recovered_traces(
         for index in missing:
             photo = photos.photos[index]
             found = _recovered(
-                index, photo, painted, lens_of(photo, settled), (targets, rule, before)
+                index, photo, painted, lens_of(photo, settled, photos), (targets, rule, before)
             )
             if found is not None:
                 recovered[photo.name] = found
@@ -168,20 +168,27 @@ def recovered_pose(
     return _pose(pixels, points, lens, _POSE_LIMIT_SHARE * max(grey.shape))
 
 
-def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> Intrinsics | None:
-    """Give a photo's lens: calibrated, or as it came out for a photo of the same camera.
+def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
+    """Return a photo's lens: calibrated, or as it came out for a photo of the same camera.
+
+    What came out counts more than what EXIF states, which is wrong for all photos of a lens.
 
     Returns:
         None when nothing is known of it.
     """
-    alike = [
+    focal_px = {each.name: each.exif_focal_px for each in photos.photos}
+    similar = [
         camera.intrinsics
-        for camera in oriented.values()
+        for name, camera in oriented.items()
         if camera.intrinsics is not None
         and (camera.intrinsics.width, camera.intrinsics.height) == (photo.width, photo.height)
-        and (photo.exif_focal_px is None or _is_near(camera.intrinsics.fx, photo.exif_focal_px))
+        and (
+            photo.exif_focal_px is None
+            or focal_px.get(name) == photo.exif_focal_px
+            or _is_near(camera.intrinsics.fx, photo.exif_focal_px)
+        )
     ]
-    return photo.intrinsics or next(iter(alike), None)
+    return photo.intrinsics or next(iter(similar), None)
 
 
 def _is_near(focal_px: float, exif_focal_px: float) -> bool:

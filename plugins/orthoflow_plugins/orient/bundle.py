@@ -45,6 +45,7 @@ from orthoflow_plugins.orient.single_photo import (
     refused,
     require,
     tied_photo,
+    with_believable_priors,
 )
 
 _SHARE_BY_ITSELF: Final = 0.4
@@ -66,7 +67,7 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 10
+    result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         *ORIENTATION_METRICS,
@@ -116,8 +117,9 @@ class OrientColmapBundle(Method):
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient each photo, then all of them together."""
-        ties, photos = inputs.ties, inputs.photos.photos
+        ties = inputs.ties
         require(ties, inputs.photos)
+        photos = with_believable_priors(inputs.photos.photos, ties, params, ctx)
         found: dict[int, Oriented] = {}
         trusted: dict[int, Trusted] = {}
         for nth, photo in enumerate(photos):

@@ -28,7 +28,7 @@ from orthoflow.geometry.resection import (
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Intrinsics, Photo
 from orthoflow_plugins.orient.layout import GROUPS, image_cells
-from orthoflow_plugins.orient.lenses import UNKNOWN, intrinsics_of, lens_prior
+from orthoflow_plugins.orient.lenses import UNKNOWN, focal_sigma, intrinsics_of, lens_prior
 
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
@@ -50,6 +50,10 @@ _FOCAL_OFF_SIGMAS: Final = 5.0
 # A first step far below that saves the rest of the adjustment.
 _FOCAL_STEP_LEAST: Final = 0.5 * _FOCAL_OFF_LEAST
 _LEAST_FOR_FOCAL: Final = 25
+# EXIF is off by some percent at most where it is right: a focal length farther from it that many
+# more ties agree with shows that it is wrong.
+_EXIF_OFF_LEAST: Final = 0.15
+_MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 
 
@@ -139,6 +143,32 @@ def estimate_pose(
     except GeometryError:
         return no_pose(seen)
     return _calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
+
+
+def focal_without_exif(
+    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
+) -> float | None:
+    """Return the focal length in pixels that a photo's ties ask for where EXIF's contradicts them.
+
+    Returns:
+        None where they do not contradict it, or say too little of it.
+    """
+    if photo.intrinsics is not None or photo.exif_focal_px is None or len(seen) < _LEAST_FOR_FOCAL:
+        return None
+    unknown = replace(photo, exif_focal_px=None)
+    start = robust_start(unknown, seen, is_check, rule)
+    if start is None or start.agreeing.sum() < _LEAST_FOR_FOCAL:
+        return None
+    by_exif = robust_start(photo, seen, is_check, rule)
+    if by_exif is not None and start.agreeing.sum() < _MANY_MORE * by_exif.agreeing.sum():
+        return None
+    try:
+        found = adjusted(unknown, seen, is_check, start, rule).resection
+    except GeometryError:
+        return None
+    off = abs(math.log(found.camera.fx / photo.exif_focal_px))
+    sigma = focal_sigma(found)
+    return found.camera.fx if off > max(_EXIF_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma) else None
 
 
 def no_pose(seen: SeenPoints) -> str:

@@ -36,7 +36,7 @@ class OrientPnp(Method):
     """
 
     id: ClassVar[str] = "orient.pnp"
-    result_version: ClassVar[int] = 8
+    result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,12 @@ from orthoflow_plugins.orient.acceptance import (
     warnings_for,
 )
 from orthoflow_plugins.orient.by_hand import TIES_LEAST, pose_by_hand
-from orthoflow_plugins.orient.estimation import Estimate, EstimationRule, adjusted
+from orthoflow_plugins.orient.estimation import (
+    Estimate,
+    EstimationRule,
+    adjusted,
+    focal_without_exif,
+)
 from orthoflow_plugins.orient.layout import withheld
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.residuals import (
@@ -33,6 +39,8 @@ from orthoflow_plugins.orient.residuals import (
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 _SEED_LIMIT = 2**31 - 1
+# Photos of a lens that are asked whether EXIF is right.
+_ASKED_OF_LENS: Final = 5
 
 Estimator = Callable[[Photo, SeenPoints, NDArray[np.bool_], EstimationRule], Estimate | str]
 """Orients one photo by its control ties, or says why it cannot."""
@@ -180,6 +188,46 @@ def tied_photo(
     )
 
 
+def with_believable_priors(
+    photos: Sequence[Photo], ties: Ties, params: OrientParams, ctx: StepContext
+) -> list[Photo]:
+    """Replace focal lengths of EXIF that photos of their camera contradict by what these ask for.
+
+    EXIF is wrong for all photos of a lens, as by digital zoom, adapters and programs that cut a
+    picture. The photos with most ties are asked; the others get the lens that these gave.
+    """
+    believed = list(photos)
+    lenses: dict[tuple[object, ...], list[int]] = {}
+    for at, photo in enumerate(photos):
+        if photo.intrinsics is None and photo.exif_focal_px is not None:
+            key = (photo.camera, photo.width, photo.height, photo.exif_focal_px)
+            lenses.setdefault(key, []).append(at)
+    for members in lenses.values():
+        # Drawn apart, so that the luck of an orientation does not hang on whether EXIF is there.
+        rng = np.random.default_rng(0)
+        tied = [tied_photo(photos[at], ties, params, rng) for at in members]
+        tied.sort(key=lambda each: -len(each.seen))
+        asked = [
+            focal_without_exif(each.photo, each.seen, each.is_check, each.rule)
+            for each in tied[:_ASKED_OF_LENS]
+        ]
+        found = [focal_px for focal_px in asked if focal_px is not None]
+        if 2 * len(found) <= len(asked):
+            continue
+        focal_px = float(np.median(found))
+        first = photos[members[0]]
+        said_px = first.exif_focal_px or math.nan
+        names = f"{first.name} and {len(members) - 1} more" if len(members) > 1 else first.name
+        ctx.warn(
+            f"photos {names}: EXIF says a focal length of {said_px:.0f} px, but their ties ask for "
+            f"{focal_px:.0f} px, a factor of {focal_px / said_px:.2f}: EXIF is not used (digital "
+            "zoom, an adapter, or a picture that was cut)"
+        )
+        for at in members:
+            believed[at] = replace(photos[at], exif_focal_px=focal_px)
+    return believed
+
+
 def each_by_itself(
     ties: Ties, photos: Photos, params: OrientParams, ctx: StepContext, estimator: Estimator
 ) -> list[Oriented]:
@@ -190,8 +238,9 @@ def each_by_itself(
     """
     require(ties, photos)
     found = []
-    for nth, photo in enumerate(photos.photos):
-        ctx.progress(nth / len(photos.photos), photo.name)
+    believed = with_believable_priors(photos.photos, ties, params, ctx)
+    for nth, photo in enumerate(believed):
+        ctx.progress(nth / len(believed), photo.name)
         tied = tied_photo(photo, ties, params, ctx.rng)
         found.append(_by_itself(tied, ties, params, estimator))
     return found

@@ -40,7 +40,7 @@ def oriented(focal_px: float, *, width: int = 900, height: int = 640) -> Camera:
 
 def test_a_calibrated_photo_keeps_its_lens() -> None:
     own = replace(VIEW, fx=777.0)
-    found = lens_of(photo(intrinsics=Intrinsics.of(own)), {"old.png": oriented(500.0)})
+    found = lens_of(photo(intrinsics=Intrinsics.of(own)), {"old.png": oriented(500.0)}, ms.photos())
     assert found is not None
     assert found == Intrinsics.of(own)
 
@@ -52,17 +52,24 @@ def test_a_calibrated_photo_keeps_its_lens() -> None:
 def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal_length(
     exif_px: float | None, is_known: bool
 ) -> None:
-    found = lens_of(photo(exif_focal_px=exif_px), {"old.png": oriented(1000.0)})
+    found = lens_of(photo(exif_focal_px=exif_px), {"old.png": oriented(1000.0)}, ms.photos())
     assert (found is not None) == is_known
     if found is not None:
         assert found.fx == 1000.0
 
 
+def test_a_lens_that_contradicts_exif_is_that_of_photos_with_the_same_exif() -> None:
+    old, new = photo(name="old.png", exif_focal_px=500.0), photo(exif_focal_px=500.0)
+    found = lens_of(new, {"old.png": oriented(1000.0)}, ms.photos(old, new))
+    assert found is not None
+    assert found.fx == 1000.0
+
+
 @pytest.mark.parametrize("size", [(640, 900), (900, 641), (901, 640)])
 def test_photos_of_another_size_have_another_lens(size: tuple[int, int]) -> None:
     cameras = {"old.png": oriented(1000.0, width=size[0], height=size[1])}
-    assert lens_of(photo(), cameras) is None
-    assert lens_of(photo(), {}) is None
+    assert lens_of(photo(), cameras, ms.photos()) is None
+    assert lens_of(photo(), {}, ms.photos()) is None
 
 
 def test_a_missing_photo_starts_with_the_lens_that_ties_tell_best() -> None:
@@ -73,14 +80,14 @@ def test_a_missing_photo_starts_with_the_lens_that_ties_tell_best() -> None:
         for name, source in (("few.png", "estimated"), ("many.png", "estimated"))
     }
     traces: Any = [trace_of(at, n, rough) for at, n in ((0, 16), (1, 80))]
-    found = lens_of(photo(), recovering._settled(photos, known, traces))
+    found = lens_of(photo(), recovering._settled(photos, known, traces), photos)
     assert found is not None
     assert found.source == "estimated"
     assert found.fx == pytest.approx(VIEW.fx, rel=0.01)
     # What was given from elsewhere stays, and is known best.
     given = Intrinsics.of(replace(rough, fx=1000.0))
     known["few.png"] = replace(known["few.png"], intrinsics=given)
-    assert lens_of(photo(), recovering._settled(photos, known, traces)) == given
+    assert lens_of(photo(), recovering._settled(photos, known, traces), photos) == given
     assert recovering._settled(photos, known, traces)["many.png"].viewing().fx == found.fx
 
 

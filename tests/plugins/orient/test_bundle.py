@@ -180,6 +180,49 @@ def test_photos_of_unknown_lenses_share_one_that_their_ties_do_not_contradict(
     assert rms(errors_m(together) / sigmas_m(together)) < 1.5
 
 
+def with_errors_that_reach_far(ties: Ties, seed: int, sigma_m: float) -> Ties:
+    """Ties whose points are off as those of a stereo cloud, neighbours by nearly the same."""
+    rng = np.random.default_rng(200 + seed)
+    nodes = rng.uniform(ties.points_world.min(axis=0), ties.points_world.max(axis=0), (80, 3))
+    near = np.exp(-np.linalg.norm(ties.points_world[:, None] - nodes[None], axis=2) / 0.4)
+    off = near / np.linalg.norm(near, axis=1, keepdims=True) @ rng.normal(size=(80, 3))
+    return replace(ties, points_world=ties.points_world + sigma_m * off)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_of_the_scan_do_not_split_one_camera_into_several_lenses(
+    tmp_path: Path, seed: int
+) -> None:
+    ties = with_errors_that_reach_far(bs.scan_ties(seed), seed, 0.003)
+    together = bundle(ties, without_exif(), context(tmp_path), **ALONE)
+    assert {camera.status for camera in together.cameras} == {"ok"}
+    assert len({camera.intrinsics for camera in together.cameras}) == 1
+
+
+def test_errors_of_the_scan_that_reach_far_are_stated(tmp_path: Path) -> None:
+    ratios = []
+    for seed in range(4):
+        ties = with_errors_that_reach_far(bs.scan_ties(seed), seed, 0.003)
+        together = bundle(ties, bs.photos(calibrated=True), context(tmp_path, seed=seed), **ALONE)
+        ratios.append(errors_m(together) / sigmas_m(together))
+    assert 0.5 < rms(np.array(ratios)) < 2.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_exif_that_the_photos_contradict_is_not_used_and_that_is_reported(
+    tmp_path: Path, factor: float
+) -> None:
+    wrong = [
+        replace(photo, exif_focal_px=factor * 840.0, camera="Phone")
+        for photo in bs.photos(calibrated=False).photos
+    ]
+    ctx = context(tmp_path)
+    together = bundle(bs.scan_ties(2), ms.photos(*wrong), ctx, **ALONE)
+    assert {camera.status for camera in together.cameras} == {"ok"}
+    assert together.cameras[0].viewing().fx == pytest.approx(840.0, rel=0.02)
+    assert any("EXIF is not used" in warning for warning in ctx.warnings)
+
+
 @pytest.mark.parametrize(("zoom", "n_lenses"), [(0.92, 1), (0.8, 4)])
 def test_photos_that_zoomed_share_no_lens_where_it_matters(
     tmp_path: Path, zoom: float, n_lenses: int
