@@ -295,7 +295,9 @@ def _with_what_is_missing(
     wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
     factor = _variance_px2(wider, points) / _variance_px2(model, points)
     wider = replace(wider, variance_factor=factor * model.variance_factor)
-    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, factor))
+    # A misfit of the lens bends neighbouring ties alike, and has widened the poorer model already.
+    beyond_noise = factor * model.variance_factor / model.sigma0**2
+    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, beyond_noise))
 
 
 def _flat(control: SeenPoints, why: str) -> str:

@@ -32,7 +32,7 @@ class OrientDlt(Method):
     """
 
     id: ClassVar[str] = "orient.dlt"
-    result_version: ClassVar[int] = 8
+    result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
