@@ -17,8 +17,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from orthoflow_provenance.model import PublishedFile, RecordedProduct
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import PublishedFile, RecordedProduct
+from orthoflow_provenance.record import write_record
 
 from benchmarks.tiled_orthoimage import GSD_M, large_orthoimage, largest_mib
 from orthoflow.cli.program import program

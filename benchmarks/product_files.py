@@ -13,8 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from orthoflow_provenance.digests import payload_digest
-from orthoflow_provenance.payloads import read_product_file, write_product_file
+from orthoflow_provenance.arrays import payload_digest, read_product_file, write_product_file
 
 from orthoflow.products.product import Payload
 

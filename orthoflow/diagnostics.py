@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, Protocol
 
-from orthoflow_provenance.model import RecordedDiagnostic as Diagnostic
+from orthoflow_provenance.document import RecordedDiagnostic as Diagnostic
 
 from orthoflow.errors import ProductError
 from orthoflow.foreign_text import shown

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_provenance.model import PublishedFile, RecordedProduct
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import PublishedFile, RecordedProduct
+from orthoflow_provenance.record import write_record
 
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of

@@ -1,119 +1,137 @@
-"""Records changed as an enemy would, with their seals and keys made again to fit."""
+"""Records changed as an enemy would, with what hangs on the change, keys and seal made to fit."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
-from orthoflow_provenance.digests import canonical_json, sha256_text
-from orthoflow_provenance.encoding import (
-    read_table,
-    read_text,
-    set_attributes,
-    write_table,
-    write_text,
+from orthoflow_provenance import record as module
+from orthoflow_provenance.document import (
+    RecordFormatError,
+    RunRecord,
+    canonical_json,
+    from_json,
+    sha256_text,
 )
-from orthoflow_provenance.layout import PUBLISHED
-from orthoflow_provenance.seal import SEAL_ATTRIBUTE, SEAL_DATASET, seal_file
+from orthoflow_provenance.hdf5 import fixed_text, write_array
 
 from orthoflow.engine.file_digests import file_sha256
 
 PNG = b"\x89PNG\r\n\x1a\n picture"
-FILES = (("name", str), ("size_bytes", int), ("sha256", str))
-PATHS = (("path", str), ("size_bytes", int), ("sha256", str))
 
 
-def changed(run: Path, copy: Path, change: Callable[[h5py.File], object]) -> Path:
+@dataclass
+class Record:
+    """The document of a record, to be changed, and the bytes that it names by digest."""
+
+    document: Any
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def cell(self, address: str) -> Any:
+        return next(cell for cell in self.document["cells"] if cell["address"] == address)
+
+    def add_figure(self, address: str, name: str, media_type: str = "image/png") -> None:
+        sha256 = hashlib.sha256(PNG).hexdigest()
+        self.files[sha256] = PNG
+        figure = {"name": name, "caption": "a caption", "media_type": media_type, "data": sha256}
+        self.cell(address)["figures"].append(figure)
+
+    def rename_files(self, entry: str, name: str) -> None:
+        """Give the files of an input another name, everywhere a digest hangs on it."""
+        (given,) = (one for one in self.document["inputs"] if one["name"] == entry)
+        for file in given["files"]:
+            file["name"] = name
+        digest = sha256_text(
+            canonical_json({"files": given["files"], "v": 1, "what": "orthoflow/files"})
+        )
+        for cell in self.document["cells"]:
+            for port, taken in cell["inputs"].items():
+                if taken["source"] == f"inputs.{entry}":
+                    taken["digest"] = f"sha256:{digest}"
+                    inputs = json.loads(cell["key_preimage"])["inputs"]
+                    inputs[port] = f"files@0:sha256:{digest}"
+                    self.rewrite_preimage(cell["address"], inputs=inputs)
+
+    def rewrite_preimage(self, address: str, **facts: object) -> None:
+        """Let the preimage of a cell's key state other facts, and make the key anew."""
+        preimage = {**json.loads(self.cell(address)["key_preimage"]), **facts}
+        self.exchange_preimage(address, canonical_json(preimage))
+
+    def exchange_preimage(self, address: str, text: str) -> None:
+        """Give a cell any text as the preimage of its key, and the key that follows from it."""
+        self.cell(address).update(key_preimage=text, key=sha256_text(text))
+
+    def name_published(self, *paths: str) -> None:
+        """Name other files as published."""
+        self.document["published"] = [
+            {"path": path, "size_bytes": 0, "sha256": "0" * 64} for path in paths
+        ]
+
+
+def changed(run: Path, copy: Path, change: Callable[[Record], object]) -> Path:
     """Copy a run folder, change its record, and seal that again."""
     shutil.copytree(run, copy, symlinks=True)
-    path = copy / "run.h5"
-    reseal(path, change)
+    reseal(copy / "run.h5", change)
     return copy
 
 
-def reseal(path: Path, change: Callable[[h5py.File], object]) -> None:
+def reseal(path: Path, change: Callable[[Record], object]) -> None:
     """Change a record and seal it again, as if it had been written so."""
     with h5py.File(path, "r+") as file:
-        change(file)
-        if SEAL_DATASET in file:
-            del file[SEAL_DATASET]
-        if SEAL_ATTRIBUTE in file.attrs:
-            del file.attrs[SEAL_ATTRIBUTE]
-        seal_file(file)
+        record = Record(json.loads(file["document"][()]))
+        change(record)
+        text = json.dumps(record.document, indent=1)
+        for sha256, data in record.files.items():
+            if sha256 not in file["files"]:
+                write_array(file["files"], sha256, np.frombuffer(data, np.uint8))
+        rewrite(file, text)
 
 
-def add_figure(cell: h5py.Group, name: str, media_type: str = "image/png") -> None:
-    figures = cell["figures"]
-    figure = figures.create_dataset(f"{len(figures):04}", data=np.frombuffer(PNG, np.uint8))
-    set_attributes(figure, {"name": name, "caption": "a caption", "media_type": media_type})
+def rewrite(file: h5py.File, text: str) -> None:
+    """Give a record another document, with what repeats it where it can be, and a new seal."""
+    try:
+        read = from_json(
+            RunRecord, json.loads(text), lambda sha256: file[f"files/{sha256}"][()].tobytes()
+        )
+        nodes = module.expected_nodes(read, text)
+        for name in set(file) - {"products", "files"}:
+            del file[name]
+        for name in list(file.attrs):
+            del file.attrs[name]
+        for name, node in nodes.items():
+            module._write_node(file, name, node)
+    except (RecordFormatError, ValueError, KeyError, TypeError, RecursionError):
+        # A document that no writer would write: nothing can repeat it.
+        for name in {"document", "seal"} & set(file):
+            del file[name]
+        write_array(file, "document", fixed_text(text))
+        file.attrs["content_sha256"] = fixed_text(sha256_text(text))
+    seal(file)
 
 
-def set_text(group: h5py.Group, name: str, text: str) -> None:
-    del group[name]
-    write_text(group, name, text)
-
-
-def set_attribute(group: h5py.Group, name: str, value: str | float) -> None:
-    del group.attrs[name]
-    set_attributes(group, {name: value})
-
-
-def rename_files(file: h5py.File, entry: str, name: str) -> None:
-    """Give the files of an input another name, everywhere a digest hangs on it."""
-    group = file[f"inputs/{entry}"]
-    rows = [(name, *row[1:]) for row in read_table(group, "files", FILES)]
-    del group["files"]
-    write_table(group, "files", FILES, rows)
-    described = [dict(zip(("name", "size_bytes", "sha256"), row, strict=True)) for row in rows]
-    digest = sha256_text(
-        canonical_json({"files": described, "v": 1, "what": "orthoflow/files"})  # type: ignore[dict-item]
-    )
-    for cell in file["cells"].values():
-        for port in cell["in"].values():
-            if port.attrs["source"].decode() == f"inputs.{entry}":
-                exchange_digest(cell, port, f"sha256:{digest}")
-
-
-def exchange_digest(cell: h5py.Group, port: h5py.Group, digest: str) -> None:
-    """Give an input of a cell another digest, and the cell the key that follows from it."""
-    name = port.name.rpartition("/")[2]
-    set_attribute(port, "digest", digest)
-    inputs = json.loads(read_text(cell, "key_preimage"))["inputs"]
-    rewrite_preimage(cell, inputs={**inputs, name: f"files@0:{digest}"})
-
-
-def rewrite_preimage(cell: h5py.Group, **facts: object) -> None:
-    """Let the preimage of a cell's key state other facts, and make the key anew."""
-    preimage = {**json.loads(read_text(cell, "key_preimage")), **facts}
-    exchange_preimage(cell, canonical_json(preimage))  # type: ignore[arg-type]
-
-
-def exchange_preimage(cell: h5py.Group, text: str) -> None:
-    """Give a cell any text as the preimage of its key, and the key that follows from it."""
-    set_text(cell, "key_preimage", text)
-    set_attribute(cell, "key", sha256_text(text))
-
-
-def name_published(file: h5py.File, *paths: str) -> None:
-    """Let a record name other files as published."""
-    rows = [(path, 0, "0" * 64) for path in paths]
-    del file[PUBLISHED]
-    write_table(file, PUBLISHED, PATHS, rows)
+def seal(file: h5py.File) -> None:
+    """Seal a record as it is, and close it."""
+    if "seal" in file:
+        del file["seal"]
+    offset = write_array(file, "seal", fixed_text("0" * 64)).id.get_offset()
+    path = Path(file.filename)
+    file.close()
+    module._seal_file(path, offset)
 
 
 def publish_again(run: Path) -> None:
     """Let the record of a run name the published files as they are now."""
 
-    def name(file: h5py.File) -> None:
-        rows = [
-            (path, (run / path).stat().st_size, file_sha256(run / path))
-            for path, _, _ in read_table(file, PUBLISHED, PATHS)
-        ]
-        del file[PUBLISHED]
-        write_table(file, PUBLISHED, PATHS, rows)
+    def name(record: Record) -> None:
+        for file in record.document["published"]:
+            path = run / file["path"]
+            file.update(size_bytes=path.stat().st_size, sha256=file_sha256(path))
 
     reseal(run / "run.h5", name)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_provenance.digests import canonical_json, sha256_text
-from orthoflow_provenance.model import (
+from orthoflow_provenance.arrays import write_product_file
+from orthoflow_provenance.document import (
     JsonValue,
     Metric,
     RecordedCell,
@@ -20,9 +20,10 @@ from orthoflow_provenance.model import (
     RecordedInput,
     RecordedProduct,
     RunRecord,
+    canonical_json,
+    sha256_text,
 )
-from orthoflow_provenance.payloads import write_product_file
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.record import write_record
 
 WORKFLOW = "orthoflow: 1\nname: court-yard\nseed: 7\n# café\r\n"
 
@@ -110,7 +111,7 @@ def sample_record(cloud_digest: str, walls_digest: str) -> RunRecord:
             },
             metrics=(
                 Metric(name="rms_mm", value=1.25, unit="mm"),
-                Metric(name="cells", value=5400.0, unit="1", words="cells seen", good="more"),
+                Metric(name="cells", value=5400.0, unit="1", label="cells seen", better="higher"),
             ),
             figures=(
                 RecordedFigure(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     Metric,
     RecordedCell,
     RecordedEnvironment,

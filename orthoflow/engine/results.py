@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Final
 
-from orthoflow_provenance.inner_files import name_problem
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     CellOutcome,
     CellStatus,
     Costs,
@@ -21,6 +20,7 @@ from orthoflow_provenance.model import (
     RecordedFile,
     shared_fields,
 )
+from orthoflow_provenance.paths import name_problem
 from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.checked_json import is_checked, with_digest

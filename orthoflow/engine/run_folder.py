@@ -13,8 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Final, Literal, Self, TypeAlias
 
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import path_below
+from orthoflow_provenance.document import UnsafeFileError
+from orthoflow_provenance.paths import path_below
 from pydantic import TypeAdapter
 
 from orthoflow.engine.clock import now, time_in_a_name

@@ -33,9 +33,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from orthoflow_provenance.digests import canonical_json, payload_digest, sha256_text
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import shared_fields
+from orthoflow_provenance.arrays import payload_digest
+from orthoflow_provenance.document import (
+    RecordFormatError,
+    canonical_json,
+    sha256_text,
+    shared_fields,
+)
 
 from orthoflow.engine.durability import (
     folder_size,
@@ -171,7 +175,7 @@ class Store:
             ProductError: the product holds what no store can keep.
         """
         # Loads h5py, which a plan does without.
-        from orthoflow_provenance.payloads import write_product_file  # noqa: PLC0415
+        from orthoflow_provenance.arrays import write_product_file  # noqa: PLC0415
 
         aside = self._new_folder()
         try:
@@ -205,7 +209,7 @@ class Store:
             DamageError: it is not there, or is damaged.
             ProductError: it is of another type.
         """
-        from orthoflow_provenance.payloads import read_product_file  # noqa: PLC0415 - as above
+        from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
 
         path = self._object(digest) / PRODUCT
         if not path.is_file():
@@ -231,7 +235,7 @@ class Store:
         Raises:
             DamageError: it is not there, or is damaged.
         """
-        from orthoflow_provenance.payloads import read_product_metadata  # noqa: PLC0415 - as above
+        from orthoflow_provenance.arrays import read_product_metadata  # noqa: PLC0415 - as above
 
         path = self.product_file(digest)
         try:
@@ -492,7 +496,7 @@ class Store:
 
         Nobody knows any more what its published files were: they are taken as they are, once.
         """
-        from orthoflow_provenance.payloads import read_product_file  # noqa: PLC0415 - as above
+        from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
 
         try:
             stored = read_product_file(folder / PRODUCT, map_arrays=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     COSTS,
     Metric,
     RecordedCell,

@@ -8,13 +8,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
-from orthoflow_provenance.digests import canonical_json
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     COSTS,
     MethodIdentity,
     RecordedCell,
     RecordedFile,
     RunRecord,
+    canonical_json,
     shared_fields,
 )
 

@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Final, TypeAlias
 
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     RecordedCell,
     RecordedEnvironment,
     RecordedFile,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.model import RecordedCell, RunRecord
+from orthoflow_provenance.document import RecordedCell, RunRecord
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name

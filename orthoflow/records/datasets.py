@@ -8,9 +8,14 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from orthoflow_provenance.errors import InputFileError, RecordFormatError
-from orthoflow_provenance.model import PublishedFile, RecordedCell, RunRecord
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import (
+    InputFileError,
+    PublishedFile,
+    RecordedCell,
+    RecordFormatError,
+    RunRecord,
+)
+from orthoflow_provenance.record import write_record
 
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.engine.durability import writing_to

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import InputError

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Final
 
-from orthoflow_provenance.model import CellOutcome, JsonValue
+from orthoflow_provenance.document import CellOutcome, JsonValue
 
 _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from orthoflow_provenance.compare import ArrayDifference, measure_payloads
-from orthoflow_provenance.digests import payload_digest
-from orthoflow_provenance.model import RecordedProduct
+from orthoflow_provenance.arrays import ArrayDifference, measure_payloads
+from orthoflow_provenance.document import RecordedProduct
 
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry.levels import DEEPER
@@ -94,24 +93,11 @@ class RunProducts:
         output = self.outputs(address).get(port)
         return "" if output is None else output.digest
 
-    def encoding_version(self, address: str, port: str) -> int:
-        """Version of the encoding in which an output was written."""
-        return self.outputs(address)[port].encoding_version
-
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
-        """Arrays and metadata of an output as the present encoding has them.
-
-        None when they are nowhere to be found.
-
-        Raises:
-            ProductError: the output is of a newer encoding than the installed type.
-        """
+        """Return arrays and metadata of an output; None when they are nowhere to be found."""
         output = self.outputs(address)[port]
         if output.embedded:
-            payload = self.run.payload(self.own.get(address, address), port)
-            if payload.encoding_version == cls.encoding_version:
-                return payload
-            return cls.from_payload(payload).to_payload()
+            return self.run.payload(self.own.get(address, address), port)
         for store in self.stores:
             if store.product_file(output.digest) is not None:
                 return store.get_product(output.digest, cls).to_payload()
@@ -174,9 +160,6 @@ def _distance(
             "the digests differ, and its arrays are in no record and no store at hand; run with "
             "--embed to keep them",
         )
-    encodings = {side.encoding_version(address, port) for side in (left, right)}
-    if len(encodings) > 1:
-        ours, theirs = _common(ours, theirs)
     limits = {
         name: (_limit(name, tolerance, ours), tolerance.unit)
         for name, tolerance in cls.tolerances.items()
@@ -184,8 +167,9 @@ def _distance(
     differences = [_named(found, ours) for found in measure_payloads(ours, theirs, limits)]
     beyond = [difference for difference in differences if difference.n_values]
     if not beyond:
-        is_same = payload_digest(ours) == payload_digest(theirs)
-        return verdict("identical" if is_same else "within tolerance", "", _by_unit(differences))
+        return verdict(
+            "within tolerance" if differences else "identical", "", _by_unit(differences)
+        )
     others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
     reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
     return verdict("different", reason, _by_unit(differences))
@@ -213,31 +197,6 @@ def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
         for path, array in payload.arrays.items()
     )
     return tolerance.limit * (DEEPER if is_deep else 1)
-
-
-def _common(left: Payload, right: Payload) -> tuple[Payload, Payload]:
-    """Leave out what only one of two encodings states: nothing can be said of a distance there."""
-    return _without_strangers(left, right), _without_strangers(right, left)
-
-
-def _without_strangers(payload: Payload, other: Payload) -> Payload:
-    return replace(
-        payload,
-        metadata={
-            name: _shared(value, other.metadata[name])
-            for name, value in payload.metadata.items()
-            if name in other.metadata
-        },
-        arrays={name: array for name, array in payload.arrays.items() if name in other.arrays},
-    )
-
-
-def _shared(value: JsonValue, other: JsonValue) -> JsonValue:
-    if isinstance(value, dict) and isinstance(other, dict):
-        return {key: _shared(value[key], other[key]) for key in value if key in other}
-    if isinstance(value, list) and isinstance(other, list) and len(value) == len(other):
-        return [_shared(a, b) for a, b in zip(value, other, strict=True)]
-    return value
 
 
 def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:

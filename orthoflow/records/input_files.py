@@ -14,9 +14,9 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.inner_files import name_problem
-from orthoflow_provenance.input_files import extract_files
-from orthoflow_provenance.model import RecordedFile, RecordedInput
+from orthoflow_provenance.document import RecordedFile, RecordedInput
+from orthoflow_provenance.paths import name_problem
+from orthoflow_provenance.record import extract_files
 
 from orthoflow.alike import first_few
 from orthoflow.engine.durability import writing_to

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.model import RecordedCell, cost_metrics
+from orthoflow_provenance.document import RecordedCell, cost_metrics
 
 from orthoflow.foreign_text import csv_text
 
@@ -28,8 +28,8 @@ class MetricRow:
         metric: name, with its unit at the end where it has one.
         value: finite number.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        words: what its method calls it; empty where it says nothing.
-        good: with words: which side is good, `less`, `more` or `one`; empty where none is.
+        label: what its method calls it; empty where it declares nothing.
+        better: which values are better, `lower`, `higher` or `one`; empty where none are.
     """
 
     cell: str
@@ -38,8 +38,8 @@ class MetricRow:
     metric: str
     value: float
     unit: str
-    words: str = ""
-    good: str = ""
+    label: str = ""
+    better: str = ""
 
 
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
@@ -57,8 +57,8 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
             metric=metric.name,
             value=metric.value,
             unit=metric.unit,
-            words=metric.words,
-            good=metric.good,
+            label=metric.label,
+            better=metric.better,
         )
         for metric in (*cell.metrics, *cost_metrics(cell))
     )

@@ -10,12 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import quote
 
-from orthoflow_provenance.model import (
-    RecordedCell,
-    RecordedProduct,
-    RunRecord,
-    cost_metrics,
-)
+from orthoflow_provenance.document import RecordedCell, RecordedProduct, RunRecord, cost_metrics
 
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.products import JsonValue

@@ -10,8 +10,8 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.inner_files import colliding, files_below, path_below
-from orthoflow_provenance.model import PublishedFile, RecordedCell
+from orthoflow_provenance.document import PublishedFile, RecordedCell
+from orthoflow_provenance.paths import colliding, files_below, path_below
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256

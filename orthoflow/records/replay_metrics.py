@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.records.comparison import compare_metrics
 from orthoflow.records.distances import ProductDistance

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.document import RecordedCell
 from pydantic import ValidationError
 
 from orthoflow.catalog.catalog import Catalog

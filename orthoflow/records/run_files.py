@@ -11,8 +11,13 @@ from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import (
+from orthoflow_provenance.document import (
+    FIGURE_SUFFIXES,
+    PublishedFile,
+    RecordedFigure,
+    UnsafeFileError,
+)
+from orthoflow_provenance.paths import (
     colliding,
     create_below,
     name_problem,
@@ -20,7 +25,6 @@ from orthoflow_provenance.inner_files import (
     path_below,
     path_problem,
 )
-from orthoflow_provenance.model import FIGURE_SUFFIXES, PublishedFile, RecordedFigure
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import cell_file_name

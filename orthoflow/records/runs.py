@@ -12,10 +12,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord, shared_fields
-from orthoflow_provenance.payloads import StoredPayload
-from orthoflow_provenance.reader import open_outputs, read_record
+from orthoflow_provenance.arrays import StoredPayload
+from orthoflow_provenance.document import (
+    RecordedCell,
+    RecordedFigure,
+    RecordFormatError,
+    RunRecord,
+    shared_fields,
+)
+from orthoflow_provenance.record import open_record, read_record
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
@@ -74,8 +79,8 @@ class Run:
         """
         with ExitStack() as stack:
             with record_errors(self.path):
-                output = stack.enter_context(open_outputs(self.path))
-            yield replace(self, output=output)
+                opened = stack.enter_context(open_record(self.path))
+            yield replace(self, output=opened.payload)
 
     @property
     def folder(self) -> Path:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from orthoflow_provenance.digests import canonical_json
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import open_below
-from orthoflow_provenance.reader import open_record
+from orthoflow_provenance.document import UnsafeFileError, canonical_json
+from orthoflow_provenance.paths import open_below
+from orthoflow_provenance.record import open_record
 
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
 from orthoflow.records.run_files import creating

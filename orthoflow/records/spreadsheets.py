@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from orthoflow_provenance.model import COSTS, RunRecord
+from orthoflow_provenance.document import COSTS, RunRecord
 
 from orthoflow.foreign_text import Value, csv_text
 from orthoflow.records.metrics import write_metrics_csv

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import open_below
-from orthoflow_provenance.model import PublishedFile, RunRecord
-from orthoflow_provenance.reader import open_record
-from orthoflow_provenance.verify import verify_record, verify_seal
+from orthoflow_provenance.document import PublishedFile, RunRecord, UnsafeFileError
+from orthoflow_provenance.paths import open_below
+from orthoflow_provenance.record import open_record
+from orthoflow_provenance.verify import verify_record
 
 from orthoflow.alike import first_few
 from orthoflow.errors import RecordError
@@ -33,9 +31,8 @@ from orthoflow.records.signatures import SIGNATURE_SUFFIX, check_signature, read
 # What shows the record; its digests would have to be in it.
 _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 
-# Every number and text of a record is smaller; large are only arrays of products and input files.
-_SEALED_BYTES: Final = 1 << 20
-
+# What a record contradicts itself in: it may have been written so.
+_OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # A crate has its description, two files of the workflow and one per environment.
 _UNCOVERED_MOST: Final = 8
 
@@ -99,8 +96,8 @@ def verify_run(
     found = verify_record(record_path)
     findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
     if findings:
-        is_foreign = any(finding.is_foreign for finding in found)
-        wrong = "cannot be checked" if is_foreign else "is not as it was written"
+        is_unchecked = found[0].code in ("foreign", "locked")
+        wrong = "cannot be checked" if is_unchecked else "is not as it was written"
         wrong = f"{record_path} {wrong}"
         return Verification(path=record_path, findings=findings, wrong=wrong)
     with record_errors(record_path), open_record(record_path) as opened:
@@ -124,24 +121,20 @@ def verify_run(
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Say what of a record was changed since it was sealed; empty where nothing is seen.
+    """Return what of a record was changed since it was sealed; empty where nothing is found.
 
-    Large arrays are not looked at, so that this costs little: whoever reads those of a product
-    compares their digest (`Run.payloads`), and `verify_run` looks at everything.
+    The arrays of products and input files are not looked at, so that this costs little: whoever
+    reads those of a product compares their digest (`Run.payloads`), and `verify_run` looks at all.
 
     Args:
         run: the run.
-        of_all: look at large arrays, too, for whoever hands on all of the record.
-
-    Raises:
-        RecordError: the record is damaged.
+        of_all: look at everything, for whoever hands on all of the record.
     """
-    with record_errors(run.path):
-        findings = verify_seal(run.path, largest_bytes=math.inf if of_all else _SEALED_BYTES)
-    if not findings:
+    findings = verify_record(run.path, with_arrays=of_all)
+    places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
+    if not places:
         return ""
-    places = first_few([finding.place for finding in findings])
-    return f"{run.path} is not as it was written: its seal does not hold for {places}"
+    return f"{run.path} is not as it was written: its seal does not hold for {first_few(places)}"
 
 
 def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck) -> str:

@@ -10,10 +10,10 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
-from orthoflow_provenance.errors import InputFileError, RecordFormatError
-from orthoflow_provenance.model import (
+from orthoflow_provenance.document import (
     CellOutcome,
     Figure,
+    InputFileError,
     MethodIdentity,
     ProductRef,
     RecordedCell,
@@ -22,11 +22,11 @@ from orthoflow_provenance.model import (
     RecordedFile,
     RecordedInput,
     RecordedProduct,
+    RecordFormatError,
     RunRecord,
     shared_fields,
 )
-from orthoflow_provenance.reader import read_record
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.record import read_record, write_record
 
 from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to

@@ -416,7 +416,7 @@ def _labels(run: Run) -> dict[str, str]:
     for part in parts_of(run).values() or (run,):
         for cell in baseline_cells(part):
             for row in cell_metrics(cell):
-                label = words_of(row.metric, row.method, row.words)
+                label = words_of(row.metric, row.method, row.label)
                 found |= {f"{row.step}.{row.metric}": label, row.metric: label}
     return found
 

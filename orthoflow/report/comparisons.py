@@ -291,7 +291,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
             steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
             last |= dict.fromkeys((step, metric) for metric, step in steps.items())
         # First what a plugin says to have a good side, as on the first screen.
-        wanted = [key for key, row in first.items() if row.good]
+        wanted = [key for key, row in first.items() if row.better]
         wanted += [
             key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
         ]
@@ -342,7 +342,7 @@ def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:
         if len(tolerances) > 1:
             label, sense = f"{label}, cut at its own tolerance", Sense.NEITHER
     return Column(
-        step=row.step, metric=row.metric, label=label, sense=sense, is_declared=bool(row.good)
+        step=row.step, metric=row.metric, label=label, sense=sense, is_declared=bool(row.better)
     )
 
 

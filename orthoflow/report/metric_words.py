@@ -392,7 +392,7 @@ def metric_words(name: str, method: str = "") -> str:
 
 def label_in_words(row: MetricRow) -> str:
     """Say what a metric is, with its unit; shares and counts (unit 1) stand alone."""
-    words = words_of(row.metric, row.method, row.words)
+    words = words_of(row.metric, row.method, row.label)
     return words if row.unit == "1" else f"{words} / {row.unit}"
 
 

@@ -145,8 +145,8 @@ class Sense(Enum):
 
 
 _DECLARED: Final = {
-    "less": Sense.LESS,
-    "more": Sense.MORE,
+    "lower": Sense.LESS,
+    "higher": Sense.MORE,
     "one": Sense.ONE,
     "": Sense.NEITHER,
 }
@@ -196,9 +196,9 @@ def sense_of(metric: str, row: MetricRow | None = None) -> Sense:
     >>> sense_of("rmse_u_mm").name, sense_of("label_iou").name, sense_of("omega_deg").name
     ('LESS', 'MORE', 'NEITHER')
     """
-    if row is not None and row.words:
+    if row is not None and row.label:
         # A record may hold anything.
-        return _DECLARED.get(row.good, Sense.NEITHER)
+        return _DECLARED.get(row.better, Sense.NEITHER)
     for pattern, sense in _PATTERNS:
         if fnmatchcase(metric, pattern):
             return sense

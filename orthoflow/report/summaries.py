@@ -99,7 +99,7 @@ class Limit:
 
 def is_quality(row: MetricRow) -> bool:
     """Whether a number is one of QUALITY; a stranger's kind may mean something else by the name."""
-    return row.metric in QUALITY and words_of(row.metric, row.method, row.words) != row.metric
+    return row.metric in QUALITY and words_of(row.metric, row.method, row.label) != row.metric
 
 
 def answers(run: Run) -> tuple[Answer, ...]:
@@ -115,9 +115,9 @@ def answers(run: Run) -> tuple[Answer, ...]:
     at_points = len(found)
     # What a stranger's method says to be good or bad is what its workflow is about.
     found += [
-        Answer(what=row.words, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
+        Answer(what=row.label, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
         for row in rows
-        if row.words and row.good
+        if row.label and row.better
     ][:_DECLARED_MOST]
     for wanted in QUALITY:
         stated = [row for row in rows if row.metric == wanted and is_quality(row)]
@@ -131,7 +131,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
             value = _in_words(wanted, row.value, row.unit)
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
-            what = words_of(wanted, row.method, row.words)
+            what = words_of(wanted, row.method, row.label)
             not_held = _NOT_HELD.get(wanted, "")
             if wanted == OF_PLANE and row.method.startswith("plane."):
                 not_held = _RELIEF_COUNTS

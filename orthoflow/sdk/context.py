@@ -14,9 +14,8 @@ from typing import Final, Literal, ParamSpec, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import colliding, path_below
-from orthoflow_provenance.model import COSTS, Figure, Metric
+from orthoflow_provenance.document import COSTS, Figure, Metric, UnsafeFileError
+from orthoflow_provenance.paths import colliding, path_below
 
 from orthoflow.diagnostics import (
     PLAIN_WARNING,

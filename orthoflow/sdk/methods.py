@@ -22,8 +22,6 @@ from orthoflow.sdk.units import unit_of
 Determinism = Literal["exact", "seeded", "loose"]
 _BETTER: Final = ("", "lower", "higher", "one")
 _WILDCARD: Final = re.compile(r"(\*|\[[^\]]+\])")
-# As records of today name it.
-_GOOD: Final = {"": "", "lower": "less", "higher": "more", "one": "one"}
 
 
 class MethodParams(BaseModel):
@@ -334,7 +332,7 @@ def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, .
         spec = method.metric_spec(metric.name)
         if spec is not None and (spec.label or spec.better):
             label = spec.label.format(*matched(spec.name, metric.name)) or metric.name
-            found.append(replace(metric, words=label, good=_GOOD[spec.better]))
+            found.append(replace(metric, label=label, better=spec.better))
         else:
             found.append(metric)
     return tuple(found)

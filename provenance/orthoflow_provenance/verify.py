@@ -1,51 +1,61 @@
-"""Checking a record against itself: the seal, every digest, every required field."""
+"""Checking a record against itself: the seal, every digest, every object, every required field."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Container, Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
-from orthoflow_provenance import layout
-from orthoflow_provenance.digests import ArrayFingerprint, digest_of_parts, sha256_text
-from orthoflow_provenance.encoding import (
-    HDF5_ERRORS,
-    parse_json,
-    read_json,
-    read_text,
-    storable_text,
-    text_attribute,
-)
-from orthoflow_provenance.errors import ForeignFormatError, RecordFormatError
-from orthoflow_provenance.inner_files import colliding, name_problem, path_problem
-from orthoflow_provenance.input_files import content_name
-from orthoflow_provenance.model import (
+from orthoflow_provenance.arrays import payload_digest, read_payload
+from orthoflow_provenance.document import (
+    DIGEST_PREFIX,
     FIGURE_SUFFIXES,
     RUN_FORMAT,
-    RUN_FORMAT_VERSION,
+    ForeignFormatError,
+    LockedFileError,
     RecordedCell,
     RecordedInput,
-    RecordedProduct,
+    RecordFormatError,
     RunRecord,
     cost_metrics,
+    parse_json,
+    sha256_text,
 )
-from orthoflow_provenance.payloads import array_datasets, open_group
-from orthoflow_provenance.reader import record_of
-from orthoflow_provenance.safe import check_format, safe_open
-from orthoflow_provenance.seal import (
-    SEAL_ATTRIBUTE,
-    SEAL_DATASET,
-    ContentDigests,
-    digest_contents,
-    read_seal,
+from orthoflow_provenance.hdf5 import (
+    HDF5_ERRORS,
+    bytes_behind_end,
+    check_format,
+    dataset_of,
+    open_group,
+    read_text,
+    read_whole,
+    reading,
+    safe_open,
+)
+from orthoflow_provenance.paths import colliding, name_problem, path_problem
+from orthoflow_provenance.record import (
+    CELLS,
+    DOCUMENT,
+    FILES,
+    PRODUCTS,
+    SEAL,
+    Node,
+    dataset_sha256,
+    expected_nodes,
+    file_sha256,
+    is_sha256,
+    product_path,
+    record_of,
 )
 
 _LETTERS_MOST: Final = 60
-_HEX_DIGITS: Final = frozenset("0123456789abcdef")
+_PRODUCT_ATTRIBUTES: Final = frozenset({"type", "encoding_version", "digest", "mapped"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,66 +63,67 @@ class Finding:
     """Something in a record that is not as it should be.
 
     Attributes:
+        code: what it is: `foreign` and `locked` for files that cannot be checked, else `damaged`,
+            `seal`, `appended`, `document`, `object`, `product`, `file`, `field`, `name`, `key`
+            or `reference`.
         place: path in the file, with `@` before the name of an attribute.
         problem: one sentence.
-        is_foreign: the file is of another program or a later version, so nothing was checked.
     """
 
+    code: str
     place: str
     problem: str
-    is_foreign: bool = False
 
 
-def verify_record(path: Path) -> tuple[Finding, ...]:
+def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...]:
     """Check a record; never raises, whatever the file is.
+
+    Args:
+        path: the record.
+        with_arrays: check the seal of the file and the arrays of products, too; without, what is
+            read is the document, what repeats it, and figures.
 
     Returns:
         What was found, in the order of the checks; empty when the record is whole and unchanged.
     """
     try:
         with safe_open(path) as file:
-            return tuple(_findings(file))
+            check_format(file, RUN_FORMAT)
+            return tuple(_findings(file, path, with_arrays=with_arrays))
+    except LockedFileError as error:
+        return (Finding(code="locked", place="/", problem=str(error)),)
+    except ForeignFormatError as error:
+        return (Finding(code="foreign", place="/", problem=str(error)),)
     except RecordFormatError as error:
-        is_foreign = isinstance(error, ForeignFormatError)
-        return (Finding(place="/", problem=str(error), is_foreign=is_foreign),)
+        return (Finding(code="damaged", place="/", problem=str(error)),)
     except HDF5_ERRORS as error:
         problem = f"{path.name} cannot be read: {error}"
-        return (Finding(place="/", problem=problem),)
+        return (Finding(code="damaged", place="/", problem=problem),)
 
 
-def verify_seal(path: Path, *, largest_bytes: float) -> tuple[Finding, ...]:
-    """Check the seal of a record alone, at the cost of reading its smaller parts.
-
-    Args:
-        path: the record.
-        largest_bytes: larger datasets are not looked at.
-
-    Raises:
-        RecordFormatError: it is no record, or unsafe to open.
-    """
-    with safe_open(path) as file:
-        contents = digest_contents(file, largest_bytes=largest_bytes)
-        unreadable = (
-            Finding(place=place, problem=problem) for place, problem in contents.unreadable.items()
-        )
-        return (*unreadable, *_seal_findings(file, contents))
+def _findings(file: h5py.File, path: Path, *, with_arrays: bool) -> Iterator[Finding]:
+    yield from _document_findings(file, with_arrays=with_arrays)
+    # Last: what was changed has been named where it can be.
+    if with_arrays:
+        yield from _file_findings(file, path)
 
 
-def _findings(file: h5py.File) -> Iterator[Finding]:
-    check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
-    contents = digest_contents(file)
-    for place, problem in contents.unreadable.items():
-        yield Finding(place=place, problem=problem)
-    yield from _seal_findings(file, contents)
+def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Finding]:
     try:
+        text = read_text(file, DOCUMENT)
         record = record_of(file)
+        nodes = expected_nodes(record, text)
+        # Any: the reader has looked at its form.
+        document: Any = parse_json(text, f"/{DOCUMENT}")
+        contents = _contents(document)
     except RecordFormatError as error:
-        yield Finding(place="/", problem=str(error))
+        yield Finding(code="document", place=f"/{DOCUMENT}", problem=str(error))
         return
-    yield from _workflow_findings(file, record)
+    yield from _object_findings(file, record, nodes, contents)
+    yield from _content_findings(file, record, contents, with_arrays=with_arrays)
     yield from _run_findings(record)
     for entry in record.inputs:
-        yield from _input_findings(entry, contents)
+        yield from _input_findings(entry)
     yield from _published_findings(record)
     environments = {entry.id for entry in record.environments}
     outputs = {
@@ -124,125 +135,265 @@ def _findings(file: h5py.File) -> Iterator[Finding]:
     for cell in record.cells:
         yield from _cell_findings(cell, environments)
         yield from _reference_findings(cell, outputs)
-        yield from _product_findings(file, cell, contents)
 
 
-def _seal_findings(file: h5py.File, contents: ContentDigests) -> Iterator[Finding]:
+def _file_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
+    """Check the bytes of the file."""
+    n_bytes = bytes_behind_end(path)
+    if n_bytes:
+        how = f"{n_bytes} bytes stand behind" if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
+        yield Finding(code="appended", place="/", problem=f"{how} the end that the file states")
     try:
-        sealed = read_seal(file)
-        text = read_text(file, SEAL_DATASET)
-        content_sha256 = text_attribute(file, SEAL_ATTRIBUTE)
+        seal = read_text(file, SEAL)
+        offset = dataset_of(file, SEAL).id.get_offset()
     except RecordFormatError as error:
-        yield Finding(place=f"/{SEAL_DATASET}", problem=f"the seal is broken: {error}")
+        yield Finding(code="seal", place=f"/{SEAL}", problem=f"the seal is broken: {error}")
         return
-    if sha256_text(text) != content_sha256:
-        yield Finding(
-            place=f"/@{SEAL_ATTRIBUTE}",
-            problem=f"the content digest is {content_sha256}, the seal's is {sha256_text(text)}",
-        )
-    for place in sorted(sealed.keys() | contents.objects.keys()):
-        if place in contents.unreadable or place in contents.left_out:
+    found = "" if offset is None or len(seal) != 64 else file_sha256(path, offset)
+    if found != seal:
+        problem = f"the seal is {seal:.80}, the bytes of the file have the SHA-256 {found}"
+        yield Finding(code="seal", place=f"/{SEAL}", problem=f"{problem}: the file was changed")
+
+
+def _object_findings(
+    file: h5py.File, record: RunRecord, nodes: Mapping[str, Node], contents: Container[str]
+) -> Iterator[Finding]:
+    """Compare every object that is not named by digest with what the document says."""
+    places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
+    missing = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+    for path, item in _objects(file):
+        missing.discard(path)
+        _, top, *below = path.split("/")
+        is_known = path in nodes or path in {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+        if top == PRODUCTS and below:
+            is_known = below[0] in places and (
+                len(below) == 1 or below[1] in {"metadata", "arrays"}
+            )
+        elif top == FILES and below:
+            is_known = below[0] in contents
+        if not is_known:
+            yield Finding(
+                code="object", place=path, problem="is in the file, but not in the document"
+            )
             continue
-        if place not in contents.objects:
-            yield Finding(place=place, problem="sealed, but not in the file any more")
-        elif place not in sealed:
-            yield Finding(place=place, problem="in the file, but not sealed")
-        elif sealed[place] != contents.objects[place]:
-            yield Finding(place=place, problem="changed after the record was sealed")
+        node = nodes.get(path, Node(attributes={}))
+        is_product = top == PRODUCTS and len(below) == 1
+        try:
+            problem = next(_attribute_problems(item, node, is_product=is_product), "")
+            if not problem and node.data is not None:
+                problem = _data_problem(item, node.data)
+        except RecordFormatError as error:
+            problem = str(error)
+        if problem:
+            yield Finding(code="object", place=path, problem=problem)
+    for path in sorted(missing):
+        yield Finding(code="object", place=path, problem="is missing in the file")
 
 
-def _workflow_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
-    stated = text_attribute(file, "workflow_sha256")
-    actual = sha256_text(storable_text(record.workflow_source))
-    if stated != actual:
-        yield Finding(
-            place="/workflow/source",
-            problem=f"the workflow's text has the SHA-256 {actual}, the record says {stated}",
+def _attribute_problems(
+    item: h5py.Group | h5py.Dataset, node: Node, *, is_product: bool
+) -> Iterator[str]:
+    with reading(item.name):
+        if isinstance(item, h5py.Group) and item.id.get_create_plist().get_link_creation_order():
+            yield "keeps its links in an order of their own, which no record does"
+        expected = _PRODUCT_ATTRIBUTES if is_product else node.attributes.keys()
+        for name in sorted(expected ^ set(item.attrs)):
+            yield (
+                f"lacks the attribute {name!r}"
+                if name in expected
+                else (f"has the attribute {name!r}, which is not in the document")
+            )
+        for name in () if is_product else expected & set(item.attrs):
+            if not _is_same(np.asarray(item.attrs[name]), node.attributes[name]):
+                yield f"its attribute {name!r} is not what the document says"
+
+
+def _data_problem(item: h5py.Group | h5py.Dataset, data: NDArray[np.generic]) -> str:
+    if not isinstance(item, h5py.Dataset):
+        return "is a group in the place of a dataset"
+    if item.shape != data.shape or item.nbytes != data.nbytes:
+        return "is not what the document says"
+    found = np.asarray(read_whole(item))
+    return "" if _is_same(found, data) else "is not what the document says"
+
+
+def _is_same(found: NDArray[Any], expected: NDArray[Any]) -> bool:
+    if found.dtype.names is not None or expected.dtype.names is not None:
+        # Column by column, so that padding between the columns does not count.
+        return found.dtype.names == expected.dtype.names and all(
+            _is_same(found[name], expected[name]) for name in expected.dtype.names or ()
         )
-    try:
-        parse_json(record.workflow_resolved, "/workflow/resolved")
-    except RecordFormatError as error:
-        yield Finding(place="/workflow/resolved", problem=str(error))
+    kinds = (found.dtype.kind, found.dtype.itemsize, found.shape)
+    return kinds == (expected.dtype.kind, expected.dtype.itemsize, expected.shape) and (
+        found.astype(expected.dtype).tobytes() == expected.tobytes()
+    )
+
+
+def _objects(file: h5py.File) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
+    pending: list[tuple[str, h5py.Group | h5py.Dataset]] = [("/", file)]
+    while pending:
+        path, item = pending.pop()
+        yield path, item
+        if isinstance(item, h5py.Group):
+            with reading(path):
+                pending += [
+                    (f"{path.rstrip('/')}/{name}", item[name])
+                    for name in sorted(item, reverse=True)
+                ]
+
+
+def _embedded(record: RunRecord) -> dict[str, str]:
+    """Digest -> type of the products whose arrays lie in the record."""
+    return {
+        output.digest: output.type_name
+        for cell in record.cells
+        for output in cell.outputs.values()
+        if output.embedded and is_sha256(output.digest.removeprefix(DIGEST_PREFIX))
+    }
+
+
+def _contents(document: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
+    """SHA-256 -> what the bytes are of and how many, for all that a document has in `/files`."""
+    found: dict[str, tuple[str, int | None]] = {}
+    for cell in document["cells"]:
+        for figure in cell["figures"]:
+            found[figure["data"]] = (f"the figure {figure['name']!r} of {cell['address']}", None)
+    for entry in document["inputs"]:
+        for file in entry["files"] if entry["embedded"] else ():
+            found[file["sha256"]] = (file["name"], file["size_bytes"])
+    return found
+
+
+def _content_findings(
+    file: h5py.File,
+    record: RunRecord,
+    contents: Mapping[str, tuple[str, int | None]],
+    *,
+    with_arrays: bool,
+) -> Iterator[Finding]:
+    """Check what the document names by digest."""
+    for sha256, (name, size_bytes) in contents.items():
+        place = f"/{FILES}/{sha256}"
+        try:
+            dataset = dataset_of(open_group(file, FILES), sha256)
+            if (
+                dataset.dtype != np.uint8
+                or dataset.ndim != 1
+                or (size_bytes is not None and dataset.size != size_bytes)
+            ):
+                problem = f"does not hold the {size_bytes} bytes of {name}"
+            elif with_arrays or size_bytes is None:
+                found = dataset_sha256(dataset)
+                problem = "" if found == sha256 else f"does not hold the bytes of {name}"
+            else:
+                problem = ""
+        except RecordFormatError as error:
+            problem = str(error)
+        if problem:
+            yield Finding(code="file", place=place, problem=problem)
+    for digest in _embedded(record) if with_arrays else ():
+        place = product_path(digest)
+        try:
+            payload = read_payload(open_group(file, place), map_arrays=True)
+            found = payload_digest(payload)
+            if found != digest or payload.digest != digest:
+                problem = f"has the digest {found}, the record says {digest}"
+                yield Finding(code="product", place=place, problem=problem)
+        except RecordFormatError as error:
+            yield Finding(code="product", place=place, problem=str(error))
 
 
 def _run_findings(record: RunRecord) -> Iterator[Finding]:
     for name in ("run_id", "name", "created_by", "started", "ended", "workflow_source"):
         if not getattr(record, name):
-            yield Finding(place="/", problem=f"{name} must not be empty")
+            yield Finding(code="field", place="/", problem=f"{name} must not be empty")
     has_failed = any(cell.status == "failed" for cell in record.cells)
     if has_failed != (record.status == "failed"):
-        yield Finding(
-            place="/@status",
-            problem=f"the run is {record.status}, which does not fit the status of its cells",
-        )
+        problem = f"the run is {record.status}, which does not fit the status of its cells"
+        yield Finding(code="field", place="/@status", problem=problem)
+    try:
+        parse_json(record.workflow_resolved, "workflow_resolved")
+    except RecordFormatError as error:
+        yield Finding(code="field", place=f"/{DOCUMENT}", problem=str(error))
 
 
-def _input_findings(entry: RecordedInput, contents: ContentDigests) -> Iterator[Finding]:
-    place = f"/{layout.INPUTS}/{entry.name}"
-    for index, file in enumerate(entry.files):
+def _input_findings(entry: RecordedInput) -> Iterator[Finding]:
+    place = f"/inputs/{entry.name}"
+    for file in entry.files:
         if problem := name_problem(file.name):
-            yield Finding(place=place, problem=f"the name of the file {file.name!r} {problem}")
-        if not (_is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding(place=place, problem=f"the file {file.name!r} needs a size and a SHA-256")
-        if not entry.embedded:
-            continue
-        inside = f"{place}/{layout.INPUT_CONTENTS}/{content_name(index)}"
-        stated = ArrayFingerprint(dtype="|u1", shape=(file.size_bytes,), sha256=file.sha256)
-        if contents.arrays.get(inside) != stated:
-            yield Finding(place=inside, problem=f"does not hold the bytes of {file.name}")
+            yield Finding(
+                code="name", place=place, problem=f"the name of the file {file.name!r} {problem}"
+            )
+        if not (is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(
+                code="field",
+                place=place,
+                problem=f"the file {file.name!r} needs a size and a SHA-256",
+            )
 
 
 def _published_findings(record: RunRecord) -> Iterator[Finding]:
-    place = f"/{layout.PUBLISHED}"
+    place = "/published"
     for file in record.published:
         if problem := path_problem(file.path):
             yield Finding(
+                code="name",
                 place=place,
                 problem=f"{file.path!r} {problem}: it must be a path from the folder of the record",
             )
-        if not (_is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding(place=place, problem=f"the file {file.path!r} needs a size and a SHA-256")
+        if not (is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(
+                code="field",
+                place=place,
+                problem=f"the file {file.path!r} needs a size and a SHA-256",
+            )
     paths = [file.path for file in record.published]
     if twice := colliding(paths):
-        yield Finding(place=place, problem=f"{twice!r} is named twice, as some systems see it")
+        yield Finding(
+            code="name", place=place, problem=f"{twice!r} is named twice, as some systems see it"
+        )
 
 
 def _name_findings(record: RunRecord) -> Iterator[Finding]:
     """Check what folders and files of other programs are called after."""
     named = [("/@name", record.name), ("/@run_id", record.run_id)]
-    named += [(f"/{layout.INPUTS}/{entry.name}", entry.name) for entry in record.inputs]
+    named += [(f"/inputs/{entry.name}", entry.name) for entry in record.inputs]
     for cell in record.cells:
-        place = f"/{layout.CELLS}/{cell.address}"
-        named += [(place, _shortened(cell.address)), (f"{place}@step", cell.step)]
-        named += [(f"{place}/{layout.CELL_OUTPUTS}/{port}", port) for port in cell.outputs]
+        place = f"/{CELLS}/{cell.address}"
+        # Names of files cut the longest addresses.
+        named += [(place, cell.address[:_LETTERS_MOST]), (f"{place}@step", cell.step)]
+        named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
         yield from _figure_findings(cell)
     for place, name in named:
         # What must not be empty is said elsewhere.
         if name and (problem := name_problem(name)):
-            yield Finding(place=place, problem=f"{name!r} {problem}, so no file can be named so")
-
-
-def _shortened(address: str) -> str:
-    """An address as the names of files have it: they cut the longest ones, and add a digest."""
-    return address if len(address) <= _LETTERS_MOST else f"{address[:_LETTERS_MOST]}-"
+            yield Finding(
+                code="name", place=place, problem=f"{name!r} {problem}, so no file can be named so"
+            )
 
 
 def _figure_findings(cell: RecordedCell) -> Iterator[Finding]:
-    place = f"/{layout.CELLS}/{cell.address}/{layout.FIGURES}"
+    place = f"/{CELLS}/{cell.address}/figures"
     for figure in cell.figures:
         suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
         if not suffix:
             problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
-            yield Finding(place=place, problem=f"{problem}, not that of a PNG, WebP or SVG file")
+            yield Finding(
+                code="name", place=place, problem=f"{problem}, not that of a PNG, WebP or SVG file"
+            )
         if problem := name_problem(figure.name) or name_problem(f"{figure.name}{suffix}"):
-            yield Finding(place=place, problem=f"the name of the figure {figure.name!r} {problem}")
+            yield Finding(
+                code="name",
+                place=place,
+                problem=f"the name of the figure {figure.name!r} {problem}",
+            )
     if twice := colliding(figure.name for figure in cell.figures):
         problem = f"two figures are named {twice!r}, as some systems see it"
-        yield Finding(place=place, problem=problem)
+        yield Finding(code="field", place=place, problem=problem)
 
 
 def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Finding]:
-    place = f"/{layout.CELLS}/{cell.address}"
+    place = f"/{CELLS}/{cell.address}"
     required = ["step", "method"]
     if cell.status == "ok":
         required += ["key", "key_preimage", "started", "ended", "environment", "determinism"]
@@ -251,16 +402,23 @@ def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Findi
         required.append("error_message")
     for name in required:
         if not getattr(cell, name):
-            yield Finding(place=place, problem=f"{name} must not be empty ({cell.status} cell)")
+            yield Finding(
+                code="field", place=place, problem=f"{name} must not be empty ({cell.status} cell)"
+            )
     if cell.key and cell.key != sha256_text(cell.key_preimage):
-        yield Finding(place=f"{place}@key", problem="the key is not the SHA-256 of its preimage")
+        yield Finding(
+            code="key", place=f"{place}@key", problem="the key is not the SHA-256 of its preimage"
+        )
     if cell.environment and cell.environment not in environments:
         yield Finding(
-            place=f"{place}@environment", problem=f"there is no environment {cell.environment}"
+            code="reference",
+            place=f"{place}@environment",
+            problem=f"there is no environment {cell.environment}",
         )
     for metric in cell.metrics:
         if not math.isfinite(metric.value) or not metric.name or not metric.unit:
             yield Finding(
+                code="field",
                 place=f"{place}/metrics",
                 problem=f"the metric {metric.name!r} must be a finite number with a unit, got "
                 f"{metric.value} {metric.unit!r}",
@@ -268,56 +426,28 @@ def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Findi
     for cost in cost_metrics(cell):
         if not math.isfinite(cost.value) or cost.value < 0:
             problem = f"must not be negative, got {cost.value}"
-            yield Finding(place=f"{place}@{cost.name}", problem=problem)
+            yield Finding(code="field", place=f"{place}@{cost.name}", problem=problem)
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
     """Check that digests are digests and that an input is what its source gave."""
     for folder, products in (
-        (layout.CELL_INPUTS, cell.inputs),
-        (layout.CELL_OUTPUTS, cell.outputs),
+        ("inputs", cell.inputs),
+        ("outputs", cell.outputs),
     ):
         for port, product in products.items():
-            place = f"/{layout.CELLS}/{cell.address}/{folder}/{port}"
+            place = f"/{CELLS}/{cell.address}/{folder}/{port}"
             scheme, _, digits = product.digest.partition(":")
-            if scheme != "sha256" or not _is_sha256(digits):
-                yield Finding(place=place, problem=f"{product.digest!r} is no SHA-256 digest")
+            if scheme != "sha256" or not is_sha256(digits):
+                yield Finding(
+                    code="reference",
+                    place=place,
+                    problem=f"{product.digest!r} is no SHA-256 digest",
+                )
             if product.source and outputs.get(product.source, product.digest) != product.digest:
                 yield Finding(
+                    code="reference",
                     place=place,
                     problem=f"has the digest {product.digest}, but its source {product.source} "
                     f"gave {outputs[product.source]}",
                 )
-
-
-def _product_findings(
-    file: h5py.File, cell: RecordedCell, contents: ContentDigests
-) -> Iterator[Finding]:
-    for port, output in cell.outputs.items():
-        if not output.embedded:
-            continue
-        place = f"/{layout.CELLS}/{cell.address}/{layout.CELL_OUTPUTS}/{port}"
-        try:
-            digest = _product_digest(open_group(file, place), output, contents)
-        except RecordFormatError as error:
-            yield Finding(place=place, problem=str(error))
-            continue
-        if digest != output.digest:
-            yield Finding(
-                place=place, problem=f"has the digest {digest}, the record says {output.digest}"
-            )
-
-
-def _product_digest(group: h5py.Group, output: RecordedProduct, contents: ContentDigests) -> str:
-    arrays: dict[str, ArrayFingerprint] = {}
-    for name, _ in array_datasets(group):
-        path = f"{group.name}/arrays/{name}"
-        if path not in contents.arrays:
-            raise RecordFormatError(f"{path} cannot be digested, so {group.name} cannot either")
-        arrays[name] = contents.arrays[path]
-    metadata = read_json(group, "metadata")
-    return digest_of_parts(output.type_name, output.encoding_version, metadata, arrays)
-
-
-def _is_sha256(text: str) -> bool:
-    return len(text) == 64 and _HEX_DIGITS.issuperset(text)

@@ -4,7 +4,7 @@
 
 The methods are those of tests/workshop. What depends on the machine and the hour (environment,
 times, run ids) is replaced by constants, so that a record made again differs only where the format
-or the digest of the unreleased code does. Made once for each version of the format and then kept.
+or the digest of the unreleased code does.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ HERE: Final = Path(__file__).resolve().parent
 MINUTE: Final = "2026-01-02T03:04:"
 
 
-# Record -> its workflow, what is set, and whether everything lies in it. studio and comparison were
-# made with format 1.0, embedded with 1.1.
+# Record -> its workflow, what is set, and whether everything lies in it.
 RECORDS: Final = {
     "studio": ("studio", ("paint.grey=131",), False),
     "comparison": ("comparison", (), False),
@@ -31,8 +30,8 @@ RECORDS: Final = {
 
 def make(name: str) -> Path:
     """Run the workflow of a record and write the record beside it."""
-    from orthoflow_provenance.model import RecordedEnvironment
-    from orthoflow_provenance.writer import write_record
+    from orthoflow_provenance.document import RecordedEnvironment
+    from orthoflow_provenance.record import write_record
 
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run

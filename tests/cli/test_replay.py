@@ -10,10 +10,8 @@ from pathlib import Path
 
 import h5py
 import pytest
-from orthoflow_provenance.digests import canonical_json, sha256_text
-from orthoflow_provenance.model import RecordedCell
-from orthoflow_provenance.reader import read_record
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import RecordedCell, canonical_json, sha256_text
+from orthoflow_provenance.record import read_record, write_record
 
 from orthoflow.engine.store import Store
 from tests.studios import Studio, open_copy, open_finished_studio, open_studio
@@ -136,10 +134,11 @@ def test_an_unknown_input_is_an_argument_error(studio: Studio) -> None:
 def test_an_edited_parameter_is_named(studio: Studio) -> None:
     path = studio.folder / "first" / "run.h5"
     with h5py.File(path, "r+") as file:
-        cell = file["cells/survey"]
-        text = cell["params"][()].replace(b"2.0", b"3.0")
-        cell["params"][()] = text
-    assert "/cells/survey/params: changed after the record was sealed" in refused(studio)
+        params = file["cells/survey/params"]
+        rows = params[()]
+        rows["value"][0] = b"3.0"
+        params[...] = rows
+    assert "/cells/survey/params: is not what the document says" in refused(studio)
 
 
 def test_an_edited_parameter_is_named_under_a_new_seal_too(studio: Studio) -> None:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import h5py
 import pytest
-from orthoflow_provenance.model import RecordedFile, RecordedInput
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import RecordedFile, RecordedInput
+from orthoflow_provenance.record import write_record
 
 from orthoflow.cli import runs as module
 from orthoflow.report.browsing import Fact, RunSummary
-from tests.hostile_records import reseal, set_attribute
+from tests.hostile_records import reseal
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
 
@@ -209,7 +209,7 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     (runs / "torn").mkdir()
     (runs / "torn" / "run.h5").write_bytes((runs / "runs/a/run.h5").read_bytes()[:2000])
     hostile = write(runs / "hostile", 12, 0.02, 1.0)
-    reseal(hostile / "run.h5", lambda file: set_attribute(file, "name", "\x1b[2Jred"))
+    reseal(hostile / "run.h5", lambda record: record.document.update(name="\x1b[2Jred"))
     linked = write(runs / "linked", 13, 0.02, 1.0)
     with h5py.File(linked / "run.h5", "r+") as file:
         file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
@@ -249,7 +249,7 @@ def test_no_letter_in_a_name_begins_a_row_of_its_own(runs: Path, end: str) -> No
     set_name = f"court{end}=HYPERLINK(1)"
     reseal(
         runs / "runs" / "other" / "run.h5",
-        lambda file: set_attribute(file, "name", set_name),
+        lambda record: record.document.update(name=set_name),
     )
     rows = list(csv.reader(io.StringIO(said("runs", "--csv", "runs"), newline="")))
     assert [row[0] for row in rows] == [

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import pytest
 from click.testing import CliRunner
-from orthoflow_provenance.model import RecordedFile, RunRecord
+from orthoflow_provenance.document import RecordedFile, RunRecord
 from pydantic import Field
 
 from orthoflow.cli import plugins as plugins_commands

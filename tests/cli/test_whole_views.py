@@ -9,7 +9,7 @@ from typing import Any
 
 import h5py
 import pytest
-from orthoflow_provenance.reader import open_record
+from orthoflow_provenance.record import open_record
 
 from orthoflow.cli.plan import _as_json, _summary
 from orthoflow.cli.verify import _summary as verified

@@ -11,10 +11,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from orthoflow_provenance.encoding import write_text
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.layout import PUBLISHED
-from orthoflow_provenance.seal import seal_file
+from orthoflow_provenance.document import RecordFormatError
+from orthoflow_provenance.hdf5 import fixed_text, write_array
+
+from tests import hostile_records as hostile
 
 TEXTS = (
     *(
@@ -78,11 +78,7 @@ def damage_structure(path: Path, random: Random) -> None:
         if sum(item.nbytes for item in datasets(file)) > 1 << 30:
             # Digesting what is not there would take longer than all else; nobody opens it.
             return
-        for name in {"seal"} & set(file):
-            del file[name]
-        for name in {"content_sha256"} & set(file.attrs):
-            del file.attrs[name]
-        seal_file(file)
+        hostile.seal(file)
 
 
 def objects(file: h5py.File) -> list[Any]:
@@ -125,7 +121,7 @@ def change_dataset(file: h5py.File, random: Random) -> None:
     if kind == 0:
         return
     if kind == 1:
-        write_text(parent, name, random.choice(TEXTS))
+        write_array(parent, name, fixed_text(random.choice(TEXTS)))
     elif kind == 2:
         shape = random.choice(((0,), (1 << 22,), (1 << 26,), (1 << 16, 1 << 10), (1 << 40,)))
         chunks = tuple(min(4096, length) or 1 for length in shape)
@@ -136,7 +132,7 @@ def change_dataset(file: h5py.File, random: Random) -> None:
         )
         parent.create_dataset(name, data=values)
     elif kind == 4 and isinstance(content, bytes):
-        write_text(parent, name, changed_json(content, random))
+        write_array(parent, name, fixed_text(changed_json(content, random)))
     elif kind == 5 and isinstance(content, np.ndarray) and content.dtype.names and content.size:
         column = random.choice(content.dtype.names)
         is_text = content.dtype[column].kind == "S"
@@ -183,32 +179,35 @@ def remove(file: h5py.File, random: Random) -> None:
     del file[random.choice(objects(file)[1:]).name]
 
 
+def change_document(file: h5py.File, random: Random) -> None:
+    """Exchange something in the document, and let what repeats it fit where it can."""
+    hostile.rewrite(file, changed_json(file["document"][()], random))
+
+
 def flood(file: h5py.File, random: Random) -> None:
     """Many small things that unpack to much."""
-    cell = random.choice(sorted(file["cells"]))
-    figures = file["cells"][cell]["figures"]
     for index in range(40):
-        figure = figures.create_dataset(
-            f"{index:04}", (1 << 24,), np.uint8, chunks=(1 << 20,), compression="gzip"
+        data = file["files"].create_dataset(
+            f"{index:064}", (1 << 24,), np.uint8, chunks=(1 << 20,), compression="gzip"
         )
         if index % 8 == 0:
-            figure[: 1 << 20] = np.uint8(1)
-        for name, text in (("name", f"n{index}"), ("caption", ""), ("media_type", "image/png")):
-            figure.attrs[name] = np.bytes_(text.encode() or b"\0")
+            data[: 1 << 20] = np.uint8(random.randrange(1, 9))
 
 
 def publish(file: h5py.File, random: Random) -> None:
-    rows = np.array(
-        [(random.choice(TEXTS).encode(), random.choice(NUMBERS[:6]), b"0" * 64) for _ in range(3)],
-        dtype=[("path", "S320"), ("size_bytes", "<i8"), ("sha256", "S64")],
-    )
-    del file[PUBLISHED]
-    file.create_dataset(PUBLISHED, data=rows)
+    document = json.loads(file["document"][()])
+    document["published"] = [
+        {"path": random.choice(TEXTS), "size_bytes": random.choice((0, -1, 7)), "sha256": "0" * 64}
+        for _ in range(3)
+    ]
+    hostile.rewrite(file, json.dumps(document))
 
 
 CHANGES: tuple[Callable[[h5py.File, Random], None], ...] = (
     *(change_attribute,) * 4,
     *(change_dataset,) * 5,
-    *(rename, copy, remove, publish),
+    *(rename, copy, remove),
+    *(change_document,) * 8,
+    publish,
     flood,
 )

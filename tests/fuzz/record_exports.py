@@ -17,9 +17,8 @@ from random import Random
 from typing import Any, Final
 
 import numpy as np
-from orthoflow_provenance.digests import sha256_text
-from orthoflow_provenance.model import RecordedProduct
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import RecordedProduct, sha256_text
+from orthoflow_provenance.record import write_record
 
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (

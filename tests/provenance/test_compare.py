@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_provenance.compare import ArrayDifference, Tolerances, measure_payloads
-from orthoflow_provenance.model import JsonValue, PayloadLike
+from orthoflow_provenance.arrays import ArrayDifference, Tolerances, measure_payloads
+from orthoflow_provenance.document import JsonValue, PayloadLike
 
 from tests.provenance_records import Given, walls_payload
 

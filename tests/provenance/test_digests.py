@@ -12,10 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from orthoflow_provenance.blocks import BLOCK_BYTES, block_indices
-from orthoflow_provenance.digests import canonical_json, payload_digest
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.payloads import StoredPayload
+from orthoflow_provenance.arrays import BLOCK_BYTES, StoredPayload, block_indices, payload_digest
+from orthoflow_provenance.document import RecordFormatError, canonical_json
 
 from tests.provenance_records import Given
 

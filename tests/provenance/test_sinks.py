@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance import sinks
-from orthoflow_provenance.sinks import FileSink, create_file
+from orthoflow_provenance import hdf5 as sinks
+from orthoflow_provenance.hdf5 import FileSink, create_file
 
 KIB = 1 << 10
 

@@ -17,7 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from orthoflow_provenance.model import RecordedFigure
+from orthoflow_provenance.document import RecordedFigure
 
 from orthoflow.errors import RecordError
 from orthoflow.files.images import encode_png

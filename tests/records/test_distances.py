@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from orthoflow_provenance.compare import ArrayDifference
+from orthoflow_provenance.arrays import ArrayDifference
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
@@ -151,25 +151,13 @@ def test_a_value_in_a_list_is_told_by_its_name_and_unit() -> None:
     assert told(unit="mm") == ("findings/1/value", "1")
 
 
-def test_of_two_encodings_what_both_state_is_compared() -> None:
-    older = payload(1, {"a": 1, "b": {"c": 2, "d": 3}, "e": [{"f": 1}, {"f": 2, "g": 3}]}, n=[1])
-    newer = payload(2, {"b": {"c": 9, "x": 1}, "e": [{"f": 5}, {"f": 6}], "y": 0}, n=[1], m=[2])
-    ours, theirs = module._common(older, newer)
-    assert ours.metadata == {"b": {"c": 2}, "e": [{"f": 1}, {"f": 2}]}
-    assert theirs.metadata == {"b": {"c": 9}, "e": [{"f": 5}, {"f": 6}]}
-    assert list(ours.arrays) == list(theirs.arrays) == ["n"]
-    # Of lists that are not as long nothing fits the other.
-    assert module._shared([1, 2], [1]) == [1, 2]
-    assert module._shared({"a": 1}, [1]) == {"a": 1}
-
-
 def difference(name: str, unit: str, largest: float, n_values: int) -> ArrayDifference:
     one = compared_differences()[0]
     return replace(one, name=name, unit=unit, largest=largest, n_values=n_values, limit=0.5)
 
 
 def compared_differences() -> list[ArrayDifference]:
-    from orthoflow_provenance.compare import measure_payloads
+    from orthoflow_provenance.arrays import measure_payloads
 
     return list(measure_payloads(payload(n=[1]), payload(n=[2]), {"n": (0.0, "1")}))
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
-from orthoflow_provenance.encoding import write_table, write_text, write_texts
 
 from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.records.verification import verify_run
@@ -54,18 +54,18 @@ def everything(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if not path.is_relative_to(folder / "x/y/z")}
 
 
-def rename_step(file: h5py.File, name: str) -> None:
-    hostile.set_attribute(file["cells/survey"], "step", name)
+def rename_step(record: hostile.Record, name: str) -> None:
+    record.cell("survey")["step"] = name
 
 
-def name_run(file: h5py.File, name: str) -> None:
-    hostile.set_attribute(file, "name", name)
+def name_run(record: hostile.Record, name: str) -> None:
+    record.document["name"] = name
 
 
-NAMED: dict[str, Callable[[h5py.File, str], None]] = {
-    "figure": lambda file, name: hostile.add_figure(file["cells/paint"], name),
-    "input file": lambda file, name: hostile.rename_files(file, "number", name),
-    "published file": hostile.name_published,
+NAMED: dict[str, Callable[[hostile.Record, str], None]] = {
+    "figure": lambda record, name: record.add_figure("paint", name),
+    "input file": lambda record, name: record.rename_files("number", name),
+    "published file": lambda record, name: record.name_published(name),
     "step": rename_step,
     "run": name_run,
 }
@@ -76,7 +76,9 @@ def test_names_that_lead_elsewhere_are_found_and_nothing_is_written_there(
     finished: Studio, folder: Path, tmp_path: Path, what: str
 ) -> None:
     run = hostile.changed(
-        finished.folder / "first", folder / "run", lambda file: NAMED[what](file, "../../../out")
+        finished.folder / "first",
+        folder / "run",
+        lambda record: NAMED[what](record, "../../../out"),
     )
     before = everything(tmp_path)
     done = finished("verify", run)
@@ -97,7 +99,7 @@ def test_every_impossible_name_is_a_finding(finished: Studio, folder: Path, what
         run = hostile.changed(
             finished.folder / "first",
             folder / str(index),
-            lambda file, name=name: NAMED[what](file, name),  # type: ignore[misc]
+            lambda record, name=name: NAMED[what](record, name),  # type: ignore[misc]
         )
         assert verify_run(run).findings, name
 
@@ -107,7 +109,7 @@ def test_figures_with_impossible_names_are_not_written(
     finished: Studio, folder: Path, name: str
 ) -> None:
     run = hostile.changed(
-        finished.folder / "first", folder / "run", lambda file: NAMED["figure"](file, name)
+        finished.folder / "first", folder / "run", lambda record: NAMED["figure"](record, name)
     )
     (run / "report.html").unlink()
     for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
@@ -122,11 +124,11 @@ def test_figures_with_impossible_names_are_not_written(
 def test_a_cell_that_no_path_can_name_is_refused_whatever_is_asked(
     finished: Studio, folder: Path, name: str
 ) -> None:
-    def rename(file: h5py.File) -> None:
+    run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
+    with h5py.File(run / "run.h5", "r+") as file:
         cells = file["cells"].id
         cells.links.move(b"paint", cells, name.encode())
-
-    run = hostile.changed(finished.folder / "first", folder / "run", rename)
+        hostile.seal(file)
     for command in (("verify",), *COMMANDS):
         done = finished(command[0], run, *command[1:])
         assert done.exit_code == 3, (command, done.output)
@@ -137,9 +139,9 @@ def test_a_cell_that_no_path_can_name_is_refused_whatever_is_asked(
 def test_figures_that_some_systems_take_for_one_are_not_laid_over_each_other(
     finished: Studio, folder: Path
 ) -> None:
-    def draw(file: h5py.File) -> None:
+    def draw(record: hostile.Record) -> None:
         for name in ("depth", "Depth"):
-            hostile.add_figure(file["cells/paint"], name)
+            record.add_figure("paint", name)
 
     run = hostile.changed(finished.folder / "first", folder / "run", draw)
     for command in (("verify", run), ("export", run, "--to", "figures"), ("report", run)):
@@ -155,8 +157,8 @@ def test_links_and_devices_beside_a_record_are_not_followed(
     secret = tmp_path / "secret.txt"
     secret.write_text("secret")
 
-    def publish(file: h5py.File) -> None:
-        hostile.name_published(file, "products/paint/a", "products/paint/b", "products/paint/c")
+    def publish(record: hostile.Record) -> None:
+        record.name_published("products/paint/a", "products/paint/b", "products/paint/c")
 
     run = hostile.changed(finished.folder / "first", folder / "run", publish)
     (run / "products" / "paint" / "a").symlink_to("/dev/zero")
@@ -182,7 +184,7 @@ def test_links_and_devices_beside_a_record_are_not_followed(
 def test_a_folder_of_products_elsewhere_is_not_followed(
     finished: Studio, folder: Path, tmp_path: Path
 ) -> None:
-    run = hostile.changed(finished.folder / "first", folder / "run", lambda file: None)
+    run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
     (run / "products").rename(tmp_path / "elsewhere")
     (run / "products").symlink_to(tmp_path / "elsewhere")
     done = finished("verify", run)
@@ -192,7 +194,7 @@ def test_a_folder_of_products_elsewhere_is_not_followed(
 
 
 def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> None:
-    run = hostile.changed(finished.folder / "first", folder / "run", lambda file: None)
+    run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
     path = run / "products" / "metrics.csv"
     os.truncate(path, 1 << 40)
     before = os.times()
@@ -230,7 +232,7 @@ def test_folders_in_a_run_that_are_links_are_not_written_through(
     run = hostile.changed(
         finished.folder / "first",
         folder / "run",
-        lambda file: hostile.add_figure(file["cells/paint"], "depth"),
+        lambda record: record.add_figure("paint", "depth"),
     )
     shutil.rmtree(run / link, ignore_errors=True)
     (run / link).parent.mkdir(exist_ok=True)
@@ -274,15 +276,12 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
     evil = "\x1b]0;title\x07\x9b2J\u202e\r\nverified: 9 products, seal ok"
     written = "\\x1b]0;title\\x07\\x9b2J\\u202e\\r\\nverified: 9 products, seal ok"
 
-    def write(file: h5py.File) -> None:
-        hostile.set_attribute(file, "name", f"name {evil}")
-        hostile.set_text(file["cells/paint"], "log", evil)
-        del file["cells/paint"]["citations"]
-        write_texts(file["cells/paint"], "citations", [f"citations {evil}"])
+    def write(record: hostile.Record) -> None:
+        record.document["name"] = f"name {evil}"
         told = PLAIN_WARNING.of("", {"text": ""})
         row = {**dataclasses.asdict(told), "text": f"warnings {evil}", "settled_by": []}
-        write_text(file["cells/paint"], "diagnostics", json.dumps([row]))
-        hostile.add_figure(file["cells/paint"], f"figure {evil}")
+        record.cell("paint").update(log=evil, diagnostics=[row], citations=[f"citations {evil}"])
+        record.add_figure("paint", f"figure {evil}")
 
     run = hostile.changed(finished.folder / "first", folder / "run", write)
     done = finished("show", run)
@@ -303,12 +302,11 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
 
 
 def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path) -> None:
-    def write(file: h5py.File) -> None:
-        rows = [("=HYPERLINK(1)", -1.5, "@unit"), ("plain", 2.0, "1")]
-        del file["cells/paint/metrics"]
-        write_table(
-            file["cells/paint"], "metrics", (("name", str), ("value", float), ("unit", str)), rows
-        )
+    def write(record: hostile.Record) -> None:
+        record.cell("paint")["metrics"] = [
+            {"name": name, "value": value, "unit": unit, "label": "", "better": ""}
+            for name, value, unit in (("=HYPERLINK(1)", -1.5, "@unit"), ("plain", 2.0, "1"))
+        ]
 
     run = hostile.changed(finished.folder / "first", folder / "run", write)
     assert finished("export", run, "--to", "csv", "-o", "csv").exit_code == 0
@@ -318,8 +316,8 @@ def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path
 
 
 def test_halves_of_letters_are_written_as_json_has_them(finished: Studio, folder: Path) -> None:
-    def write(file: h5py.File) -> None:
-        hostile.set_text(file["cells/paint"], "params", '{"odd": "a\\ud800"}')
+    def write(record: hostile.Record) -> None:
+        record.cell("paint")["params"] = {"odd": "a\ud800"}
 
     run = hostile.changed(finished.folder / "first", folder / "run", write)
     for target in ("csv", "prov", "ro-crate"):
@@ -330,9 +328,9 @@ def test_halves_of_letters_are_written_as_json_has_them(finished: Studio, folder
 
 
 def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folder: Path) -> None:
-    def draw(file: h5py.File) -> None:
-        hostile.add_figure(file["cells/paint"], "good")
-        hostile.add_figure(file["cells/paint"], "bad", "image/webp")
+    def draw(record: hostile.Record) -> None:
+        record.add_figure("paint", "good")
+        record.add_figure("paint", "bad", "image/webp")
 
     run = hostile.changed(finished.folder / "first", folder / "run", draw)
     done = finished("export", run, "--to", "figures", "-o", "drawn")
@@ -349,7 +347,7 @@ def test_drawings_that_run_something_are_not_written(
     run = hostile.changed(
         finished.folder / "first",
         folder / "run",
-        lambda file: hostile.add_figure(file["cells/paint"], "active", "image/svg+xml"),
+        lambda record: record.add_figure("paint", "active", "image/svg+xml"),
     )
     (run / "report.html").unlink()
     for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
@@ -364,13 +362,13 @@ def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
 ) -> None:
     shutil.copytree(finished.folder / "first", folder / "run")
     with h5py.File(folder / "run" / "run.h5", "r+") as file:
-        hostile.set_text(file["cells/paint"], "key_preimage", "{")
+        file["cells/paint"].attrs["method"] = np.bytes_("other")
     # Nothing there reads the preimage, so let something fail in its place.
     monkeypatch.setattr("orthoflow.records.runs.open_run", lambda _: {}["missing"])
     runs = (finished.folder / "first", folder / "run") if command[0] == "compare" else ("run",)
     done = finished(command[0], *runs)
     assert done.exit_code == 3, done.output
-    assert "is not as it was written: /cells/paint/key_preimage: changed after" in done.output
+    assert "is not as it was written: /cells/paint: its attribute" in done.output
     done = finished(command[0], *[finished.folder / "first"] * len(runs))
     assert done.exit_code == 1
     assert "orthoflow itself failed" in done.output
@@ -394,7 +392,7 @@ def test_odd_facts_under_a_key_of_their_own_change_no_replay(
     run = hostile.changed(
         finished.folder / "first",
         folder / "run",
-        lambda file: hostile.rewrite_preimage(file["cells/paint"], **facts),
+        lambda record: record.rewrite_preimage("paint", **facts),
     )
     assert verify_run(run).findings == ()
     done = finished("replay", run, "-o", "again")
@@ -414,7 +412,7 @@ def test_a_key_of_a_preimage_that_says_nothing_is_refused(
     run = hostile.changed(
         finished.folder / "first",
         folder / "run",
-        lambda file: hostile.exchange_preimage(file["cells/paint"], text),
+        lambda record: record.exchange_preimage("paint", text),
     )
     done = finished("replay", run, "-o", "again")
     assert done.exit_code == 3, done.output
@@ -423,10 +421,9 @@ def test_a_key_of_a_preimage_that_says_nothing_is_refused(
     assert not Path("again").exists()
 
 
-def add_cell_parameters(file: h5py.File, **params: object) -> None:
-    cell = file["cells/paint"]
-    hostile.rewrite_preimage(cell, params=params)
-    hostile.set_text(cell, "params", json.dumps(params))
+def add_cell_parameters(record: hostile.Record, **params: object) -> None:
+    record.rewrite_preimage("paint", params=params)
+    record.cell("paint")["params"] = params
 
 
 @pytest.mark.parametrize(
@@ -443,7 +440,9 @@ def test_parameters_that_fit_their_key_and_not_their_method_are_refused(
     finished: Studio, folder: Path, params: dict[str, object], refused: str
 ) -> None:
     run = hostile.changed(
-        finished.folder / "first", folder / "run", lambda file: add_cell_parameters(file, **params)
+        finished.folder / "first",
+        folder / "run",
+        lambda record: add_cell_parameters(record, **params),
     )
     assert verify_run(run).findings == ()
     done = finished("replay", run, "-o", "again")
@@ -461,7 +460,7 @@ def test_a_cell_that_nothing_leads_to_is_refused(
     run = hostile.changed(
         finished.folder / "first",
         folder / "run",
-        lambda file: hostile.set_attribute(file["cells/paint/in/planes"], "source", source),
+        lambda record: record.cell("paint")["inputs"]["planes"].update(source=source),
     )
     done = finished("replay", run, "-o", "again")
     assert done.exit_code == 3, done.output
@@ -471,14 +470,11 @@ def test_a_cell_that_nothing_leads_to_is_refused(
 
 def test_cells_that_lead_to_one_another_are_refused(finished: Studio, folder: Path) -> None:
     # Every digest fits: a cell that is made of what it gives itself.
-    def close(file: h5py.File) -> None:
-        cell = file["cells/paint"]
-        given = cell["in/planes"]
-        own = cell["out"].create_group("planes")
-        for name in given.attrs:
-            own.attrs[name] = given.attrs[name]
-        hostile.set_attribute(own, "source", "")
-        hostile.set_attribute(given, "source", "paint.planes")
+    def close(record: hostile.Record) -> None:
+        cell = record.cell("paint")
+        given = cell["inputs"]["planes"]
+        cell["outputs"]["planes"] = {**given, "source": ""}
+        given["source"] = "paint.planes"
 
     run = hostile.changed(finished.folder / "first", folder / "run", close)
     assert verify_run(run).findings == ()

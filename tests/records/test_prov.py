@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from orthoflow_provenance.model import RunRecord
+from orthoflow_provenance.document import RunRecord
 from prov.model import (
     ProvActivity,
     ProvAgent,

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance import reader
-from orthoflow_provenance.model import (
+from orthoflow_provenance import record as reader
+from orthoflow_provenance.arrays import write_product_file
+from orthoflow_provenance.document import (
     Metric,
     RecordedCell,
     RecordedFigure,
@@ -20,8 +21,7 @@ from orthoflow_provenance.model import (
     RecordedProduct,
     RunRecord,
 )
-from orthoflow_provenance.payloads import write_product_file
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.record import write_record
 
 import orthoflow
 from orthoflow.engine.run_folder import cell_file_name
@@ -282,7 +282,7 @@ def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path
         "x.csv": "b x.csv",
         "b_2_X.csv": "b X.csv",
         "b_metrics.csv": "b metrics.csv",
-        "metrics.csv": "cell,step,method,met",
+        "metrics.csv": '"cell","step","metho',
     }
     assert len(published) == 7
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from orthoflow_provenance.model import Metric
+from orthoflow_provenance.document import Metric
 
 from orthoflow.records.distances import ProductDistance, Verdict
 from orthoflow.records.replay_metrics import ReplayedMetric, replayed_metrics

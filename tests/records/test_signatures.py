@@ -140,9 +140,7 @@ def test_the_signature_of_another_record_does_not_fit(finished: Studio, run: Pat
 
 def test_a_record_that_was_changed_and_sealed_again_is_noticed(finished: Studio, run: Path) -> None:
     finished("sign", run, "--key", "jane")
-    hostile.reseal(
-        run / "run.h5", lambda file: hostile.set_text(file["cells/paint"], "log", "nothing wrong")
-    )
+    hostile.reseal(run / "run.h5", lambda record: record.cell("paint").update(log="nothing wrong"))
     assert finished("verify", run).exit_code == 0
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3

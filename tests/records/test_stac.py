@@ -9,7 +9,7 @@ import numpy as np
 import pystac
 import pytest
 import rasterio
-from orthoflow_provenance.model import PublishedFile
+from orthoflow_provenance.document import PublishedFile
 from pystac.validation import RegisteredValidator
 
 from orthoflow.errors import ArgumentError

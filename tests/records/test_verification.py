@@ -206,7 +206,7 @@ def test_a_record_without_a_signature_has_nothing_said_of_it(
         ),
         (
             {"format": np.bytes_("orthoflow-run"), "format_version": np.bytes_("2.0")},
-            "x.h5 has format version 2.0, this program reads version ",
+            "x.h5 has format version '2.0', this program reads version ",
         ),
         # What a later version writes may be outside this one's format.
         (
@@ -215,7 +215,7 @@ def test_a_record_without_a_signature_has_nothing_said_of_it(
                 "format_version": np.bytes_("2.0"),
                 "creator": "C",
             },
-            "x.h5 has format version 2.0, this program reads version ",
+            "x.h5 has format version '2.0', this program reads version ",
         ),
     ],
 )

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from orthoflow_provenance.model import RecordedFile, RecordedInput
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import RecordedFile, RecordedInput
+from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import ArgumentError
 from orthoflow.report import browsing as module

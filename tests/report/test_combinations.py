@@ -129,7 +129,7 @@ def test_errors_of_both_signs_are_averaged_by_their_sizes(monkeypatch: pytest.Mo
     def found(metric: str, *values: float) -> Any:
         def rows(of: Any) -> list[Any]:
             value = values[of.repeat]
-            return [SimpleNamespace(metric=metric, value=value, unit="mm", words="")]
+            return [SimpleNamespace(metric=metric, value=value, unit="mm", label="")]
 
         monkeypatch.setattr(combinations, "cell_metrics", rows)
         cells = tuple(cell("plane", repeat=repeat) for repeat in range(len(values)))
@@ -151,7 +151,7 @@ def test_the_photos_behind_a_summary_are_counted_in_its_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def rows(_: Any) -> list[Any]:
-        return [SimpleNamespace(metric="n_oriented", value=2.0, unit="1", words="")]
+        return [SimpleNamespace(metric="n_oriented", value=2.0, unit="1", label="")]
 
     monkeypatch.setattr(combinations, "cell_metrics", rows)
     one = Combination(run=run(), assignment={}, cells=(cell("orient"),), is_baseline=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.errors import StoreError
 from orthoflow.records.datasets import datasets_of, parts_of

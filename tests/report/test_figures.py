@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance.model import RecordedCell, RecordedFigure
+from orthoflow_provenance.document import RecordedCell, RecordedFigure
 
 from orthoflow.files.images import decode_image, encode_png, encode_webp
 from orthoflow.report import figures as module

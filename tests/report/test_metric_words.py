@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from orthoflow_provenance.model import Metric
+from orthoflow_provenance.document import Metric
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.records.metrics import cell_metrics
@@ -92,13 +92,13 @@ def test_a_stranger_names_metrics_and_their_good_side(tmp_path: Path) -> None:
             f"damp@damp={name}",
             method="damp.simple",
             metrics=(
-                Metric(name="n_patches", value=3.0, unit="1", words="damp patches"),
+                Metric(name="n_patches", value=3.0, unit="1", label="damp patches"),
                 Metric(
                     name="damp_share",
                     value=share,
                     unit="1",
-                    words="damp",
-                    good="less",
+                    label="damp",
+                    better="lower",
                 ),
                 Metric(name="rms_mm", value=share, unit="mm"),
             ),
@@ -121,6 +121,6 @@ def test_a_stranger_names_metrics_and_their_good_side(tmp_path: Path) -> None:
 
 def test_a_good_side_that_nobody_knows_is_none() -> None:
     row = cell_metrics(
-        cell("damp", metrics=(Metric(name="a_mm", value=1.0, unit="mm", words="a", good="odd"),))
+        cell("damp", metrics=(Metric(name="a_mm", value=1.0, unit="mm", label="a", better="odd"),))
     )[0]
     assert sense_of("a_mm", row) is Sense.NEITHER

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from orthoflow_provenance.model import RecordedFigure, RecordedProduct
-from orthoflow_provenance.writer import write_record
+from orthoflow_provenance.document import RecordedFigure, RecordedProduct
+from orthoflow_provenance.record import write_record
 
 import orthoflow
 from orthoflow.engine.store import Store

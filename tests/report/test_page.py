@@ -10,7 +10,7 @@ from pathlib import Path
 
 import axe_core_python
 import pytest
-from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
+from orthoflow_provenance.document import Metric, RecordedCell, RecordedFigure
 
 from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from markupsafe import Markup
-from orthoflow_provenance.model import Metric, PublishedFile, RecordedCell, RecordedInput
+from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell, RecordedInput
 
 from orthoflow.errors import StoreError
 from orthoflow.products import CheckPoints
@@ -507,8 +507,8 @@ def test_whether_a_detector_found_what_there_is_has_columns_without_being_asked(
 
 
 def test_what_a_stranger_calls_good_is_told_first() -> None:
-    dent = Metric(name="dent_share", value=0.25, unit="1", words="share of dents", good="less")
-    other = Metric(name="n_dents", value=7.0, unit="1", words="dents")
+    dent = Metric(name="dent_share", value=0.25, unit="1", label="share of dents", better="lower")
+    other = Metric(name="n_dents", value=7.0, unit="1", label="dents")
     cells = [
         cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6)),
         cell("dent", method="dent.simple", metrics=(dent, other)),

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from orthoflow_provenance.model import RecordedFile
+from orthoflow_provenance.document import RecordedFile
 
 from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
 from orthoflow.records.distances import Distance

@@ -14,7 +14,7 @@ import pdfplumber
 import pytest
 from click import BadParameter
 from click.testing import CliRunner, Result
-from orthoflow_provenance.model import PublishedFile
+from orthoflow_provenance.document import PublishedFile
 from PIL import Image
 
 from orthoflow.cli.export import export as command

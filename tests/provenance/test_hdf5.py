@@ -11,17 +11,20 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from orthoflow_provenance import safe
-from orthoflow_provenance.encoding import read_texts, set_attributes
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import RUN_FORMAT, RUN_FORMAT_VERSION
-from orthoflow_provenance.reader import open_record
-from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance import hdf5
+from orthoflow_provenance.document import (
+    FORMAT_VERSION,
+    RUN_FORMAT,
+    LockedFileError,
+    RecordFormatError,
+)
+from orthoflow_provenance.hdf5 import read_whole, safe_open, set_attributes
+from orthoflow_provenance.record import open_record
 from orthoflow_provenance.verify import verify_record
 
 SECRET = np.arange(5.0)
 # Of files that do not say that they are records, nothing else is said.
-NAMED = {"format": RUN_FORMAT, "format_version": RUN_FORMAT_VERSION}
+NAMED = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION}
 
 
 def external_link(file: h5py.File) -> None:
@@ -190,7 +193,7 @@ def test_forbidden_files_are_refused_with_a_sentence(
     path = tmp_path / "stranger.h5"
     with h5py.File(path, "w", libver=("v110", "v110")) as file:
         make(file)
-        set_attributes(file, NAMED)
+        set_attributes(file, **NAMED)
     with pytest.raises(RecordFormatError) as refusal, safe_open(path):
         pass
     assert str(refusal.value).startswith("stranger.h5")
@@ -233,24 +236,6 @@ def test_files_that_are_not_hdf5_are_refused_with_a_sentence(tmp_path: Path) -> 
         pass
 
 
-def test_notes_may_be_written_as_h5py_does_by_itself(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file["notes/first"] = "text of variable length"
-        file["notes"].attrs["author"] = "A. Nother"
-    with safe_open(path) as file:
-        assert list(file["notes"]) == ["first"]
-
-
-def test_notes_may_not_lead_out_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file.create_group("notes")["a"] = h5py.ExternalLink("secret.h5", "/")
-        set_attributes(file, NAMED)
-    with pytest.raises(RecordFormatError, match="is a link into another file"), safe_open(path):
-        pass
-
-
 def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
@@ -279,11 +264,11 @@ def test_more_objects_than_any_record_has_are_refused(
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for index in range(10):
             file.create_group(str(index)).attrs["a"] = index
-        set_attributes(file, NAMED)
-    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 23)
+        set_attributes(file, **NAMED)
+    monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 23)
     with safe_open(tmp_path / "a.h5"):
         pass
-    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 22)
+    monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 22)
     refused = pytest.raises(RecordFormatError, match="more than 22 groups and attributes")
     with refused, safe_open(tmp_path / "a.h5"):
         pass
@@ -297,16 +282,8 @@ def test_tables_and_texts_that_unpack_to_much_are_not_read(tmp_path: Path) -> No
         file.create_dataset("plain", data=rows[:1000], chunks=(1000,), compression=9)
     with safe_open(path) as file:
         with pytest.raises(RecordFormatError, match=r"/packed unpacks to 5242880 bytes: texts, ta"):
-            read_texts(file, "packed")
-        assert read_texts(file, "plain") == ("",) * 1000
-
-
-def test_names_in_notes_are_nobodys_business(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file.create_group("notes/a\x1b")
-    with safe_open(path) as file:
-        assert list(file["notes"]) == ["a\x1b"]
+            read_whole(file["packed"])
+        assert np.shape(read_whole(file["plain"])) == (1000,)
 
 
 def inspected(folder: Path, n_bytes: int, *sizes: tuple[int, int]) -> None:
@@ -315,7 +292,7 @@ def inspected(folder: Path, n_bytes: int, *sizes: tuple[int, int]) -> None:
     with path.open("wb") as file:
         file.truncate(n_bytes)
     nothing: Any = None
-    inspection = safe._Inspection(nothing, path)
+    inspection = hdf5._Inspection(nothing, path)
     for declared, stored in sizes:
         dataset: Any = SimpleNamespace(shape=(declared,), get_storage_size=lambda n=stored: n)
         inspection._check_size(dataset, 1, "/x")
@@ -336,3 +313,61 @@ def test_compression_saves_no_more_than_it_can(tmp_path: Path) -> None:
     inspected(tmp_path, 10**6, (1 << 26, 0))
     with pytest.raises(RecordFormatError, match="have more than 64 MiB that the file cannot hold"):
         inspected(tmp_path, 10**6, (1 << 25, 0), (1 << 25, 0), (1, 0))
+
+
+MIB = 1 << 20
+
+
+def groups(file: h5py.File, over: int) -> None:
+    file.create_group("/".join("g" * (32 + over)))
+
+
+def attribute(file: h5py.File, over: int) -> None:
+    file.attrs["a"] = np.zeros(MIB + over, np.uint8)
+
+
+def chunk(file: h5py.File, over: int) -> None:
+    file.create_dataset("a", (1,), np.uint8, maxshape=(None,), chunks=(64 * MIB + over,))
+
+
+def unpacked(file: h5py.File, over: int) -> None:
+    file.create_dataset("a", (64 * MIB + over,), np.uint8, chunks=(1000,))
+
+
+@pytest.mark.parametrize("make", [groups, attribute, chunk, unpacked])
+def test_a_file_is_refused_from_just_beyond_each_limit_on(
+    tmp_path: Path, make: Callable[[h5py.File, int], None]
+) -> None:
+    path = tmp_path / "a.h5"
+    for over in (0, 1):
+        with h5py.File(path, "w", libver=("v110", "v110")) as file:
+            make(file, over)
+        if over:
+            with pytest.raises(RecordFormatError), safe_open(path):
+                pass
+        else:
+            with safe_open(path):
+                pass
+
+
+def test_rows_of_numbers_and_fixed_text_are_allowed(tmp_path: Path) -> None:
+    kind = np.dtype([("a", "f8"), ("b", "i4"), ("c", "S7"), ("d", "?")])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["a"] = np.zeros(3, kind)
+    with safe_open(tmp_path / "a.h5") as file:
+        assert file["a"].dtype == kind
+
+
+def test_a_file_open_for_writing_or_left_so_is_locked_and_not_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        file["a"] = 1
+        for state in ("open", "left"):
+            if state == "left":
+                content = path.read_bytes()
+            with pytest.raises(LockedFileError, match=r"h5clear -s run\.h5"), safe_open(path):
+                pass
+            file.flush()
+    path.write_bytes(content)
+    (finding,) = verify_record(path)
+    assert finding.code == "locked"

@@ -1,26 +1,30 @@
-"""What a run says, as plain dataclasses: the one declaration of metric, figure, cell and record.
+"""What a run says, as dataclasses and as one JSON document.
 
-Methods, store and record use these types, or add to them what only they know. The writer and the
-reader go through the fields: a field that is added to `Costs` or `CellOutcome` is recorded, and
-those of `Costs` are shown wherever the others are.
+The only declaration of metric, figure, cell and record: methods, store and record use these types,
+or add to them what only they know. Reading and writing go through the fields, so a field that is
+added here is recorded, and those of `Costs` are shown wherever the others are.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
+import types
 import typing
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from enum import Enum
-from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 RUN_FORMAT: Final = "orthoflow-run"
-# Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
-RUN_FORMAT_VERSION: Final = "1.4"
 PRODUCT_FORMAT: Final = "orthoflow-product"
-PRODUCT_FORMAT_VERSION: Final = "1.0"
+FORMAT_VERSION: Final = "1.0"
+DIGEST_PREFIX: Final = "sha256:"
 
 # What a figure may be, and what its file is called.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
@@ -32,17 +36,31 @@ FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
 
 JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 CellStatus = Literal["ok", "failed", "skipped"]
+Entry = TypeVar("Entry")
 
 
-class Stored(Enum):
-    """How a field lies in HDF5 where its type alone does not say it."""
+class RecordFormatError(ValueError):
+    """A file or a value does not fit the record format: damaged, forbidden or incomplete.
 
-    DATASET = "a text of any length in a dataset of its own"
-    DIGITS = "a whole number of any size as decimal text; empty for None"
-    ELSEWHERE = "a group, or the name of one: writer and reader place it by hand"
+    The message is one sentence: what was found, what was expected, where, and the way out if there
+    is one.
+    """
 
 
-LongText: TypeAlias = Annotated[str, Stored.DATASET]
+class ForeignFormatError(RecordFormatError):
+    """The file is of another program, or of another version of the format: it cannot be checked."""
+
+
+class LockedFileError(RecordFormatError):
+    """The file is open for writing elsewhere, or was left so by a program that crashed."""
+
+
+class InputFileError(RecordFormatError):
+    """An input file that is to be embedded is missing, or not the one that was digested."""
+
+
+class UnsafeFileError(RecordFormatError):
+    """A name leads elsewhere than to a file in its folder, or no regular file stands there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,15 +108,15 @@ class Metric:
         name: of the number, with its unit at the end where it has one.
         value: finite.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        words: what tables call it, where its method says that; empty without.
-        good: with words: which side is good, `less`, `more` or `one`; empty where none is.
+        label: what tables call it, where its method declares that; empty without.
+        better: which values are better, `lower`, `higher` or `one`; empty where none are.
     """
 
     name: str
     value: float
     unit: str
-    words: str = ""
-    good: str = ""
+    label: str = ""
+    better: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,9 +218,9 @@ class RecordedInput:
         embedded: the bytes of the files are in the record.
     """
 
-    name: Annotated[str, Stored.ELSEWHERE]
+    name: str
     files: tuple[RecordedFile, ...]
-    embedded: Annotated[bool, Stored.ELSEWHERE] = False
+    embedded: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,14 +254,14 @@ class RecordedEnvironment:
         packages: distribution name -> version.
     """
 
-    id: Annotated[str, Stored.ELSEWHERE]
+    id: str
     python: str
     os: str
     cpu: str
     cores: int
     threads: int
     git_commit: str
-    packages: Annotated[Mapping[str, str], ("name", "version")]
+    packages: Mapping[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +289,7 @@ class MethodIdentity:
 class Costs:
     """What one execution of a method took; in a record that of the run that computed it.
 
-    One that came with a later version of the format is None where an older record lacks it.
+    What was not measured is None.
 
     Attributes:
         wall_s: seconds on the clock that the method ran, without `compile_s`; with it where
@@ -318,16 +336,16 @@ class CellOutcome(MethodIdentity, Costs):
 
     status: CellStatus
     error_type: str = ""
-    error_message: LongText = ""
+    error_message: str = ""
     key: str = ""
-    key_preimage: LongText = ""
-    seed: Annotated[int | None, Stored.DIGITS] = None
+    key_preimage: str = ""
+    seed: int | None = None
     started: str = ""
     ended: str = ""
     metrics: tuple[Metric, ...] = ()
     warnings: tuple[str, ...] = ()
     diagnostics: tuple[RecordedDiagnostic, ...] = ()
-    log: LongText = ""
+    log: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -348,19 +366,17 @@ class RecordedCell(CellOutcome):
         outputs: port -> product.
     """
 
-    address: Annotated[str, Stored.ELSEWHERE]
+    address: str
     step: str
-    assignment: Annotated[Mapping[str, str], ("step", "variant")] = field(default_factory=dict)
+    assignment: Mapping[str, str] = field(default_factory=dict)
     repeat: int = 0
     params: Mapping[str, JsonValue] = field(default_factory=dict)
     params_set: Mapping[str, JsonValue] = field(default_factory=dict)
     environment: str = ""
     cached_from: str = ""
-    figures: Annotated[tuple[RecordedFigure, ...], Stored.ELSEWHERE] = ()
-    inputs: Annotated[Mapping[str, RecordedProduct], Stored.ELSEWHERE] = field(default_factory=dict)
-    outputs: Annotated[Mapping[str, RecordedProduct], Stored.ELSEWHERE] = field(
-        default_factory=dict
-    )
+    figures: tuple[RecordedFigure, ...] = ()
+    inputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
+    outputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         # Logs and lists of parameters are for whoever asks for them.
@@ -384,7 +400,7 @@ class RunRecord:
         ended: ISO 8601 UTC.
         seed: seed of the workflow.
         workflow_source: the file as written.
-        workflow_resolved: canonical JSON of the workflow with all overrides applied.
+        workflow_resolved: JSON of the workflow with all overrides applied.
         overrides: `--set` and other options that changed the workflow or chose among its steps,
             as given.
         inputs: the workflow's inputs.
@@ -399,14 +415,14 @@ class RunRecord:
     status: Literal["ok", "failed"]
     started: str
     ended: str
-    seed: Annotated[int, Stored.DIGITS]
-    workflow_source: Annotated[str, Stored.ELSEWHERE]
-    workflow_resolved: Annotated[str, Stored.ELSEWHERE]
-    overrides: Annotated[tuple[str, ...], Stored.ELSEWHERE] = ()
-    inputs: Annotated[tuple[RecordedInput, ...], Stored.ELSEWHERE] = ()
-    environments: Annotated[tuple[RecordedEnvironment, ...], Stored.ELSEWHERE] = ()
-    cells: Annotated[tuple[RecordedCell, ...], Stored.ELSEWHERE] = ()
-    published: Annotated[tuple[PublishedFile, ...], Stored.ELSEWHERE] = ()
+    seed: int
+    workflow_source: str
+    workflow_resolved: str
+    overrides: tuple[str, ...] = ()
+    inputs: tuple[RecordedInput, ...] = ()
+    environments: tuple[RecordedEnvironment, ...] = ()
+    cells: tuple[RecordedCell, ...] = ()
+    published: tuple[PublishedFile, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -416,7 +432,7 @@ class RunRecord:
 
 
 def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
-    """What was measured as metrics, in the order of the fields; what is not stated is left out."""
+    """Return what was measured as metrics, in the order of the fields, without what was not."""
     measured = {name: getattr(costs, name) for name in COSTS}
     return tuple(
         Metric(name=name, value=float(value), unit=COSTS[name].unit)
@@ -427,5 +443,169 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
 
 # Any: keywords for a constructor, whose own annotations say what they are.
 def shared_fields(source: object, part: type) -> dict[str, Any]:
-    """Give what an object says in the fields of a part that it has, to hand on as keywords."""
+    """Return what an object says in the fields of a part that it has, as keywords."""
     return {item.name: getattr(source, item.name) for item in fields(part)}
+
+
+def to_json(value: object) -> JsonValue:
+    """Write dataclasses as JSON: an object per dataclass, the SHA-256 in the place of bytes."""
+    if is_dataclass(value):
+        return {item.name: to_json(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, bytes):
+        return hashlib.sha256(value).hexdigest()
+    if isinstance(value, tuple):
+        return [to_json(item) for item in value]
+    return plain_json(value)
+
+
+def from_json(
+    kind: type[Entry], value: object, contents: Callable[[str], bytes], place: str = ""
+) -> Entry:
+    """Read what `to_json` wrote.
+
+    Args:
+        kind: the dataclass.
+        value: JSON.
+        contents: SHA-256 -> bytes, for what was written as digest.
+        place: of the value in the document, for the message.
+
+    Raises:
+        RecordFormatError: a field is missing, unknown, or has another type.
+    """
+    if not isinstance(value, dict):
+        raise _misfit(place, "an object", value)
+    hints = _hints(typing.cast("Hashable", kind))
+    for name in hints.keys() ^ value.keys():
+        said = "lacks" if name in hints else "has the unknown field"
+        raise RecordFormatError(f"the document{f' at {place}' if place else ''} {said} {name!r}")
+    return kind(
+        **{
+            name: _from_json(hint, value[name], contents, f"{place}/{name}")
+            for name, hint in hints.items()
+        }
+    )
+
+
+# Any: a type as annotations state it, and what it constructs.
+def _from_json(hint: Any, value: object, contents: Callable[[str], bytes], place: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+
+    def inner(kind: object, item: object, name: object) -> Any:
+        return _from_json(kind, item, contents, f"{place}/{name}")
+
+    read: Any = value
+    if origin in (typing.Union, types.UnionType):
+        # Of two the other is None; of more it is JSON of any form.
+        if len(arguments) == 2 and value is not None:
+            read = _from_json(arguments[0], value, contents, place)
+    elif origin is tuple and isinstance(value, list):
+        read = tuple(inner(arguments[0], item, index) for index, item in enumerate(value))
+    elif origin is Mapping and isinstance(value, dict):
+        read = {key: inner(arguments[1], item, key) for key, item in value.items()}
+    elif is_dataclass(hint):
+        read = from_json(typing.cast("type", hint), value, contents, place)
+    elif hint is bytes and isinstance(value, str):
+        read = contents(value)
+    elif hint is float and type(value) is int:
+        read = float(value)
+    elif value not in arguments if origin is Literal else type(value) is not hint:
+        expected = " or ".join(map(repr, arguments)) if origin is Literal else f"a {hint}"
+        raise _misfit(place, expected, value)
+    return read
+
+
+def _misfit(place: str, expected: str, value: object) -> RecordFormatError:
+    found = f"{value!r:.40}" if isinstance(value, str | int | float) else type(value).__name__
+    return RecordFormatError(f"the document must have {expected} at {place or '/'}, got {found}")
+
+
+@cache
+# Any: a dataclass, which mypy does not let be a key of the cache.
+def _hints(kind: Any) -> Mapping[str, Any]:
+    hints = typing.get_type_hints(kind)
+    return {item.name: hints[item.name] for item in fields(kind)}
+
+
+def parse_json(text: str, place: str) -> JsonValue:
+    """Parse JSON as the format understands it: no NaN, no infinity, no endless nesting.
+
+    Raises:
+        RecordFormatError: the text is not such JSON.
+    """
+
+    def refuse(constant: str) -> JsonValue:
+        raise ValueError(f"{constant} is no JSON")
+
+    try:
+        value: JsonValue = json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise RecordFormatError(f"{place} must hold JSON: {error}") from error
+    return value
+
+
+def canonical_json(value: object) -> str:
+    """Write a JSON value in the one way that digests are made of.
+
+    Keys sorted by code point, no white space, no escapes beyond JSON's own, the shortest digits
+    that give the same float. `1`, `1.0` and `-0.0` stay apart, as do `true` and `1`.
+
+    Raises:
+        RecordFormatError: the value holds NaN, infinity, keys that are not text, half a surrogate
+            pair, or anything that is not JSON.
+
+    >>> canonical_json({"b": 1.0, "a": [True, None, "é"]})
+    '{"a":[true,null,"é"],"b":1.0}'
+    """
+    text = json.dumps(
+        plain_json(value),
+        sort_keys=True,
+        ensure_ascii=False,
+        allow_nan=False,
+        separators=(",", ":"),
+    )
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise RecordFormatError(
+            f"text must be valid Unicode to be stored, got half a surrogate pair ({error})"
+        ) from error
+    return text
+
+
+def sha256_text(text: str) -> str:
+    """Digest of a text's UTF-8 bytes, 64 hexadecimal digits."""
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def plain_json(value: object, place: str = "") -> JsonValue:
+    """Copy a value as plain JSON types, so that subclasses cannot print themselves differently.
+
+    Raises:
+        RecordFormatError: the value holds NaN, infinity, keys that are not text, or what is no
+            JSON.
+    """
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise RecordFormatError(f"JSON needs finite numbers, got {value} at {place or 'root'}")
+        return float(value)
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [plain_json(item, f"{place}/{index}") for index, item in enumerate(value)]
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise RecordFormatError(
+                    f"keys of a JSON object must be text, got {key!r} at {place or 'root'}"
+                )
+        return {str(key): plain_json(item, f"{place}/{key}") for key, item in value.items()}
+    raise RecordFormatError(
+        f"JSON knows no {type(value).__name__}, got one at {place or 'root'}: store numbers, text, "
+        "lists or mappings"
+    )

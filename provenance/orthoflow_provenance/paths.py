@@ -14,15 +14,20 @@ import re
 import secrets
 import stat
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from orthoflow_provenance.errors import UnsafeFileError
+from orthoflow_provenance.document import RecordFormatError, UnsafeFileError
 
+_LETTER: Final = r"""[^\s/'"<>|,;:()\[\]{}\\]"""
+# An absolute path of at least two parts that does not continue a word, a relative path or a URL.
+_PATH: Final = re.compile(
+    rf"(?<![\w.:/~*?\\-]) (?:file://)? / (?:{_LETTER}+/)+ (?P<last>{_LETTER}*)", re.VERBOSE
+)
 LONGEST_NAME_BYTES: Final = 255
 LONGEST_PATH_BYTES: Final = 4095
 # Windows takes these for devices whatever stands behind a dot, on every drive and in every folder.
@@ -64,6 +69,20 @@ def holds_control(text: str) -> bool:
     return not text.isprintable() and any(
         unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in text
     )
+
+
+def check_name(name: str, what: str) -> str:
+    """Refuse names that cannot be one link in HDF5 or one line in the seal.
+
+    Raises:
+        RecordFormatError: the name is empty, `.` or `..`, or holds `/` or a control character.
+    """
+    if name in {"", ".", ".."} or "/" in name or holds_control(name):
+        raise RecordFormatError(
+            f"{what} {name!r} cannot be a name in a record: names are not empty, not `.` or `..`, "
+            "and hold neither `/` nor control characters"
+        )
+    return name
 
 
 _PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
@@ -277,3 +296,28 @@ def _link_refused(parent: _Place, name: str, path: str) -> Iterator[None]:
             if _is_link(parent.look(name)):
                 raise UnsafeFileError(f"{path!r} is a link, and links are not followed") from error
         raise
+
+
+def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
+    """Reduce absolute paths in a text to their last part.
+
+    Args:
+        text: a log, a message, an option as it was typed.
+        folders: folders to take out literally first, for names with spaces, which no pattern
+            finds the end of; the home and the working directory are always among them.
+
+    >>> without_folders("cannot read /home/jane/scans/hall.e57: 1/2 of it is missing")
+    'cannot read hall.e57: 1/2 of it is missing'
+    """
+    for folder in sorted({*map(str, folders), *_own_folders()}, key=len, reverse=True):
+        if len(folder) > 1:
+            text = text.replace(f"{folder}/", "")
+    return _PATH.sub(lambda match: match["last"], text)
+
+
+def _own_folders() -> set[str]:
+    folders = {str(Path.cwd())}
+    # Where no home directory is known no text can name it.
+    with suppress(RuntimeError):
+        folders.add(str(Path.home()))
+    return folders

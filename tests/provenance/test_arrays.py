@@ -12,16 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from orthoflow_provenance.digests import payload_digest
-from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.payloads import (
+from orthoflow_provenance.arrays import (
+    payload_digest,
     read_payload,
     read_product_file,
     read_product_metadata,
     write_product_file,
 )
-from orthoflow_provenance.safe import safe_open
-from orthoflow_provenance.sinks import create_file, create_group
+from orthoflow_provenance.document import RecordFormatError
+from orthoflow_provenance.hdf5 import create_file, create_group, safe_open
 
 from tests.provenance_records import Given, cloud_payload, walls_payload
 
@@ -163,7 +162,7 @@ def test_a_product_file_of_a_newer_format_is_refused(tmp_path: Path) -> None:
     write_product_file(tmp_path / "a.h5", walls_payload())
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file.attrs["format_version"] = np.bytes_(b"2.0")
-    with pytest.raises(RecordFormatError, match=r"has format version 2\.0.*use a newer orthoflow"):
+    with pytest.raises(RecordFormatError, match=r"has format version '2\.0.*reads version 1"):
         read_product_file(tmp_path / "a.h5")
 
 
@@ -193,7 +192,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from orthoflow_provenance.payloads import read_product_file, write_product_file
+from orthoflow_provenance.arrays import read_product_file, write_product_file
 from tests.provenance_records import Given
 
 noise = np.random.default_rng(0).integers(0, 255, 6_000_000, dtype=np.uint8)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from orthoflow_provenance import inner_files
-from orthoflow_provenance.errors import UnsafeFileError
-from orthoflow_provenance.inner_files import (
+from orthoflow_provenance import paths
+from orthoflow_provenance.document import UnsafeFileError
+from orthoflow_provenance.paths import (
     colliding,
     create_below,
     files_below,
@@ -221,16 +221,16 @@ def test_where_no_folder_has_a_number_the_way_into_it_goes_through_no_link(
 ) -> None:
     (tmp_path / "a/b").mkdir(parents=True)
     (tmp_path / "a/link").symlink_to(tmp_path / "a/b")
-    down = inner_files._path_of_folder(tmp_path, ["a", "b"], is_made=is_made)
+    down = paths._path_of_folder(tmp_path, ["a", "b"], is_made=is_made)
     assert down == tmp_path / "a/b"
     with pytest.raises(UnsafeFileError, match=r"^'a/link' is a link, and links are not followed$"):
-        inner_files._path_of_folder(tmp_path, ["a", "link", "c"], is_made=is_made)
+        paths._path_of_folder(tmp_path, ["a", "link", "c"], is_made=is_made)
     if is_made:
-        inner_files._path_of_folder(tmp_path, ["a", "new"], is_made=True)
+        paths._path_of_folder(tmp_path, ["a", "new"], is_made=True)
         assert (tmp_path / "a/new").is_dir()
     else:
         with pytest.raises(FileNotFoundError):
-            inner_files._path_of_folder(tmp_path, ["a", "new"], is_made=False)
+            paths._path_of_folder(tmp_path, ["a", "new"], is_made=False)
     (tmp_path / "a/file").touch()
     with pytest.raises(NotADirectoryError):
-        inner_files._path_of_folder(tmp_path, ["a", "file"], is_made=is_made)
+        paths._path_of_folder(tmp_path, ["a", "file"], is_made=is_made)

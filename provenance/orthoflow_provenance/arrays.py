@@ -1,0 +1,619 @@
+"""Products as named arrays: their digests, their group in HDF5, and how far two lie apart.
+
+The same product has the same digest however it is stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow_provenance.document import (
+    DIGEST_PREFIX,
+    FORMAT_VERSION,
+    PRODUCT_FORMAT,
+    JsonValue,
+    PayloadLike,
+    RecordFormatError,
+    canonical_json,
+    parse_json,
+    sha256_text,
+)
+from orthoflow_provenance.hdf5 import (
+    check_format,
+    create_file,
+    create_group,
+    fixed_text,
+    int_attribute,
+    open_group,
+    read_text,
+    reading,
+    safe_open,
+    set_attributes,
+    text_attribute,
+    write_array,
+)
+from orthoflow_provenance.paths import check_name
+
+PRODUCT_GROUP: Final = "product"
+BLOCK_BYTES: Final = 8 << 20
+_CHUNK_BYTES: Final = 1 << 20
+# Smaller arrays gain nothing from compression or mapping.
+_SMALL_BYTES: Final = 4096
+_EXACT: Final = 0.0
+# Of numbers in the metadata, which say something about a product and are not the product itself:
+# other versions of numerical libraries round their last digits in another way.
+_STATED_SHARE: Final = 1e-6
+_UNITS: Final = ("mm", "m", "px", "deg")
+
+Index: TypeAlias = tuple[int | slice, ...]
+Tolerances: TypeAlias = Mapping[str, tuple[float, str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayFingerprint:
+    """An array without its values.
+
+    Attributes:
+        dtype: numpy's code of the little-endian type, e.g. `<f4`, `|u1`, `|b1`.
+        shape: length of every axis.
+        sha256: digest of the bytes, little-endian and in C order; 64 hexadecimal digits.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredPayload:
+    """A product as it was read; fulfils `PayloadLike`.
+
+    Attributes:
+        type_name: name of the product type.
+        encoding_version: version of the type's layout.
+        metadata: JSON; holds everything that is not an array.
+        arrays: name -> array, read-only; mapped ones are views of a `numpy.memmap`.
+        mapped: stored contiguous and uncompressed.
+        digest: digest that was stored with the product; `payload_digest` says whether it is true.
+    """
+
+    type_name: str
+    encoding_version: int
+    metadata: Mapping[str, JsonValue]
+    arrays: Mapping[str, NDArray[np.generic]]
+    mapped: bool
+    digest: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayDifference:
+    """One array or metadata value in which two products differ.
+
+    Attributes:
+        name: name of the array, or path of the value in the metadata.
+        largest: largest absolute difference of two numbers in `unit`; infinite where they cannot
+            be subtracted (another shape or type, missing, NaN against a number).
+        limit: largest difference that is allowed.
+        unit: unit of both.
+        n_values: how many values differ by more than the limit; 0 when the products agree here.
+        problem: one sentence.
+    """
+
+    name: str
+    largest: float
+    limit: float
+    unit: str
+    n_values: int
+    problem: str
+
+
+def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
+    """Give indices that cut an array into blocks of at most about 8 MiB.
+
+    Joined in order, the blocks' elements are the array's elements in C order. An array without
+    elements has no blocks; a scalar has one, `()`.
+
+    >>> list(block_indices((3,), 8))
+    [(slice(0, 3, None),)]
+    """
+    if math.prod(shape) == 0:
+        return
+    if not shape:
+        yield ()
+        return
+    row_bytes = itemsize * math.prod(shape[1:])
+    if row_bytes > BLOCK_BYTES:
+        for index in range(shape[0]):
+            for rest in block_indices(shape[1:], itemsize):
+                yield (index, *rest)
+        return
+    step = max(1, BLOCK_BYTES // row_bytes)
+    for start in range(0, shape[0], step):
+        yield (slice(start, min(start + step, shape[0])),)
+
+
+def little_endian(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
+    """Give the dtype with its bytes in little-endian order."""
+    return dtype.newbyteorder("<")
+
+
+def byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
+    """Give the array's bytes: little-endian, C order, flat.
+
+    A contiguous little-endian array is given whole and not copied, memory-mapped or not; any other
+    is copied block by block.
+    """
+    wanted = little_endian(array.dtype)
+    if array.size == 0:
+        return
+    if array.flags.c_contiguous and array.dtype == wanted:
+        yield _as_bytes(array)
+        return
+    for index in block_indices(array.shape, array.dtype.itemsize):
+        yield _as_bytes(np.ascontiguousarray(array[index], dtype=wanted))
+
+
+def array_fingerprint(array: NDArray[np.generic]) -> ArrayFingerprint:
+    """Digest one array without copying it when it is contiguous.
+
+    Raises:
+        RecordFormatError: the type is none that can be stored.
+    """
+    check_storable(array.dtype)
+    digest = hashlib.sha256()
+    for block in byte_blocks(array):
+        digest.update(block.data)
+    return ArrayFingerprint(
+        dtype=little_endian(array.dtype).str, shape=array.shape, sha256=digest.hexdigest()
+    )
+
+
+def payload_digest(payload: PayloadLike) -> str:
+    """Digest a product: type, encoding version, metadata, and every array's type, shape and bytes.
+
+    Arrays are digested in threads, streaming, so memory-mapped ones are never loaded as a whole.
+
+    Returns:
+        `sha256:` and 64 hexadecimal digits.
+
+    Raises:
+        RecordFormatError: the metadata are not JSON or an array's type cannot be stored.
+    """
+    # Largest first, so that no thread is left alone with a long tail.
+    names = sorted(payload.arrays, key=lambda name: -payload.arrays[name].nbytes)
+    with ThreadPoolExecutor(max_workers=usable_cores()) as threads:
+        prints = threads.map(lambda name: array_fingerprint(payload.arrays[name]), names)
+        fingerprints = dict(zip(names, prints, strict=True))
+    return digest_of_parts(
+        payload.type_name, payload.encoding_version, payload.metadata, fingerprints
+    )
+
+
+def digest_of_parts(
+    type_name: str,
+    encoding_version: int,
+    metadata: Mapping[str, JsonValue],
+    arrays: Mapping[str, ArrayFingerprint],
+) -> str:
+    """Digest a product whose arrays have been digested before; see `payload_digest`."""
+    content = {
+        "what": "orthoflow/product",
+        "v": 1,
+        "type": type_name,
+        "encoding_version": encoding_version,
+        "metadata": metadata,
+        "arrays": {
+            name: [print_.dtype, list(print_.shape), print_.sha256]
+            for name, print_ in arrays.items()
+        },
+    }
+    return DIGEST_PREFIX + sha256_text(canonical_json(content))
+
+
+def check_storable(dtype: np.dtype[np.generic]) -> None:
+    """Refuse array types that the format does not know.
+
+    Raises:
+        RecordFormatError: the type is not bool, an integer of up to 8 bytes, or a float of 2, 4 or
+            8 bytes.
+    """
+    is_float = dtype.kind == "f" and dtype.itemsize in (2, 4, 8)
+    if not (dtype.kind in "biu" or is_float):
+        raise RecordFormatError(
+            f"an array of type {dtype} cannot be stored, only bool, integers and floats of 2, 4 or "
+            "8 bytes can"
+        )
+
+
+def usable_cores() -> int:
+    """Count the processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def write_product_file(path: Path, payload: PayloadLike) -> str:
+    """Write one product into a file of its own and bring it to the disk.
+
+    The digest is computed in other threads while the arrays are written. Nothing is copied except
+    arrays that are not contiguous, block by block.
+
+    Returns:
+        The product's digest.
+
+    Raises:
+        RecordFormatError: the payload has names or types that the format does not know.
+        OSError: the file cannot be written, e.g. because the disk is full; it is removed.
+    """
+    _check_payload(payload)
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        digest = thread.submit(payload_digest, payload)
+        with create_file(path) as file:
+            set_attributes(file, format=PRODUCT_FORMAT, format_version=FORMAT_VERSION)
+            group = create_group(file, PRODUCT_GROUP)
+            _write_content(group, payload)
+            set_attributes(group, digest=digest.result())
+    return digest.result()
+
+
+def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
+    """Read what `write_product_file` wrote.
+
+    Args:
+        path: the file; it must stay in place while mapped arrays are in use.
+        map_arrays: memory-map the arrays of mapped products instead of loading them.
+
+    Raises:
+        RecordFormatError: the file is damaged, of another format or a newer one.
+        OSError: the file cannot be opened.
+    """
+    with safe_open(path) as file:
+        check_format(file, PRODUCT_FORMAT)
+        return read_payload(open_group(file, PRODUCT_GROUP), map_arrays=map_arrays)
+
+
+def read_product_metadata(path: Path) -> Mapping[str, JsonValue]:
+    """Read what `write_product_file` wrote, without the arrays.
+
+    Raises:
+        RecordFormatError: the file is damaged, of another format or a newer one.
+        OSError: the file cannot be opened.
+    """
+    with safe_open(path) as file:
+        check_format(file, PRODUCT_FORMAT)
+        return _metadata(open_group(file, PRODUCT_GROUP))
+
+
+def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
+    """Read a product from its group in a file that `safe_open` opened.
+
+    Raises:
+        RecordFormatError: the group is damaged or incomplete.
+    """
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for name, dataset in array_datasets(group):
+        with reading(dataset.name):
+            arrays[name] = _read_array(dataset, is_mapping=map_arrays)
+    return StoredPayload(
+        type_name=text_attribute(group, "type"),
+        encoding_version=int_attribute(group, "encoding_version"),
+        metadata=_metadata(group),
+        arrays=arrays,
+        mapped=bool(int_attribute(group, "mapped")),
+        digest=text_attribute(group, "digest"),
+    )
+
+
+def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
+    """Give a product's arrays with their names, sorted, without reading them.
+
+    Raises:
+        RecordFormatError: the group is damaged.
+    """
+    yield from _datasets_below(open_group(group, "arrays"), "")
+
+
+def measure_payloads(
+    left: PayloadLike, right: PayloadLike, tolerances: Tolerances
+) -> tuple[ArrayDifference, ...]:
+    """Measure how far two products lie apart; arrays are read block by block.
+
+    Args:
+        left: one product.
+        right: the other.
+        tolerances: field -> (limit, unit). A field is the last part of a name that is not a
+            number: `depth_m` for the array `walls/0/depth_m`, and the same for numbers in the
+            metadata. Fields not named must be equal, but for fractions in the metadata, which
+            may differ by a millionth of the larger one, or by a millionth where that is below 1.
+            NaN equals NaN.
+
+    Returns:
+        All differences, also those within the limits, by name; empty when the products are equal.
+    """
+    differences: list[ArrayDifference] = []
+    if (left.type_name, left.encoding_version) != (right.type_name, right.encoding_version):
+        problem = (
+            f"the products are {left.type_name} version {left.encoding_version} and "
+            f"{right.type_name} version {right.encoding_version}"
+        )
+        return (_unlike("type", (_EXACT, "1"), problem),)
+    for name in sorted(left.arrays.keys() | right.arrays.keys()):
+        tolerance = _tolerance(name, tolerances)
+        if name not in left.arrays or name not in right.arrays:
+            differences.append(_unlike(name, tolerance, "only one of the products has it"))
+        else:
+            differences += _array_differences(
+                name, left.arrays[name], right.arrays[name], tolerance
+            )
+    differences += _json_differences("", dict(left.metadata), dict(right.metadata), tolerances)
+    return tuple(differences)
+
+
+def _metadata(group: h5py.Group) -> dict[str, JsonValue]:
+    value = parse_json(read_text(group, "metadata"), f"{group.name}/metadata")
+    if not isinstance(value, dict):
+        raise RecordFormatError(f"{group.name}/metadata must hold a JSON object")
+    return value
+
+
+def _check_payload(payload: PayloadLike) -> None:
+    check_name(payload.type_name, "the product type")
+    names = sorted(payload.arrays)
+    for name in names:
+        for part in name.split("/"):
+            check_name(part, "the array")
+        check_storable(payload.arrays[name].dtype)
+    for name in names:
+        parents = name.split("/")
+        for depth in range(1, len(parents)):
+            if "/".join(parents[:depth]) in payload.arrays:
+                raise RecordFormatError(
+                    f"the array {name} cannot lie below {'/'.join(parents[:depth])}, which is an "
+                    "array itself"
+                )
+
+
+def _write_content(group: h5py.Group, payload: PayloadLike) -> None:
+    """Write all but the digest."""
+    set_attributes(
+        group,
+        type=payload.type_name,
+        encoding_version=payload.encoding_version,
+        mapped=int(payload.mapped),
+    )
+    write_array(group, "metadata", fixed_text(canonical_json(payload.metadata)))
+    root = create_group(group, "arrays")
+    for name in sorted(payload.arrays):
+        parent = root
+        *folders, last = name.split("/")
+        for folder in folders:
+            parent = parent[folder] if folder in parent else create_group(parent, folder)
+        _write_array(parent, last, payload.arrays[name], is_mapped=payload.mapped)
+
+
+def _write_array(
+    group: h5py.Group, name: str, array: NDArray[np.generic], *, is_mapped: bool
+) -> None:
+    dtype = little_endian(array.dtype)
+    if is_mapped or array.nbytes < _SMALL_BYTES or array.ndim == 0:
+        dataset = _create_contiguous(group, name, array.shape, dtype)
+    else:
+        dataset = group.create_dataset(
+            name,
+            shape=array.shape,
+            dtype=dtype,
+            chunks=_chunk_shape(array.shape, dtype.itemsize),
+            compression="gzip",
+            compression_opts=1,
+            shuffle=True,
+            fletcher32=True,
+            track_times=False,
+        )
+    if array.size == 0:
+        return
+    if array.flags.c_contiguous:
+        dataset.write_direct(np.asarray(array))
+        return
+    for index in block_indices(array.shape, dtype.itemsize):
+        dataset[index] = array[index]
+
+
+def _create_contiguous(
+    group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]
+) -> h5py.Dataset:
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_layout(h5py.h5d.CONTIGUOUS)
+    properties.set_obj_track_times(False)
+    # Early: the offset exists as soon as the dataset does. Never: no pass of zeros before the data.
+    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
+    kind = h5py.h5t.py_create(dtype, logical=True)
+    return h5py.Dataset(
+        h5py.h5d.create(group.id, name.encode("utf-8"), kind, space, dcpl=properties)
+    )
+
+
+def _chunk_shape(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
+    """Cut along the first axis first: chunks are runs of whole rows of about a megabyte."""
+    chunk = list(shape)
+    for axis in range(len(chunk)):
+        others = itemsize * math.prod(chunk) // chunk[axis]
+        chunk[axis] = min(chunk[axis], max(1, _CHUNK_BYTES // others))
+    return tuple(chunk)
+
+
+def _read_array(dataset: h5py.Dataset, *, is_mapping: bool) -> NDArray[np.generic]:
+    offset = dataset.id.get_offset()
+    is_mappable = (
+        is_mapping
+        and offset is not None
+        and dataset.nbytes >= _SMALL_BYTES
+        and dataset.dtype.isnative
+        # Misaligned arrays, which other writers may leave, are slower than a copy.
+        and offset % dataset.dtype.itemsize == 0
+    )
+    if is_mappable:
+        path = Path(dataset.file.filename)
+        if offset + dataset.nbytes > path.stat().st_size:
+            raise RecordFormatError(f"{dataset.name} reaches beyond the end of {path.name}")
+        mapped = np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
+        return mapped.view(np.ndarray)
+    array: NDArray[np.generic] = np.empty(dataset.shape, dtype=dataset.dtype)
+    if array.size:
+        dataset.read_direct(array)
+    array.flags.writeable = False
+    return array
+
+
+def _datasets_below(group: h5py.Group, prefix: str) -> Iterator[tuple[str, h5py.Dataset]]:
+    with reading(group.name):
+        children = [(name, group[name]) for name in sorted(group)]
+    for name, child in children:
+        if isinstance(child, h5py.Dataset):
+            yield prefix + name, child
+        elif isinstance(child, h5py.Group):
+            yield from _datasets_below(child, f"{prefix}{name}/")
+
+
+def _as_bytes(array: NDArray[np.generic]) -> NDArray[np.uint8]:
+    return np.asarray(array).reshape(-1).view(np.uint8)
+
+
+def _array_differences(
+    name: str,
+    left: NDArray[np.generic],
+    right: NDArray[np.generic],
+    tolerance: tuple[float, str],
+) -> Iterator[ArrayDifference]:
+    if left.shape != right.shape or left.dtype != right.dtype:
+        problem = f"{left.dtype} of shape {left.shape} against {right.dtype} of {right.shape}"
+        yield _unlike(name, tolerance, problem)
+        return
+    limit, unit = tolerance
+    largest, total, n_values = 0.0, 0.0, 0
+    for index in block_indices(left.shape, left.dtype.itemsize):
+        distances = _distances(np.ravel(left[index]), np.ravel(right[index]))
+        largest = max(largest, float(distances.max()))
+        total += float(distances[np.isfinite(distances)].sum())
+        n_values += int(np.count_nonzero(distances > limit))
+    if largest:
+        problem = (
+            f"{n_values} of {left.size} values differ by more than {_amount(limit, unit)}, the "
+            f"largest by {largest:g}; the mean of all is {total / left.size:.3g}"
+            if n_values
+            else f"differs by {_amount(largest, unit)} at most, {limit:g} are allowed"
+        )
+        yield ArrayDifference(
+            name=name,
+            largest=largest,
+            limit=limit,
+            unit=unit,
+            n_values=n_values,
+            problem=problem,
+        )
+
+
+def _distances(left: NDArray[np.generic], right: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Absolute differences, infinite where only one value is NaN; of any type, without overflow."""
+    if left.dtype.kind in "iu" and left.dtype.itemsize == 8:
+        # Neighbours beyond 2^53 are one float64.
+        larger, smaller = np.maximum(left, right), np.minimum(left, right)
+        gaps: NDArray[np.uint64] = larger.view(np.uint64) - smaller.view(np.uint64)
+        return gaps.astype(np.float64)
+    a, b = left.astype(np.float64), right.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        distances = np.abs(a - b)
+    distances[np.isnan(a) != np.isnan(b)] = math.inf
+    is_same = (a == b) | (np.isnan(a) & np.isnan(b))
+    return np.where(is_same, 0.0, distances)
+
+
+def _json_differences(
+    name: str, left: JsonValue, right: JsonValue, tolerances: Tolerances
+) -> Iterator[ArrayDifference]:
+    tolerance = _tolerance(name, tolerances)
+    if isinstance(left, dict) and isinstance(right, dict):
+        for key in sorted(left.keys() | right.keys()):
+            place = f"{name}/{key}".lstrip("/")
+            if key not in left or key not in right:
+                yield _unlike(place, tolerance, "only one of the products has it")
+            else:
+                yield from _json_differences(place, left[key], right[key], tolerances)
+    elif isinstance(left, list) and isinstance(right, list) and len(left) == len(right):
+        for index, (a, b) in enumerate(zip(left, right, strict=True)):
+            yield from _json_differences(f"{name}/{index}", a, b, tolerances)
+    elif _is_number(left) and _is_number(right):
+        stated = _stated_tolerance(name, left, right, tolerances)
+        yield from _number_differences(name, float(str(left)), float(str(right)), stated)
+    elif left != right or type(left) is not type(right):
+        yield _unlike(name, tolerance, f"{left!r:.60} against {right!r:.60}")
+
+
+def _number_differences(
+    name: str, left: float, right: float, tolerance: tuple[float, str]
+) -> Iterator[ArrayDifference]:
+    limit, unit = tolerance
+    distance = abs(left - right)
+    if distance:
+        yield ArrayDifference(
+            name=name,
+            largest=distance,
+            limit=limit,
+            unit=unit,
+            n_values=int(distance > limit),
+            problem=f"{left:g} against {right:g}, {_amount(limit, unit)} are allowed",
+        )
+
+
+def _is_number(value: JsonValue) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _tolerance(name: str, tolerances: Tolerances) -> tuple[float, str]:
+    field = _field(name)
+    return tolerances.get(field, (_EXACT, _unit(field)))
+
+
+def _stated_tolerance(
+    name: str, left: JsonValue, right: JsonValue, tolerances: Tolerances
+) -> tuple[float, str]:
+    limit, unit = _tolerance(name, tolerances)
+    values = [value for value in (left, right) if isinstance(value, float)]
+    if _field(name) in tolerances or not values:
+        return limit, unit
+    return _STATED_SHARE * max(1.0, *(abs(value) for value in values)), unit
+
+
+def _field(name: str) -> str:
+    """The last part of a name that is not a number."""
+    parts = (part for part in reversed(name.split("/")) if not part.isdigit())
+    return next(parts, "")
+
+
+def _unit(field: str) -> str:
+    """The unit that the name of a field ends in, 1 when it ends in none."""
+    suffix = field.rpartition("_")[2]
+    return suffix if suffix in _UNITS else "1"
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:g}" if unit == "1" else f"{value:g} {unit}"
+
+
+def _unlike(name: str, tolerance: tuple[float, str], problem: str) -> ArrayDifference:
+    limit, unit = tolerance
+    return ArrayDifference(
+        name=name, largest=math.inf, limit=limit, unit=unit, n_values=1, problem=problem
+    )

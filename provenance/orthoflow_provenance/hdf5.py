@@ -1,0 +1,625 @@
+"""HDF5 files: writing them so that a full disk is an ordinary error, and opening untrusted ones.
+
+HDF5 cannot close a file that cannot be written to: the library keeps it open, complains again from
+destructors, and may crash the process at exit. It therefore writes through a sink that always
+succeeds, remembers the first error, and raises it once HDF5 is out of the way.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow_provenance.document import (
+    FORMAT_VERSION,
+    PRODUCT_FORMAT,
+    RUN_FORMAT,
+    ForeignFormatError,
+    LockedFileError,
+    RecordFormatError,
+)
+from orthoflow_provenance.paths import check_name
+
+# Everything that h5py raises for damaged files; which one depends on where the damage is.
+HDF5_ERRORS: Final = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    SystemError,
+)
+# Readable by HDF5 1.10 and newer; from 1.10 on all of HDF5's own structures carry checksums.
+_LIBRARY_VERSIONS: Final = (h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
+# Arrays that are worth mapping start at a multiple of this, so that mapped arrays are aligned.
+_ALIGNMENT_BYTES: Final = 64
+_ALIGNED_FROM_BYTES: Final = 2048
+# After a failed write, data blocks are dropped, but HDF5 must be able to read its structures back.
+_KEPT_AFTER_FAILURE_BYTES: Final = 64 << 10
+
+_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+# Of the superblock of version 2 and 3: its version, the marks of open writers, the end of the file.
+_SUPERBLOCK_BYTES: Final = 36
+_WRITER_MARKS: Final = 0b101
+_DEEPEST: Final = 32
+# No honest file comes near: deflate packs at most 1032 to 1.
+_LARGEST_RATIO: Final = 1100
+_ALWAYS_ALLOWED_BYTES: Final = 64 << 20
+_LARGEST_CHUNK_BYTES: Final = 64 << 20
+_LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
+_LONGEST_FORMAT_BYTES: Final = 256
+# Nobody packs what is this small and read at once; more would be a flood from a few bytes.
+_PACKED_BYTES_MOST: Final = 4 << 20
+# Groups, datasets and attributes; a cell with its products has some fifty.
+MAX_OBJECTS: Final = 1_000_000
+_FILTERS: Final = {
+    h5py.h5z.FILTER_SHUFFLE: "shuffle",
+    h5py.h5z.FILTER_DEFLATE: "gzip",
+    h5py.h5z.FILTER_FLETCHER32: "fletcher32",
+}
+_PLAIN_CLASSES: Final = frozenset({h5py.h5t.INTEGER, h5py.h5t.FLOAT})
+
+
+@contextmanager
+def reading(place: str) -> Iterator[None]:
+    """Turn whatever HDF5 says about a damaged place into one sentence.
+
+    Raises:
+        RecordFormatError: something inside failed.
+    """
+    try:
+        yield
+    except RecordFormatError:
+        raise
+    except HDF5_ERRORS as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordFormatError(f"{place} cannot be read, the file is damaged: {reason}") from error
+
+
+def fixed_text(text: str) -> NDArray[np.bytes_]:
+    """Return a text as HDF5 holds it: UTF-8 of fixed length, without NUL and halves of letters.
+
+    Text of variable length lies in HDF5's global heap, the one structure without a checksum, in
+    which one changed byte can make the library loop for ever.
+    """
+    data = text.replace("\0", "").encode("utf-8", "replace")
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+
+
+def set_attributes(item: h5py.Group | h5py.Dataset, **values: str | float) -> None:
+    """Write scalar attributes: text of fixed length, whole numbers as int64, others as float64."""
+    for name, value in values.items():
+        item.attrs[name] = attribute_value(value)
+
+
+def attribute_value(value: str | float) -> NDArray[np.generic]:
+    """Return a value of an attribute as it is stored."""
+    if isinstance(value, str):
+        return fixed_text(value)
+    return np.array(value, dtype="<i8" if isinstance(value, int) else "<f8")
+
+
+def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    """Read a text attribute.
+
+    Raises:
+        RecordFormatError: it is missing or no text.
+    """
+    value = _attribute(item, name)
+    if not isinstance(value, bytes):
+        raise RecordFormatError(f"{item.name}@{name} must be text, got {type(value).__name__}")
+    return _decoded(bytes(value), f"{item.name}@{name}")
+
+
+def int_attribute(item: h5py.Group | h5py.Dataset, name: str) -> int:
+    """Read a whole-number attribute.
+
+    Raises:
+        RecordFormatError: it is missing or no whole number.
+    """
+    value = _attribute(item, name)
+    if not isinstance(value, np.integer | int):
+        raise RecordFormatError(
+            f"{item.name}@{name} must be a whole number, got {type(value).__name__}"
+        )
+    return int(value)
+
+
+def write_array(group: h5py.Group, name: str, data: NDArray[np.generic]) -> h5py.Dataset:
+    """Write a text, a table or bytes as a contiguous dataset without time stamps."""
+    return group.create_dataset(name, data=data, track_times=False)
+
+
+def read_text(group: h5py.Group, name: str) -> str:
+    """Read a text of any length.
+
+    Raises:
+        RecordFormatError: the dataset is missing, damaged or no text.
+    """
+    dataset = dataset_of(group, name)
+    value = read_whole(dataset)
+    if not isinstance(value, bytes):
+        raise RecordFormatError(f"{dataset.name} must be one text, got {dataset.dtype}")
+    return _decoded(bytes(value), dataset.name)
+
+
+def open_group(parent: h5py.Group, name: str) -> h5py.Group:
+    """Open a sub-group.
+
+    Raises:
+        RecordFormatError: there is none of that name.
+    """
+    with reading(f"{parent.name.rstrip('/')}/{name}"):
+        found = parent.get(name)
+    if not isinstance(found, h5py.Group):
+        raise RecordFormatError(f"{parent.name} lacks the group {name}")
+    return found
+
+
+def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Open a dataset.
+
+    Raises:
+        RecordFormatError: there is none of that name.
+    """
+    with reading(f"{group.name}/{name}"):
+        found = group.get(name)
+    if not isinstance(found, h5py.Dataset):
+        raise RecordFormatError(f"{group.name} lacks the dataset {name}")
+    return found
+
+
+def read_whole(dataset: h5py.Dataset) -> object:
+    """Read a text, a table or a figure at once.
+
+    Raises:
+        RecordFormatError: it is damaged, or unpacks to much more than the file holds for it.
+    """
+    with reading(dataset.name):
+        if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
+            raise RecordFormatError(
+                f"{dataset.name} unpacks to {dataset.nbytes} bytes: texts, tables and figures of "
+                f"more than {_PACKED_BYTES_MOST} bytes must not be packed"
+            )
+        value: object = dataset[()]
+    return value
+
+
+class FileSink:
+    """A file that HDF5 writes to; writing never raises.
+
+    Attributes:
+        failure: the first error of the operating system, None while all is well.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Through a link it would be another's file that is emptied.
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC
+        for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
+            flags |= int(getattr(os, name, 0))
+        if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+        self._descriptor = os.open(path, flags, 0o666)
+        self._position = 0
+        self._kept: list[tuple[int, bytes]] = []
+        self._kept_end = 0
+        self.failure: OSError | None = None
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move the position; HDF5 uses it to ask for the size as well."""
+        if whence == os.SEEK_END:
+            size = os.fstat(self._descriptor).st_size
+            self._position = max(size, self._kept_end) + offset
+        elif whence == os.SEEK_CUR:
+            self._position += offset
+        else:
+            self._position = offset
+        return self._position
+
+    def tell(self) -> int:
+        """Give the position."""
+        return self._position
+
+    def write(self, data: memoryview) -> int:
+        """Write all of the data at the position."""
+        view = memoryview(data).cast("B")
+        if self.failure is None:
+            try:
+                self._write_all(view)
+            except OSError as error:
+                self.failure = error
+        if self.failure is not None and len(view) <= _KEPT_AFTER_FAILURE_BYTES:
+            self._kept.append((self._position, bytes(view)))
+            self._kept_end = max(self._kept_end, self._position + len(view))
+        self._position += len(view)
+        return len(view)
+
+    def readinto(self, buffer: memoryview) -> int:
+        """Read at the position; what was never written is zeros."""
+        view = memoryview(buffer).cast("B")
+        stored = _read_at(self._descriptor, len(view), self._position)
+        view[: len(stored)] = stored
+        view[len(stored) :] = bytes(len(view) - len(stored))
+        for offset, data in self._kept:
+            start = max(offset, self._position)
+            stop = min(offset + len(data), self._position + len(view))
+            if start < stop:
+                view[start - self._position : stop - self._position] = data[
+                    start - offset : stop - offset
+                ]
+        self._position += len(view)
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        """Set the length of the file."""
+        if self.failure is None:
+            try:
+                os.ftruncate(self._descriptor, size)
+            except OSError as error:
+                self.failure = error
+        return size
+
+    def flush(self) -> None:
+        """Do nothing: `close` brings the data to the disk, once."""
+
+    def close(self) -> None:
+        """Bring the data to the disk and close the file.
+
+        Raises:
+            OSError: writing failed now or before.
+        """
+        try:
+            if self.failure is None:
+                os.fsync(self._descriptor)
+        finally:
+            os.close(self._descriptor)
+        if self.failure is not None:
+            raise self.failure
+
+    def _write_all(self, view: memoryview) -> None:
+        done = 0
+        while done < len(view):
+            done += _write_at(self._descriptor, view[done:], self._position + done)
+
+
+@contextmanager
+def create_file(path: Path) -> Iterator[h5py.File]:
+    """Create an HDF5 file and bring it to the disk; what stood at `path` before is lost.
+
+    A file that could not be completed is removed.
+
+    Raises:
+        OSError: the file cannot be created or written, e.g. because the disk is full.
+    """
+    sink = FileSink(path)
+    try:
+        file = _open_through(sink, path)
+        try:
+            yield file
+        finally:
+            file.close()
+    except BaseException as error:
+        failure = sink.failure
+        with suppress(OSError):
+            sink.close()
+        path.unlink(missing_ok=True)
+        if failure is not None and isinstance(error, Exception):
+            raise failure from error
+        raise
+    try:
+        sink.close()
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def create_group(parent: h5py.Group, name: str) -> h5py.Group:
+    """Create a group without time stamps: equal content gives equal files."""
+    properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
+    properties.set_obj_track_times(False)
+    return h5py.Group(h5py.h5g.create(parent.id, name.encode("utf-8"), gcpl=properties))
+
+
+@contextmanager
+def safe_open(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading after looking at every object in it.
+
+    Raises:
+        ForeignFormatError: the file is no HDF5 file, or something of the following is so because
+            another program or another version wrote it.
+        LockedFileError: the file is open for writing elsewhere, or was left so by a crash.
+        RecordFormatError: the file is damaged, or holds links other than hard links, an object
+            that is reached twice or has an impossible name, external or virtual storage, filters
+            other than shuffle, gzip and fletcher32, types outside the format, or datasets that
+            unpack to far more than the file could hold.
+        OSError: the file cannot be opened.
+    """
+    _check_superblock(path)
+    with reading(path.name):
+        file = h5py.File(path, "r", locking=False)
+    try:
+        try:
+            _Inspection(file, path).run()
+        except RecordFormatError as error:
+            # What a file is comes before what is forbidden in it.
+            raise _foreign(file) or error from error
+        yield file
+    finally:
+        file.close()
+
+
+def _check_superblock(path: Path) -> None:
+    with path.open("rb") as stream:
+        start = stream.read(_SUPERBLOCK_BYTES)
+    if not start.startswith(_SIGNATURE):
+        raise ForeignFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+    if len(start) == _SUPERBLOCK_BYTES and start[8] == 3 and start[11] & _WRITER_MARKS:
+        raise LockedFileError(
+            f"{path.name} is open for writing in another program, or was left so by one that "
+            f"crashed: close that program; if there is none, `h5clear -s {path.name}` (of the HDF5 "
+            "tools) takes the mark away, and `orthoflow verify` says whether the file is whole"
+        )
+
+
+def bytes_behind_end(path: Path) -> int:
+    """Count the bytes behind the end that an HDF5 file states; negative where some are missing."""
+    with path.open("rb") as stream:
+        start = stream.read(_SUPERBLOCK_BYTES)
+    return path.stat().st_size - int.from_bytes(start[28:36], "little")
+
+
+def check_format(file: h5py.File, name: str) -> None:
+    """Refuse files of another format, or of another version of this one.
+
+    Raises:
+        ForeignFormatError: the file is such a one.
+    """
+    file_name = Path(file.filename).name
+    try:
+        found = text_attribute(file, "format")
+        version = text_attribute(file, "format_version")
+    except RecordFormatError as error:
+        raise ForeignFormatError(
+            f"{file_name} must be of format {name}, but it names no format: it was not written by "
+            "orthoflow, or it is damaged"
+        ) from error
+    if found != name:
+        raise ForeignFormatError(f"{file_name} must be of format {name}, got {found!r}")
+    if version != FORMAT_VERSION:
+        raise ForeignFormatError(
+            f"{file_name} has format version {version!r}, this program reads version "
+            f"{FORMAT_VERSION}: use the orthoflow that wrote it, or a newer one"
+        )
+
+
+def _foreign(file: h5py.File) -> ForeignFormatError | None:
+    """Return that a refused file is of another program or version; None for one of ours."""
+    try:
+        if not all(_is_short_text(file, name) for name in (b"format", b"format_version")):
+            name = Path(file.filename).name
+            return ForeignFormatError(
+                f"{name} is no record of orthoflow: it does not name that format; give a run.h5"
+            )
+        is_product = text_attribute(file, "format") == PRODUCT_FORMAT
+        check_format(file, PRODUCT_FORMAT if is_product else RUN_FORMAT)
+    except ForeignFormatError as error:
+        return error
+    except (RecordFormatError, *HDF5_ERRORS):
+        return None
+    return None
+
+
+def _is_short_text(file: h5py.File, name: bytes) -> bool:
+    """Whether an attribute is text as records have it: of fixed length, so that it may be read."""
+    if not h5py.h5a.exists(file.id, name):
+        return False
+    kind = h5py.h5a.open(file.id, name).get_type()
+    return _is_text(kind) and _is_plain(kind) and kind.get_size() <= _LONGEST_FORMAT_BYTES
+
+
+class _Inspection:
+    """One walk over all links, objects and attributes of a file."""
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        self._file = file
+        self._name = path.name
+        self._size_bytes = path.stat().st_size
+        self._stored_bytes = 0
+        self._n_objects = 0
+        self._unfounded_bytes = 0
+        self._seen: set[tuple[int, int]] = set()
+
+    def run(self) -> None:
+        """Look at everything, deepest last.
+
+        Raises:
+            RecordFormatError: something forbidden was found.
+        """
+        # Low-level identifiers: the objects of h5py on top of them would take three times as long.
+        pending: list[tuple[h5py.h5g.GroupID, str, int]] = [(self._file.id, "/", 0)]
+        self._visit_once(self._file.id, "/")
+        while pending:
+            group, path, depth = pending.pop()
+            if depth > _DEEPEST:
+                raise self._refusal(path, f"is nested more than {_DEEPEST} groups deep")
+            with reading(f"{self._name}:{path}"):
+                self._check_attributes(group, path)
+                names = list(group)
+            for name in names:
+                place = f"{path.rstrip('/')}/{name.decode('utf-8', 'backslashreplace')}"
+                with reading(f"{self._name}:{place}"):
+                    self._check_name(name, place)
+                    child = self._open(group, name, place)
+                    if isinstance(child, h5py.h5g.GroupID):
+                        pending.append((child, place, depth + 1))
+                    else:
+                        self._check_attributes(child, place)
+                        self._check_dataset(child, place)
+
+    def _open(
+        self, group: h5py.h5g.GroupID, name: bytes, place: str
+    ) -> h5py.h5g.GroupID | h5py.h5d.DatasetID:
+        link = group.links.get_info(name).type
+        if link == h5py.h5l.TYPE_EXTERNAL:
+            raise self._refusal(place, "is a link into another file")
+        if link != h5py.h5l.TYPE_HARD:
+            raise self._refusal(place, "is a soft link, only hard links are allowed")
+        child = h5py.h5o.open(group, name)
+        if not isinstance(child, h5py.h5g.GroupID | h5py.h5d.DatasetID):
+            raise self._refusal(place, "is neither a group nor a dataset")
+        self._visit_once(child, place)
+        return child
+
+    def _check_name(self, name: bytes, place: str) -> None:
+        # A way down is asked for with `/` between names: `..` would be one up for other programs.
+        try:
+            check_name(name.decode("utf-8"), "the object")
+        except RecordFormatError as error:
+            raise self._refusal(place, f"is no place in a record: {error}") from error
+
+    def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
+        # Two ways to one object make loops, and trees that grow without end from a few bytes.
+        info = h5py.h5o.get_info(item)
+        identity = (int(info.fileno), int(info.addr))
+        if identity in self._seen:
+            raise self._refusal(place, "leads to an object that has another place as well")
+        self._seen.add(identity)
+        self._count(1, place)
+
+    def _count(self, n_objects: int, place: str) -> None:
+        self._n_objects += n_objects
+        if self._n_objects > MAX_OBJECTS:
+            raise self._refusal(
+                place, f"and what lies before it are more than {MAX_OBJECTS} groups and attributes"
+            )
+
+    def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
+        properties = dataset.get_create_plist()
+        if properties.get_external_count():
+            raise self._refusal(place, "keeps its data in another file")
+        layout = properties.get_layout()
+        if layout not in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED}:
+            raise self._refusal(place, "is a virtual dataset")
+        used = [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]
+        if not set(used) <= set(_FILTERS) or len(set(used)) != len(used):
+            raise self._refusal(
+                place, f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
+            )
+        kind = dataset.get_type()
+        if not _is_allowed(kind):
+            raise self._refusal(place, "has a type outside the format")
+        if layout == h5py.h5d.CHUNKED and (
+            math.prod(properties.get_chunk()) * kind.get_size() > _LARGEST_CHUNK_BYTES
+        ):
+            raise self._refusal(place, "has chunks of more than 64 MiB")
+        self._check_size(dataset, kind.get_size(), place)
+
+    def _check_size(self, dataset: h5py.h5d.DatasetID, itemsize: int, place: str) -> None:
+        declared = math.prod(dataset.shape or ()) * itemsize
+        stored = dataset.get_storage_size()
+        if declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored):
+            raise self._refusal(
+                place, f"says it has {declared} bytes, but the file holds {stored} for it"
+            )
+        # Many that each stay below what is always allowed would be a flood together.
+        self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
+        if self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES:
+            raise self._refusal(
+                place,
+                "and those before it say they have more than 64 MiB that the file cannot hold",
+            )
+        self._stored_bytes += stored
+        if self._stored_bytes > self._size_bytes:
+            raise self._refusal(place, "and the datasets before it say more than the file can hold")
+
+    def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
+        n_attributes = h5py.h5a.get_num_attrs(item)
+        self._count(n_attributes, place)
+        for index in range(n_attributes):
+            attribute = h5py.h5a.open(item, index=index)
+            kind = attribute.get_type()
+            problem = ""
+            if not _is_allowed(kind):
+                problem = "has a type outside the format"
+            elif math.prod(attribute.shape) * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
+                problem = "is larger than 1 MiB"
+            if problem:
+                name = attribute.name.decode("utf-8", "backslashreplace")
+                raise self._refusal(f"{place}@{name}", problem)
+
+    def _refusal(self, place: str, reason: str) -> RecordFormatError:
+        return RecordFormatError(f"{self._name}:{place} {reason}: the file is not opened")
+
+
+def _is_text(kind: h5py.h5t.TypeID) -> bool:
+    return bool(kind.get_class() == h5py.h5t.STRING)
+
+
+def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
+    """Say whether values of a type lie in the dataset itself: numbers, bool, fixed text, rows."""
+    type_class = kind.get_class()
+    if type_class == h5py.h5t.COMPOUND:
+        return all(_is_plain(kind.get_member_type(index)) for index in range(kind.get_nmembers()))
+    return _is_plain(kind)
+
+
+def _is_plain(kind: h5py.h5t.TypeID) -> bool:
+    type_class = kind.get_class()
+    if type_class == h5py.h5t.STRING:
+        return not kind.is_variable_str()
+    return type_class in _PLAIN_CLASSES or type_class == h5py.h5t.ENUM
+
+
+def _read_at(descriptor: int, n_bytes: int, position: int) -> bytes:
+    if hasattr(os, "pread"):
+        return os.pread(descriptor, n_bytes, position)
+    # Windows has no such call; a sink has one thread.
+    os.lseek(descriptor, position, os.SEEK_SET)
+    return os.read(descriptor, n_bytes)
+
+
+def _write_at(descriptor: int, data: memoryview, position: int) -> int:
+    if hasattr(os, "pwrite"):
+        return os.pwrite(descriptor, data, position)
+    os.lseek(descriptor, position, os.SEEK_SET)
+    return os.write(descriptor, data)
+
+
+def _open_through(sink: FileSink, path: Path) -> h5py.File:
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    access.set_libver_bounds(*_LIBRARY_VERSIONS)
+    access.set_alignment(_ALIGNED_FROM_BYTES, _ALIGNMENT_BYTES)
+    access.set_fileobj_driver(h5py.h5fd.fileobj_driver, sink)
+    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    creation.set_obj_track_times(False)
+    name = os.fsencode(path)
+    return h5py.File(h5py.h5f.create(name, h5py.h5f.ACC_TRUNC, fapl=access, fcpl=creation))
+
+
+def _attribute(item: h5py.Group | h5py.Dataset, name: str) -> object:
+    with reading(f"{item.name}@{name}"):
+        value: object = item.attrs.get(name)
+    if value is None:
+        raise RecordFormatError(f"{item.name} lacks the attribute {name}")
+    return value
+
+
+def _decoded(data: bytes, place: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise RecordFormatError(f"{place} must be UTF-8 text: {error}") from error

@@ -1,0 +1,629 @@
+"""The record of a run as one HDF5 file: the document, what it names by digest, and the seal.
+
+`/document` is the record. Everything else in the file is either named in it by digest, the products
+and the bytes of files, or repeats it so that people find their way in HDFView and h5py: a group per
+cell, one table of metrics. `/seal` is the digest of the whole file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final, TypeAlias
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow_provenance.arrays import (
+    PRODUCT_GROUP,
+    StoredPayload,
+    payload_digest,
+    read_payload,
+)
+from orthoflow_provenance.document import (
+    DIGEST_PREFIX,
+    FORMAT_VERSION,
+    RUN_FORMAT,
+    InputFileError,
+    RecordedCell,
+    RecordedFile,
+    RecordedInput,
+    RecordFormatError,
+    RunRecord,
+    cost_metrics,
+    from_json,
+    parse_json,
+    sha256_text,
+    to_json,
+)
+from orthoflow_provenance.hdf5 import (
+    attribute_value,
+    check_format,
+    create_file,
+    create_group,
+    dataset_of,
+    fixed_text,
+    open_group,
+    read_text,
+    read_whole,
+    reading,
+    safe_open,
+    text_attribute,
+    write_array,
+)
+from orthoflow_provenance.paths import check_name, create_below, path_below, without_folders
+
+ProductFile: TypeAlias = Callable[[str], Path | None]
+InputFile: TypeAlias = Callable[[str], Path | None]
+
+DOCUMENT: Final = "document"
+SEAL: Final = "seal"
+CONTENT_SHA256: Final = "content_sha256"
+PRODUCTS: Final = "products"
+FILES: Final = "files"
+CELLS: Final = "cells"
+_UNSEALED: Final = "0" * 64
+_BLOCK_BYTES: Final = 16 << 20
+# Attributes are read at a glance; what is longer stands in the document.
+_LONGEST_ATTRIBUTE: Final = 1000
+_PLAIN: Final = (str, int, float, bool)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Node:
+    """One object of a record as it must be.
+
+    Attributes:
+        attributes: all of its attributes.
+        data: content of a dataset, None for a group.
+    """
+
+    attributes: Mapping[str, NDArray[np.generic]]
+    data: NDArray[np.generic] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenRecord:
+    """An open record.
+
+    Attributes:
+        record: everything but the arrays.
+        content_sha256: SHA-256 of the document, as stated; 64 hexadecimal digits.
+        file: the HDF5 file.
+    """
+
+    record: RunRecord
+    content_sha256: str
+    file: h5py.File
+
+    def payload(self, address: str, port: str) -> StoredPayload:
+        """Read an output of a cell; arrays of mapped products stay valid after closing.
+
+        Raises:
+            RecordFormatError: there is no such output, it is not embedded, it is damaged, or it is
+                not what its digest says.
+        """
+        cell = next((cell for cell in self.record.cells if cell.address == address), None)
+        output = None if cell is None else cell.outputs.get(port)
+        if output is None:
+            raise RecordFormatError(f"the record has no output {port} of the cell {address}")
+        if not output.embedded:
+            raise RecordFormatError(
+                f"the record names the output {port} of {address} ({output.type_name}) by its "
+                f"digest only, {output.digest}: it is in the store, or run again with --embed"
+            )
+        group = open_group(self.file, product_path(output.digest))
+        payload = read_payload(group, map_arrays=True)
+        # Who shows or hands on arrays has not looked at the seal of the file.
+        if (found := payload_digest(payload)) != output.digest:
+            raise RecordFormatError(
+                f"{group.name} has the digest {found}, the record says {output.digest}: it was "
+                "changed, or the file is damaged"
+            )
+        return payload
+
+
+def write_record(
+    path: Path,
+    record: RunRecord,
+    product_file: ProductFile,
+    *,
+    embed: bool = False,
+    keep_folders: bool = False,
+    input_file: InputFile | None = None,
+    earlier: Path | None = None,
+) -> str:
+    """Write a record next to its final place and move it there when it is complete.
+
+    Args:
+        path: the record, usually `run.h5`; its folder exists.
+        record: everything but the arrays.
+        product_file: digest -> file that `write_product_file` wrote, None when there is none.
+        embed: put in the arrays of all outputs, not only of those marked `embedded`.
+        keep_folders: leave absolute paths in logs, messages and options.
+        input_file: SHA-256 -> file with it, for the inputs marked `embedded`.
+        earlier: another record of this run; the outputs embedded in it are taken from there.
+
+    Returns:
+        The content digest, 64 hexadecimal digits.
+
+    Raises:
+        RecordFormatError: a name is impossible in a record, or a product to embed is missing,
+            damaged or another one.
+        InputFileError: an input file to embed is missing or another one.
+        OSError: the file cannot be written, e.g. because the disk is full; what stood at `path`
+            before is untouched.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    written = _as_written(record, embed=embed, keep_folders=keep_folders)
+    _check_names(written)
+    text = document_text(written)
+    with ExitStack() as stack:
+        before = stack.enter_context(safe_open(earlier)) if earlier else None
+        file = stack.enter_context(create_file(part))
+        for name, node in expected_nodes(written, text).items():
+            _write_node(file, name, node)
+        products = create_group(file, PRODUCTS)
+        for digest in _embedded(written):
+            _embed_product(products, digest, product_file, before)
+        files = create_group(file, FILES)
+        for cell in written.cells:
+            for figure in cell.figures:
+                if (sha256 := hashlib.sha256(figure.data).hexdigest()) not in files:
+                    write_array(files, sha256, np.frombuffer(figure.data, dtype=np.uint8))
+        for entry in written.inputs:
+            for given in entry.files if entry.embedded else ():
+                if given.sha256 not in files:
+                    _embed_file(files, entry.name, given, input_file or _no_file)
+        offset = write_array(file, SEAL, fixed_text(_UNSEALED)).id.get_offset()
+    _seal_file(part, offset)
+    part.replace(path)
+    _sync_folder(path.parent)
+    return sha256_text(text)
+
+
+def read_record(path: Path) -> RunRecord:
+    """Read all of a record but the arrays.
+
+    Raises:
+        RecordFormatError: the file is no record, damaged, incomplete, or of another format.
+        OSError: the file cannot be opened.
+    """
+    with open_record(path) as opened:
+        return opened.record
+
+
+@contextmanager
+def open_record(path: Path) -> Iterator[OpenRecord]:
+    """Open a record for reading.
+
+    Raises:
+        RecordFormatError: the file is no record, damaged, incomplete, or of another format.
+        OSError: the file cannot be opened.
+    """
+    with safe_open(path) as file:
+        check_format(file, RUN_FORMAT)
+        yield OpenRecord(
+            record=record_of(file), content_sha256=text_attribute(file, CONTENT_SHA256), file=file
+        )
+
+
+def record_of(file: h5py.File) -> RunRecord:
+    """Read the document of a file whose format has been checked.
+
+    Raises:
+        RecordFormatError: something required is missing or damaged.
+    """
+
+    def contents(sha256: str) -> bytes:
+        check_name(sha256, "the file")
+        return np.asarray(read_whole(dataset_of(open_group(file, FILES), sha256))).tobytes()
+
+    value = parse_json(read_text(file, DOCUMENT), f"/{DOCUMENT}")
+    return from_json(RunRecord, value, contents)
+
+
+def document_text(record: RunRecord) -> str:
+    """Write the document of a record."""
+    return json.dumps(to_json(record), ensure_ascii=False, allow_nan=False, indent=1)
+
+
+def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
+    """Return what repeats a record so that people find their way: path -> group or dataset.
+
+    Parents come before what lies in them. Products, files and the seal are not among them.
+
+    Args:
+        record: of the document.
+        text: the document.
+    """
+    stated = _attributes(record)
+    root = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION, **stated}
+    nodes = {
+        "/": _node({**root, CONTENT_SHA256: sha256_text(text)}),
+        f"/{DOCUMENT}": _node(data=fixed_text(text)),
+        "/workflow": _node(data=fixed_text(record.workflow_source)),
+        "/metrics": _node(data=_metrics_table(record)),
+        "/published": _node(data=_table(record.published, ("path", "size_bytes", "sha256"))),
+        "/inputs": _node(),
+        "/environments": _node(),
+        f"/{CELLS}": _node(),
+    }
+    for entry in record.inputs:
+        columns = ("name", "size_bytes", "sha256")
+        nodes[f"/inputs/{entry.name}"] = _node(data=_table(entry.files, columns))
+    for environment in record.environments:
+        nodes[f"/environments/{environment.id}"] = _node(
+            _attributes(environment), _pairs(environment.packages, "name", "version")
+        )
+    for cell in record.cells:
+        place = f"/{CELLS}/{cell.address}"
+        nodes[place] = _node(_attributes(cell))
+        for name, data in _cell_tables(cell).items():
+            nodes[f"{place}/{name}"] = _node(data=data)
+    return nodes
+
+
+def product_path(digest: str) -> str:
+    """Return where a record has the product of a digest.
+
+    Raises:
+        RecordFormatError: the digest is none.
+    """
+    scheme, _, digits = digest.partition(":")
+    if f"{scheme}:" != DIGEST_PREFIX or not is_sha256(digits):
+        raise RecordFormatError(f"{digest!r} is no SHA-256 digest")
+    return f"/{PRODUCTS}/{digits}"
+
+
+def is_sha256(text: str) -> bool:
+    """Return whether a text is 64 hexadecimal digits in lower case."""
+    return len(text) == 64 and not set(text) - set("0123456789abcdef")
+
+
+def file_sha256(path: Path, offset: int) -> str:
+    """Digest the bytes of a record file, with zeros as digits in the place of its seal.
+
+    Args:
+        path: the file.
+        offset: of the 64 bytes of the seal.
+    """
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        _digest_bytes(digest.update, stream, offset)
+        digest.update(_UNSEALED.encode())
+        stream.seek(64, os.SEEK_CUR)
+        _digest_bytes(digest.update, stream, None)
+    return digest.hexdigest()
+
+
+def extract_files(
+    path: Path, inputs: tuple[RecordedInput, ...], folder: Path
+) -> Mapping[str, tuple[Path, ...]]:
+    """Write the embedded input files of a record into a folder, under their names.
+
+    Args:
+        path: the record.
+        inputs: of the record.
+        folder: made when missing; each file gets a folder of its own, as names may come twice.
+
+    Returns:
+        Input -> files, in the order of the record; inputs that are not embedded are left out.
+
+    Raises:
+        RecordFormatError: a file is damaged, is not the one that the record describes, or has a
+            name that cannot be that of a file.
+        OSError: a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with safe_open(path) as opened:
+        return {
+            entry.name: tuple(_extracted(opened, entry, folder))
+            for entry in inputs
+            if entry.embedded
+        }
+
+
+def _as_written(record: RunRecord, *, embed: bool, keep_folders: bool) -> RunRecord:
+    def clean(text: str) -> str:
+        # HDF5 text cannot hold NUL, and UTF-8 no halves of surrogate pairs.
+        text = text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
+        return text if keep_folders else without_folders(text)
+
+    cells = tuple(
+        dataclasses.replace(
+            cell,
+            error_message=clean(cell.error_message),
+            warnings=tuple(map(clean, cell.warnings)),
+            diagnostics=tuple(
+                dataclasses.replace(one, text=clean(one.text), remedy=clean(one.remedy))
+                for one in cell.diagnostics
+            ),
+            log=clean(cell.log),
+            outputs={
+                port: dataclasses.replace(output, embedded=output.embedded or embed)
+                for port, output in cell.outputs.items()
+            },
+        )
+        for cell in record.cells
+    )
+    return dataclasses.replace(
+        record,
+        workflow_resolved=clean(record.workflow_resolved),
+        overrides=tuple(map(clean, record.overrides)),
+        cells=cells,
+    )
+
+
+def _check_names(record: RunRecord) -> None:
+    """Refuse names that cannot be one link in HDF5, and those that come twice."""
+    named = {
+        "the input": [entry.name for entry in record.inputs],
+        "the environment": [entry.id for entry in record.environments],
+        "the cell": [cell.address for cell in record.cells],
+    }
+    for what, names in named.items():
+        for index, name in enumerate(names):
+            check_name(name, what)
+            if name in names[:index]:
+                raise RecordFormatError(f"{what} {name!r} is given twice")
+    for cell in record.cells:
+        for port in (*cell.inputs, *cell.outputs):
+            check_name(port, "the port")
+    for entry in record.inputs:
+        for file in entry.files:
+            if "/" in file.name:
+                raise RecordFormatError(
+                    f"the file {file.name!r} of the input {entry.name} must be named without its "
+                    "folder"
+                )
+
+
+def _embedded(record: RunRecord) -> Iterable[str]:
+    return dict.fromkeys(
+        output.digest
+        for cell in record.cells
+        for output in cell.outputs.values()
+        if output.embedded
+    )
+
+
+def _node(
+    attributes: Mapping[str, str | float] | None = None, data: NDArray[np.generic] | None = None
+) -> Node:
+    return Node(
+        attributes={name: attribute_value(value) for name, value in (attributes or {}).items()},
+        data=data,
+    )
+
+
+def _attributes(entry: object) -> dict[str, str | float]:
+    """Return the fields of a dataclass that one sees at a glance."""
+    found: dict[str, str | float] = {}
+    for item in dataclasses.fields(entry):  # type: ignore[arg-type] # any dataclass
+        value = getattr(entry, item.name)
+        if item.name == "seed":
+            # A seed may have more digits than a number in HDF5.
+            value = "" if value is None else str(value)
+        if isinstance(value, _PLAIN) and not item.name.startswith(("workflow_", "key_", "log")):
+            found[item.name] = value[:_LONGEST_ATTRIBUTE] if isinstance(value, str) else value
+    return found
+
+
+def _cell_tables(cell: RecordedCell) -> dict[str, NDArray[np.generic]]:
+    product = ("port", "type_name", "encoding_version", "digest")
+    params = [
+        {
+            "name": name,
+            "value": json.dumps(value, ensure_ascii=False),
+            "is_set": int(name in cell.params_set),
+        }
+        for name, value in cell.params.items()
+    ]
+    inputs, outputs = (
+        [{"port": port, **vars(one), "embedded": int(one.embedded)} for port, one in found.items()]
+        for found in (cell.inputs, cell.outputs)
+    )
+    figures = [
+        {**vars(figure), "sha256": hashlib.sha256(figure.data).hexdigest()}
+        for figure in cell.figures
+    ]
+    return {
+        "params": _table(params, ("name", "value", "is_set"), numbers=("is_set",)),
+        "inputs": _table(inputs, (*product, "source"), numbers=("encoding_version",)),
+        "outputs": _table(
+            outputs, (*product, "embedded"), numbers=("encoding_version", "embedded")
+        ),
+        "figures": _table(figures, ("name", "caption", "media_type", "sha256")),
+        "warnings": _table([{"text": text} for text in cell.warnings], ("text",)),
+        "log": fixed_text(cell.log),
+    }
+
+
+def _metrics_table(record: RunRecord) -> NDArray[np.generic]:
+    rows = [
+        {"cell": cell.address, "step": cell.step, "method": cell.method, **vars(metric)}
+        for cell in record.cells
+        if cell.status == "ok"
+        for metric in (*cell.metrics, *cost_metrics(cell))
+    ]
+    columns = ("cell", "step", "method", "name", "value", "unit", "label", "better")
+    return _table(rows, columns, reals=("value",))
+
+
+def _pairs(pairs: Mapping[str, str], key: str, value: str) -> NDArray[np.generic]:
+    return _table([{key: one, value: other} for one, other in pairs.items()], (key, value))
+
+
+def _table(
+    rows: Sequence[object],
+    columns: Sequence[str],
+    *,
+    numbers: Sequence[str] = ("size_bytes",),
+    reals: Sequence[str] = (),
+) -> NDArray[np.generic]:
+    """Return rows, dataclasses or mappings, as a flat table; text columns as wide as need be."""
+    values = [dict(row) if isinstance(row, Mapping) else vars(row) for row in rows]
+    filled: dict[str, NDArray[np.generic]] = {}
+    for name in columns:
+        column = [row[name] for row in values]
+        if name in numbers or name in reals:
+            filled[name] = np.array(column, dtype="<f8" if name in reals else "<i8")
+        else:
+            texts = [fixed_text(text).item() for text in column]
+            width = max((len(text) for text in texts), default=1)
+            filled[name] = np.array(texts, dtype=h5py.string_dtype("utf-8", max(1, width)))
+    table = np.empty(len(rows), dtype=[(name, filled[name].dtype) for name in columns])
+    for name in columns:
+        table[name] = filled[name]
+    return table
+
+
+def _write_node(file: h5py.File, path: str, node: Node) -> None:
+    parent, _, name = path.rpartition("/")
+    if path == "/":
+        item = file
+    elif node.data is None:
+        item = create_group(file[parent or "/"], name)
+    else:
+        item = write_array(file[parent or "/"], name, node.data)
+    for title, value in node.attributes.items():
+        item.attrs[title] = value
+
+
+def _embed_product(
+    products: h5py.Group, digest: str, product_file: ProductFile, earlier: h5py.File | None
+) -> None:
+    place = product_path(digest)
+    if earlier is not None and place in earlier:
+        _copy_product(products, digest, open_group(earlier, place))
+        return
+    path = product_file(digest)
+    if path is None:
+        raise RecordFormatError(
+            f"the product {digest} is not in the store any more: run the workflow again"
+        )
+    with safe_open(path) as source:
+        _copy_product(products, digest, open_group(source, PRODUCT_GROUP))
+
+
+def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None:
+    stored = text_attribute(source, "digest")
+    if stored != digest:
+        name = Path(source.file.filename).name
+        raise RecordFormatError(f"{name} must hold the product {digest}, got {stored}")
+    # Copies chunks as they are; unpacking and packing again would be ten times slower.
+    source.file.copy(source, products, name=digest.removeprefix(DIGEST_PREFIX))
+
+
+def _no_file(sha256: str) -> Path | None:
+    del sha256
+    return None
+
+
+def _embed_file(
+    files: h5py.Group, input_name: str, file: RecordedFile, input_file: InputFile
+) -> None:
+    path = input_file(file.sha256)
+    if path is None:
+        raise InputFileError(
+            f"the file {file.name} of the input {input_name} is to be embedded, but there is none "
+            f"with its SHA-256 {file.sha256[:12]}..."
+        )
+    another = InputFileError(
+        f"the input file {path.name} must have {file.size_bytes} bytes with the SHA-256 "
+        f"{file.sha256[:12]}..., but it was changed since it was digested"
+    )
+    if not path.is_file():
+        # A pipe in its place would be waited for.
+        raise another
+    # Neither chunked nor packed: photos and scans are packed already, and digests guard the bytes.
+    dataset = files.create_dataset(
+        file.sha256, shape=(file.size_bytes,), dtype=np.uint8, track_times=False
+    )
+    digest, n_bytes = hashlib.sha256(), 0
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            if n_bytes + len(block) > file.size_bytes:
+                raise another
+            dataset[n_bytes : n_bytes + len(block)] = np.frombuffer(block, dtype=np.uint8)
+            digest.update(block)
+            n_bytes += len(block)
+    if n_bytes != file.size_bytes or digest.hexdigest() != file.sha256:
+        raise another
+
+
+def _seal_file(path: Path, offset: int) -> None:
+    seal = file_sha256(path, offset)
+    with path.open("r+b") as stream:
+        stream.seek(offset)
+        stream.write(seal.encode())
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _digest_bytes(update: Callable[[bytes], object], stream: BinaryIO, n_bytes: int | None) -> None:
+    """Digest so many bytes of a stream, all that are left without a number."""
+    left = n_bytes
+    while left is None or left > 0:
+        block = stream.read(_BLOCK_BYTES if left is None else min(left, _BLOCK_BYTES))
+        if not block:
+            return
+        update(block)
+        left = None if left is None else left - len(block)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterator[Path]:
+    files = open_group(opened, FILES)
+    for index, file in enumerate(entry.files):
+        check_name(file.sha256, "the file")
+        dataset = dataset_of(files, file.sha256)
+        # Before anything is written: the record says how much room it takes.
+        if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
+            raise RecordFormatError(
+                f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
+                f"{dataset.dtype} {dataset.shape}"
+            )
+        inside = f"{entry.name}/{index:04}/{file.name}"
+        with create_below(folder, inside) as stream:
+            sha256 = dataset_sha256(dataset, stream.write)
+        if sha256 != file.sha256:
+            raise RecordFormatError(
+                f"{dataset.name} has the SHA-256 {sha256}, the record says {file.sha256} of "
+                f"{file.name!r}"
+            )
+        yield path_below(folder, inside)
+
+
+def dataset_sha256(dataset: h5py.Dataset, also: Callable[[bytes], object] = len) -> str:
+    """Digest a dataset of bytes, block by block.
+
+    Args:
+        dataset: one-dimensional, uint8.
+        also: gets each block.
+
+    Raises:
+        RecordFormatError: the dataset is damaged.
+    """
+    digest = hashlib.sha256()
+    for start in range(0, dataset.size, _BLOCK_BYTES):
+        with reading(dataset.name):
+            block = dataset[start : start + _BLOCK_BYTES].tobytes()
+        digest.update(block)
+        also(block)
+    return digest.hexdigest()
