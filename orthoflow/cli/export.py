@@ -230,18 +230,21 @@ def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
 
 def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.cli.exports.results import embedded
-    from orthoflow.records.wall_results import content_digest
 
-    before = content_digest(run)
     make_empty(folder)
     record = embedded(run, folder, chosen)
-    after = content_digest(record)
+    after = record.content_sha256
+    is_same = after == run.content_sha256
     n_products = sum(len(cell.outputs) for cell in record.cells.values())
     n_files = sum(len(entry.files) for entry in record.record.inputs)
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + ("sealed anew" if after != before else "all of it embedded before, the same seal")
+        + (
+            "sealed anew"
+            if after != run.content_sha256
+            else "all of it embedded before, the same seal"
+        )
         + f": sha256:{after}"
     )
 

@@ -67,7 +67,8 @@ def replay(
     What is missing or not as it was is named before anything runs. Says of every product whether
     it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
     differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
-    whose products are identical: by more than a millionth, or a count at all; and where it cannot
+    whose products are identical or whose method's code has changed: by more than a millionth, or a
+    count at all; and where it cannot
     be replayed because an input or the record was changed, or a method is of another version; else
     with 2 where an input is not to be found, with 4 where methods are missing.
     """
@@ -154,7 +155,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare and say how far the products lie apart."""
-        from orthoflow.records.replay_metrics import replayed_metrics
+        from orthoflow.records.replay_metrics import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
 
         current_session().resume_hint = (
@@ -165,9 +166,10 @@ class _Call:
             echo(f"note: {note}", err=self.as_json)
         made = self._make()
         distances = self._distances(made)
-        metrics = replayed_metrics(self.original, made, distances)
-        verdicts = [*(item.verdict for item in distances), *(item.verdict for item in metrics)]
-        differs = "different" in verdicts
+        metrics = replayed_metrics(self.original, made, distances, self.replay.changed_methods)
+        differs = any(item.verdict == "different" for item in distances) or any(
+            item.verdict in DIFFERING for item in metrics
+        )
         content = {
             "record": str(self.original.path),
             "replay": str(made.path),
@@ -230,7 +232,10 @@ def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
     what = "metrics, without times"
     kinds = (
         ("different", "differ though the products of their steps are identical"),
-        ("excused", "differ by rounding, as products do, or are not in the record"),
+        ("code changed", "differ, and the code of a method behind them is not that of the record"),
+        ("products", "differ with the products of their steps, which are not the same bits"),
+        ("not in the record", "are not in the record"),
+        ("rounding", "differ by rounding"),
     )
     lines = []
     for verdict, said in kinds:

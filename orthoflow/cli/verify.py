@@ -24,21 +24,30 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="The public key, OpenSSH or PEM, that the record must be signed with.",
 )
+@click.option(
+    "--strict",
+    is_flag=True,
+    help="Fail over notes, too: published files that are missing or not the record's, a changed "
+    "report, a signature that was not checked.",
+)
 @json_option
-def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
+def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> int:
     """Check that the record of RUN, a run folder or its run.h5, is whole and unchanged.
 
-    Recomputes the seal, the digest of every product and input file in the record, every cache
-    key and the digest of the workflow, and compares the published files beside the record with
-    theirs; one that is not there is noted. The report and its figures are not covered: `orthoflow
-    report` makes them anew from the record; nor is what else lies in the folder, logs and the
-    description of a crate, say. With --signer the record must be signed with that key.
-    Ends with 3 when something differs, or RUN is no record or of a newer orthoflow.
+    Recomputes the seal of the file, the digest of every product and input file in the record and
+    every cache key, compares what repeats the document with it, and the published files and report
+    pages beside the record with what was written. Files that are missing, or that the record does
+    not name, and a report that was changed are noted; with --strict they fail. Figures beside the
+    report, and what else lies in the folder, logs, say, are not covered. With --signer the record
+    must be signed with that key.
+    Ends with 3 when something differs, or RUN is no record or of another version.
     """
     from orthoflow.records.verification import verify_run
 
     verification = verify_run(run, signer=signer)
-    findings = verification.findings
+    notes = verification.notes
+    failing = [note for note in notes if strict and not note.is_harmless]
+    findings = (*verification.findings, *(f"{note.code}: {note.text}" for note in failing))
     if as_json:
         echo_json(
             {
@@ -47,15 +56,17 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
                 "products": verification.n_products,
                 "inputs": verification.n_inputs,
                 "published": verification.n_published,
+                "pages": verification.n_pages,
                 "seal": verification.seal,
                 "signed_with": verification.signed_with,
                 "findings": list(findings),
-                "notes": list(verification.notes),
+                "notes": [note.text for note in notes if note not in failing],
             }
         )
         return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
-    for note in verification.notes:
-        echo(f"note: {note}")
+    for note in notes:
+        if note not in failing:
+            echo(f"note: {note.text}")
     if verification.seal:
         echo(f"seal: sha256:{verification.seal}")
     if not findings:
@@ -63,7 +74,8 @@ def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     else:
         for finding in findings:
             echo(finding)
-        say_error(f"error: {verification.wrong}, see above")
+        beside = f"the seal of {verification.path} holds, but what lies beside it is not as written"
+        say_error(f"error: {verification.wrong or beside}, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 
 
@@ -76,6 +88,8 @@ def _summary(verification: Verification) -> str:
     parts.append("seal ok")
     if verification.n_published:
         parts.append(f"{counted(verification.n_published, 'published file')} unchanged")
+    if verification.n_pages:
+        parts.append(f"{counted(verification.n_pages, 'report page')} as written")
     if verification.signed_with:
         parts.append(f"signed with {verification.signed_with}")
     return f"verified: {', '.join(parts)}"

@@ -33,7 +33,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from orthoflow_provenance.arrays import payload_digest
 from orthoflow_provenance.document import (
     RecordFormatError,
     canonical_json,
@@ -496,7 +495,10 @@ class Store:
 
         Nobody knows any more what its published files were: they are taken as they are, once.
         """
-        from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
+        from orthoflow_provenance.arrays import (  # noqa: PLC0415 - as above
+            payload_digest,
+            read_product_file,
+        )
 
         try:
             stored = read_product_file(folder / PRODUCT, map_arrays=True)
@@ -548,6 +550,8 @@ def publish_into(folder: Path, product: Product, publisher: Publisher, digest: s
 
 def digest_of(product: Product) -> str:
     """Digest of a product's logical content, `sha256:` + 64 hexadecimal digits."""
+    from orthoflow_provenance.arrays import payload_digest  # noqa: PLC0415 - as above
+
     return payload_digest(product.to_payload())
 
 

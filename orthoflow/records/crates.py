@@ -31,6 +31,7 @@ from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating, figure_files, path_inside
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, REPORT_FILE, Run
 from orthoflow.records.signatures import SIGNATURE_SUFFIX
+from orthoflow.records.verification import page_of
 from orthoflow.version import DISTRIBUTION
 
 NO_LICENSE: Final = "not stated: ask who made these results"
@@ -114,7 +115,8 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     if record.path != folder / RECORD_FILE:
         with writing_to(folder):
             shutil.copyfile(record.path, folder / RECORD_FILE)
-    wanted = [REPORT_FILE, *pages_of(run).values()]
+    pages = [REPORT_FILE, *pages_of(run).values()]
+    wanted = [*pages]
     # Which the report leads to, where it was written with them.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
     signed: tuple[str, ...] = ()
@@ -128,7 +130,11 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
         for file in files
     ]
     wanted.append(f"{PRODUCTS_FOLDER}/{METRICS_FILE}")
-    return [RECORD_FILE, *signed, *copy_files(run.folder, folder, wanted, run.record.published)]
+    copied = copy_files(run.folder, folder, wanted, run.record.published)
+    for page in set(pages) & set(copied) if record is not run else ():
+        text = path_inside(folder, page).read_text(encoding="utf-8")
+        _write(folder, page, page_of(text, record))
+    return [RECORD_FILE, *signed, *copied]
 
 
 def crate_metadata(

@@ -27,7 +27,7 @@ from orthoflow.products.product import JsonValue
 from orthoflow.records.input_files import embedded_inputs
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files
-from orthoflow.records.runs import PAGES_FOLDER, Run
+from orthoflow.records.runs import PAGES_FOLDER, Run, read_run
 from orthoflow.workflow.model import (
     DATA,
 )
@@ -132,7 +132,7 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
                 )
         except (RecordFormatError, InputFileError) as error:
             raise StoreError(f"{path} cannot be written: {error}") from error
-    return Run(path=path, record=record)
+    return read_run(path)
 
 
 def pages_of(run: Run) -> dict[str, str]:

@@ -1,18 +1,22 @@
-"""Numbers of a replay beside those that the record states: which differ, and what excuses it."""
+"""Numbers of a replay beside those that the record states: which differ, and why."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from orthoflow_provenance.document import RecordedCell
 
-from orthoflow.records.comparison import compare_metrics
+from orthoflow.records.comparison import ComparedMetric, Pair, compare_metrics
 from orthoflow.records.distances import ProductDistance
 from orthoflow.records.runs import Run
 
-MetricVerdict = Literal["same", "excused", "different"]
+MetricVerdict = Literal[
+    "same", "rounding", "products", "not in the record", "code changed", "different"
+]
+# Verdicts that make a replay differ.
+DIFFERING: Final = frozenset({"code changed", "different"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +30,9 @@ class ReplayedMetric:
         recorded_unit: in which unit.
         replayed: what the replay computed, None when nothing.
         replayed_unit: in which unit.
-        verdict: `same` bits; else `excused` by rounding, by products of its step that are not the
-            same bits either, or by a record that does not state it; else `different`.
+        verdict: `same` bits; within `rounding`; moved with `products` of its step that are not the
+            same bits, though within their tolerance or not measured; `not in the record`; of a
+            step behind which a method's `code changed`; else `different`.
     """
 
     cell: str
@@ -40,7 +45,10 @@ class ReplayedMetric:
 
 
 def replayed_metrics(
-    original: Run, made: Run, distances: Sequence[ProductDistance]
+    original: Run,
+    made: Run,
+    distances: Sequence[ProductDistance],
+    changed_methods: Collection[str] = (),
 ) -> tuple[ReplayedMetric, ...]:
     """Compare the numbers of a record with those of its replay, times and memory left out.
 
@@ -48,30 +56,37 @@ def replayed_metrics(
         original: the run that was replayed.
         made: the replay.
         distances: of all their products.
+        changed_methods: ids of the methods whose code is not that of the record.
     """
     identical = {f"{item.cell}.{item.port}" for item in distances if item.verdict == "identical"}
-    found = []
-    for pair in compare_metrics(original, made):
-        is_excused = (
-            pair.left is None
-            or pair.left.is_near(pair.right)
-            or not _is_of_identical(original.cells[pair.cell], identical)
+    is_changed = {
+        address: any(cell.method in changed_methods for cell in original.upstream(address))
+        for address in original.cells
+    }
+
+    def verdict(pair: Pair[ComparedMetric]) -> MetricVerdict:
+        if pair.is_same:
+            return "same"
+        if pair.left is None:
+            return "not in the record"
+        if pair.left.is_near(pair.right):
+            return "rounding"
+        if is_changed[pair.cell]:
+            return "code changed"
+        return "different" if _is_of_identical(original.cells[pair.cell], identical) else "products"
+
+    return tuple(
+        ReplayedMetric(
+            cell=pair.cell,
+            metric=pair.name,
+            recorded=pair.left.value if pair.left else None,
+            recorded_unit=pair.left.unit if pair.left else "",
+            replayed=pair.right.value if pair.right else None,
+            replayed_unit=pair.right.unit if pair.right else "",
+            verdict=verdict(pair),
         )
-        verdict: MetricVerdict = (
-            "same" if pair.is_same else "excused" if is_excused else "different"
-        )
-        found.append(
-            ReplayedMetric(
-                cell=pair.cell,
-                metric=pair.name,
-                recorded=pair.left.value if pair.left else None,
-                recorded_unit=pair.left.unit if pair.left else "",
-                replayed=pair.right.value if pair.right else None,
-                replayed_unit=pair.right.unit if pair.right else "",
-                verdict=verdict,
-            )
-        )
-    return tuple(found)
+        for pair in compare_metrics(original, made)
+    )
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:

@@ -57,12 +57,14 @@ class Replay:
         workflow: of the record, for the record of the replay.
         plan: its cells with the parameters and seeds as recorded.
         notes: what is not as it was and may change results: code, libraries, Python, processor.
+        changed_methods: methods whose code is not that of the record, though its version is.
         is_embedded: the record has the arrays of every product and all input files.
     """
 
     workflow: Workflow
     plan: RunPlan
     notes: tuple[str, ...]
+    changed_methods: frozenset[str]
     is_embedded: bool
 
 
@@ -136,10 +138,13 @@ def plan_replay(
     found = _with_files(workflow, paths)
     cells = [_cell(cell, workflow) for cell in run.record.cells]
     plan = plan_run(cells, found, catalog, store, options)
+    changed = _changed_methods(run, plan)
+    notes = (*_environment_notes(run), *_method_notes(run, plan, changed))
     return Replay(
         workflow=workflow,
         plan=plan,
-        notes=tuple(dict.fromkeys((*_environment_notes(run), *_method_notes(run, plan)))),
+        notes=tuple(dict.fromkeys(notes)),
+        changed_methods=changed,
         is_embedded=_is_embedded(run),
     )
 
@@ -313,18 +318,28 @@ def _environment_notes(run: Run) -> Iterator[str]:
                 yield f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
 
 
-def _method_notes(run: Run, plan: RunPlan) -> Iterator[str]:
+def _changed_methods(run: Run, plan: RunPlan) -> frozenset[str]:
+    return frozenset(
+        cell.method
+        for cell in run.record.cells
+        if cell.method in plan.methods
+        and cell.key_preimage
+        and stated_versions(read_preimage(cell.key_preimage), "code")
+        != dict(plan.methods[cell.method].code)
+    )
+
+
+def _method_notes(run: Run, plan: RunPlan, changed: frozenset[str]) -> Iterator[str]:
     for cell in run.record.cells:
         facts = plan.methods.get(cell.method)
         if facts is None or not cell.key_preimage:
             continue
-        preimage = read_preimage(cell.key_preimage)
-        if stated_versions(preimage, "code") != dict(facts.code):
+        if cell.method in changed:
             yield (
                 f"{cell.method}: its code is not that of the record, though both say result "
                 f"version {cell.result_version}"
             )
-        recorded = stated_versions(preimage, "tools")
+        recorded = stated_versions(read_preimage(cell.key_preimage), "tools")
         for tool in sorted(recorded.keys() | facts.tools.keys()):
             versions = facts.tools.get(tool), recorded.get(tool)
             if versions[0] != versions[1]:

@@ -20,7 +20,7 @@ from orthoflow_provenance.document import (
     RunRecord,
     shared_fields,
 )
-from orthoflow_provenance.record import open_record, read_record
+from orthoflow_provenance.record import open_record
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
@@ -53,6 +53,7 @@ class Run:
         output: reads an output by address and port from the record that is held open; None where
             it is opened for it.
         files_folder: what stands for the folder of the record, where its files lie elsewhere.
+        content_sha256: the digest that seals the record; empty where it was not read from a file.
         later_name: name that the record file gets once all beside it is written; empty where it has
             its name.
     """
@@ -61,6 +62,7 @@ class Run:
     record: RunRecord
     output: Callable[[str, str], StoredPayload] | None = field(default=None, compare=False)
     files_folder: Path | None = field(default=None, compare=False)
+    content_sha256: str = field(default="", compare=False)
     later_name: str = field(default="", compare=False)
 
     @property
@@ -80,7 +82,7 @@ class Run:
         with ExitStack() as stack:
             with record_errors(self.path):
                 opened = stack.enter_context(open_record(self.path))
-            yield replace(self, output=opened.payload)
+            yield replace(self, output=opened.payload, content_sha256=opened.content_sha256)
 
     @property
     def folder(self) -> Path:
@@ -254,8 +256,26 @@ def open_run(path: str | Path) -> Run:
         RecordError: the record is damaged, no record at all, or of a newer format.
     """
     record_path = find_record(path)
-    with record_errors(record_path):
-        return Run(path=record_path, record=read_record(record_path))
+    return read_run(record_path)
+
+
+def read_run(path: Path, *, later_name: str = "") -> Run:
+    """Read a record file, whatever it is called.
+
+    Args:
+        path: the file.
+        later_name: as of `Run`.
+
+    Raises:
+        RecordError: the record is damaged, no record at all, or of another format.
+    """
+    with record_errors(path), open_record(path) as opened:
+        return Run(
+            path=path,
+            record=opened.record,
+            content_sha256=opened.content_sha256,
+            later_name=later_name,
+        )
 
 
 def find_record(path: str | Path) -> Path:

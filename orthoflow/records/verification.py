@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import os
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from orthoflow_provenance.document import PublishedFile, RunRecord, UnsafeFileError
-from orthoflow_provenance.paths import open_below
+from orthoflow_provenance.paths import files_below, open_below
 from orthoflow_provenance.record import open_record
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.alike import first_few
+from orthoflow.engine.run_folder import JOURNAL, LOGS
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
@@ -35,6 +37,9 @@ _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # A crate has its description, two files of the workflow and one per environment.
 _UNCOVERED_MOST: Final = 8
+# Before the digests at the end of a page.
+_PAGE_MARK: Final = "orthoflow report of"
+_LARGEST_PAGE_BYTES: Final = 1 << 30
 
 PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
@@ -45,6 +50,25 @@ _WRONG: Final[dict[PublishedState, str]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
+class Note:
+    """Something beside a record that does not make the record wrong.
+
+    Attributes:
+        code: `missing` or `foreign` published files, a `page` that is not of this record or was
+            changed, a `signature` that was not checked; or `uncovered` files of other programs.
+        text: one sentence.
+    """
+
+    code: Literal["missing", "foreign", "page", "signature", "uncovered"]
+    text: str
+
+    @property
+    def is_harmless(self) -> bool:
+        """Whether a strict check passes over it."""
+        return self.code == "uncovered"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Verification:
     """What a check of a record found.
 
@@ -52,13 +76,14 @@ class Verification:
         path: the record file.
         findings: one sentence per difference; empty when all is as it was written.
         wrong: what the findings are of, in words; empty without any.
-        notes: what could not be checked, a sentence each.
+        notes: what could not be checked, or is not of the record.
         seal: the digest that seals the record, 64 hexadecimal digits, as sheets show it; empty
             where the record itself is not as it was written.
         n_named: products that the record names by their digests alone.
         n_products: products whose arrays lie in the record and were compared with their digest.
         n_inputs: input files that lie in the record and were compared with their digest.
         n_published: files beside the record that are as they were published.
+        n_pages: report pages beside the record that show it and are as they were written.
         signed_with: fingerprint of the key that the record is signed with, empty unless that was
             asked for and is so.
     """
@@ -66,12 +91,13 @@ class Verification:
     path: Path
     findings: tuple[str, ...]
     wrong: str = ""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     seal: str = ""
     n_named: int = 0
     n_products: int = 0
     n_inputs: int = 0
     n_published: int = 0
+    n_pages: int = 0
     signed_with: str = ""
 
 
@@ -105,19 +131,64 @@ def verify_run(
     products = [product for cell in record.cells for product in cell.outputs.values()]
     n_products = sum(product.embedded for product in products)
     check = _check_published(record_path, record) if also_published else _PublishedCheck()
+    pages = _page_states(record_path.parent, seal) if also_published else {}
     signature = _check_signature(record_path, signer)
+    changed_pages = tuple(_page_note(record_path.parent, name) for name in pages if not pages[name])
     return Verification(
         path=record_path,
         findings=(*signature.findings, *check.changed),
         wrong=_wrong_beside(record_path, signature, check),
-        notes=(*signature.notes, *check.notes),
+        notes=(*signature.notes, *changed_pages, *check.notes),
         seal=seal,
         signed_with=signature.signed_with,
         n_products=n_products,
         n_named=len(products) - n_products,
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=check.n_same,
+        n_pages=sum(pages.values()),
     )
+
+
+def sealed_page(text: str, runs: Sequence[Run]) -> str:
+    """Return a report page with the digests of the records that it shows and of its own text."""
+    digests = [run.content_sha256 for run in runs if run.content_sha256]
+    sealed = f"{text}\n<!-- {_PAGE_MARK} {' '.join(digests)} "
+    return f"{sealed}page {hashlib.sha256(sealed.encode('utf-8')).hexdigest()} -->\n"
+
+
+def page_of(page: str, run: Run) -> str:
+    """Return a page of another record of the same run, sealed as one of this record."""
+    text, mark, _ = page.rpartition(f"\n<!-- {_PAGE_MARK}")
+    return sealed_page(text, [run]) if mark else page
+
+
+def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
+    """Page beside a record -> whether it shows that record and is as it was written."""
+    names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
+    names += [f"{PAGES_FOLDER}/{name}" for name in sorted(files_below(folder, PAGES_FOLDER))]
+    return {name: _is_own_page(folder, name, content_sha256) for name in names}
+
+
+def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
+    try:
+        with open_below(folder, name) as stream:
+            if os.fstat(stream.fileno()).st_size > _LARGEST_PAGE_BYTES:
+                return False
+            content = stream.read()
+    except (OSError, UnsafeFileError):
+        return False
+    sealed, _, end = content.rpartition(b"page ")
+    shown = sealed.rpartition(_PAGE_MARK.encode())[2].decode("ascii", "replace").split()
+    own = f"{hashlib.sha256(sealed).hexdigest()} -->\n".encode()
+    return end == own and content_sha256 in shown
+
+
+def _page_note(folder: Path, name: str) -> Note:
+    text = (
+        f"{name} does not show this record, or was changed since it was written; `orthoflow report "
+        f"{shlex.quote(str(folder))}` makes it anew"
+    )
+    return Note(code="page", text=text)
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
@@ -155,14 +226,14 @@ def _check_signature(record: Path, signer: Path | None) -> Verification:
         if (unchecked := read_signature(record)) is None:
             return Verification(path=record, findings=())
     except RecordError as error:
-        said = (str(error),)
-        is_asked = signer is not None
-        return Verification(
-            path=record, findings=said if is_asked else (), notes=() if is_asked else said
-        )
-    note = (
-        f"there is a signature, said to be of the key {unchecked.fingerprint}, that was not "
-        "checked: name the signer's public key with --signer"
+        if signer is not None:
+            return Verification(path=record, findings=(str(error),))
+        note = Note(code="signature", text=str(error))
+        return Verification(path=record, findings=(), notes=(note,))
+    note = Note(
+        code="signature",
+        text=f"there is a signature, said to be of the key {unchecked.fingerprint}, that was not "
+        "checked: name the signer's public key with --signer",
     )
     return Verification(path=record, findings=(), notes=(note,))
 
@@ -170,7 +241,7 @@ def _check_signature(record: Path, signer: Path | None) -> Verification:
 @dataclass(frozen=True, kw_only=True)
 class _PublishedCheck:
     changed: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     n_same: int = 0
 
 
@@ -180,13 +251,18 @@ def _check_published(path: Path, record: RunRecord) -> _PublishedCheck:
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
-    notes: tuple[str, ...] = (_missing_note(missing, len(checked)),) if missing else ()
-    views = [name for name in _VIEWS if os.path.lexists(folder / name)]
+    notes = [Note(code="missing", text=_missing_note(missing, len(checked)))] if missing else []
     # A record that travels alone lies among files that are none of its own.
-    others = _uncovered(path, record) if views or len(missing) < len(checked) else []
-    if views or others:
-        notes += (_uncovered_note(folder, views, others),)
-    return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
+    if len(missing) < len(checked) or not checked:
+        foreign, others = _unnamed(path, record)
+        if foreign:
+            rest = first_few(foreign, most=_UNCOVERED_MOST)
+            text = f"the record does not name {rest}, among its published files"
+            notes.append(Note(code="foreign", text=text))
+        if others:
+            text = f"not covered by the record: {first_few(others, most=_UNCOVERED_MOST)}"
+            notes.append(Note(code="uncovered", text=text))
+    return _PublishedCheck(changed=changed, notes=tuple(notes), n_same=states.count("same"))
 
 
 def published_state(folder: Path, file: PublishedFile) -> PublishedState:
@@ -238,28 +314,15 @@ def require_unchanged(run: Run, *paths: Path) -> None:
             raise RecordError(f"{path} cannot be read: {state}")
 
 
-def _uncovered(path: Path, record: RunRecord) -> list[str]:
-    """What lies beside a record and is neither named in it nor shows it, sorted."""
-    known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, *_VIEWS}
+def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
+    """Return what a record does not name: below `products/`, and beside it; sorted."""
+    known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, JOURNAL, LOGS, *_VIEWS}
     _, folders, files = next(os.walk(path.parent), ("", [], []))
-    beside = sorted({*folders, *files} - known)
     named = {file.path for file in record.published}
+    foreign: set[str] = set()
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):
-        paths = [Path(place, name).relative_to(path.parent).as_posix() for name in below]
-        beside += sorted(set(paths) - named)
-    return beside
-
-
-def _uncovered_note(folder: Path, views: list[str], others: list[str]) -> str:
-    rest = first_few(others, most=_UNCOVERED_MOST)
-    if not views:
-        return f"not covered: {rest}, which the record does not name"
-    shows, them = ("shows", "it") if len(views) == 1 else ("show", "them")
-    return (
-        f"not covered: {', '.join(views)}, which {shows} the record; `orthoflow report "
-        f"{shlex.quote(str(folder))}` makes {them} anew"
-        + (f"; nor what else the record does not name: {rest}" if others else "")
-    )
+        foreign |= {Path(place, name).relative_to(path.parent).as_posix() for name in below}
+    return sorted(foreign - named), sorted({*folders, *files} - known)
 
 
 def _missing_note(missing: list[str], n_published: int) -> str:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from orthoflow_provenance.record import open_record
 
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
@@ -19,7 +18,7 @@ from orthoflow.files.sidecars import accuracy_words, placed_raster, read_sidecar
 from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, Inspection, Opening, Openings, Planes, Walls
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
-from orthoflow.records.runs import Run, record_errors
+from orthoflow.records.runs import Run
 from orthoflow.records.verification import require_unchanged
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
@@ -131,12 +130,6 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         cell=looking[0][0].address if looking else "",
         sentence=f"though {n_points} {were} given: {why}",
     )
-
-
-def content_digest(run: Run) -> str:
-    """The digest that seals the record of a run, 64 hexadecimal digits."""
-    with record_errors(run.path), open_record(run.path) as opened:
-        return opened.content_sha256
 
 
 def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> RoomResults:

@@ -26,7 +26,7 @@ from orthoflow_provenance.document import (
     RunRecord,
     shared_fields,
 )
-from orthoflow_provenance.record import read_record, write_record
+from orthoflow_provenance.record import write_record
 
 from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
@@ -36,7 +36,7 @@ from orthoflow.engine.run_folder import RECORD_FILE, kept_from_others
 from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, read_run
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import (
@@ -145,7 +145,7 @@ def _write_run(
     embed: bool,
     before_finish: Callable[[Run], None] | None,
 ) -> Run:
-    record, unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
+    unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
     with writing_to(run_folder):
         if before_finish is not None:
             before_finish(_under_way(unfinished))
@@ -153,7 +153,7 @@ def _write_run(
         sync_tree(run_folder)
         finished = unfinished.replace(run_folder / RECORD_FILE)
         sync_folder(run_folder)
-    return Run(path=finished, record=record)
+    return read_run(finished)
 
 
 def _publish(
@@ -164,7 +164,7 @@ def _publish(
     store: Store,
     *,
     embed: bool,
-) -> tuple[RunRecord, Path]:
+) -> Path:
     """Fill `products/` and write the record under the name that it has until it is finished."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
@@ -176,11 +176,11 @@ def _publish(
         for leftover in run_folder.glob(f".*{RECORD_FILE}.*"):
             leftover.unlink()
         _write_record(unfinished, record, store, plan, embed=embed)
-    return record, unfinished
+    return unfinished
 
 
 def _under_way(unfinished: Path) -> Run:
-    return Run(path=unfinished, record=read_record(unfinished), later_name=RECORD_FILE)
+    return read_run(unfinished, later_name=RECORD_FILE)
 
 
 def show_unfinished(
@@ -220,7 +220,7 @@ def show_unfinished(
     }
     whole = dataclasses.replace(outcome, results={**outcome.results, **missing})
     try:
-        _, unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
+        unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
         try:
             show(_under_way(unfinished))
         finally:
@@ -358,7 +358,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
                 )
         except RecordFormatError as error:
             raise StoreError(f"{path} cannot be written: {error}") from error
-    return Run(path=path, record=record)
+    return read_run(path)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,6 +31,7 @@ from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import figure_files
 from orthoflow.records.runs import FIGURES_FOLDER, Run
+from orthoflow.records.verification import sealed_page
 from orthoflow.records.wall_results import UncountedPoints, uncounted_points
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
@@ -282,7 +283,7 @@ def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
             go_on=place.go_on,
         )
     )
-    write_whole(path, text)
+    write_whole(path, sealed_page(text, runs))
 
 
 def write_whole(path: Path, text: str) -> None:

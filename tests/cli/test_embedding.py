@@ -84,12 +84,9 @@ def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
     verified = studio("verify", "crate")
     notes = [line for line in verified.stdout.splitlines() if line.startswith("note: ")]
     assert (verified.exit_code, len(notes)) == (0, 1), verified.stdout
-    assert notes[0].startswith("note: not covered: report.html, ")
-    environment = next((studio.folder / "crate").glob("requirements-*.txt")).name
-    assert notes[0].endswith(
-        f"; nor what else the record does not name: {environment}, ro-crate-metadata.json, "
-        "workflow-resolved.json, workflow.yaml"
-    ), notes[0]
+    assert "1 report page as written" in verified.stdout
+    assert "ro-crate-metadata.json" in notes[0]
+    assert studio("verify", "--strict", "crate").exit_code == 0
 
 
 def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
@@ -98,7 +95,9 @@ def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
     with h5py.File(studio.folder / "first" / "run.h5", "r+") as file:
         arrays = next(iter(file["products"].values()))["arrays"]
         names: list[str] = []
-        arrays.visititems(lambda name, item: names.append(name) if item.ndim else None)
+        arrays.visititems(
+            lambda name, item: names.append(name) if getattr(item, "ndim", 0) else None
+        )
         arrays[names[0]][...] = 0
     ways = (("--embed",), ("--to", "ro-crate", "--embed"), ("--to", "ro-crate"), ("--to", "sheet"))
     for words in ways:
@@ -188,8 +187,7 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
 def test_a_changed_published_file_is_named_and_does_not_hinder_a_replay(studio: Studio) -> None:
     table = studio.folder / "first" / "products" / "metrics.csv"
     told = studio.json("verify", "first")
-    (note,) = told["notes"]
-    assert (told["ok"], note.split(",")[0]) == (True, "not covered: report.html")
+    assert (told["ok"], told["notes"], told["pages"]) == (True, [], 1)
     assert told["published"] == sum(path.is_file() for path in table.parent.rglob("*"))
     table.write_text(table.read_text().replace("cell", "sell"))
     refused = studio("verify", "first")
@@ -204,3 +202,20 @@ def test_a_missing_published_file_is_noted(studio: Studio) -> None:
     done = studio("verify", "first")
     assert done.exit_code == 0
     assert "published files are not in products/: products/metrics.csv" in done.stdout
+    assert studio("verify", "first", "--strict").exit_code == 3
+
+
+@pytest.mark.parametrize("beside", ["a foreign file", "another page", "a changed page"])
+def test_what_is_noted_fails_a_strict_check(studio: Studio, beside: str) -> None:
+    assert studio("verify", "first", "--strict").exit_code == 0
+    report = studio.folder / "first" / "report.html"
+    if beside == "a foreign file":
+        (studio.folder / "first" / "products" / "mine.tif").touch()
+    elif beside == "another page":
+        report.write_text("<html></html>")
+    else:
+        report.write_text(report.read_text().replace("</html>", " </html>"))
+    assert studio("verify", "first").exit_code == 0
+    done = studio("verify", "first", "--strict")
+    assert done.exit_code == 3
+    assert studio.json("verify", "first")["ok"]

@@ -51,27 +51,46 @@ def told(recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict]) -> tuple[R
     ("recorded", "replayed", "verdicts", "expected"),
     [
         (2.5, 2.5, IDENTICAL, "same"),
-        (2.5, 2.5 + 1e-9, IDENTICAL, "excused"),
+        (2.5, 2.5 + 1e-9, IDENTICAL, "rounding"),
         (2.5, 2.5001, IDENTICAL, "different"),
         (2.5, math.inf, IDENTICAL, "different"),
         # Counts are not rounded, however many.
         (3e7, 3e7 + 1, IDENTICAL, "different"),
-        (2.5, 2.6, ("identical", "within tolerance"), "excused"),
-        (2.5, 2.6, ("within tolerance", "identical"), "excused"),
-        (2.5, 2.6, ("identical", "not measured"), "excused"),
+        (2.5, 2.6, ("identical", "within tolerance"), "products"),
+        (2.5, 2.6, ("within tolerance", "identical"), "products"),
+        (2.5, 2.6, ("identical", "not measured"), "products"),
     ],
 )
-def test_only_rounding_and_other_products_excuse_a_number(
+def test_each_cause_has_a_verdict_of_its_own(
     recorded: float, replayed: float, verdicts: tuple[Verdict, Verdict], expected: str
 ) -> None:
     [found] = told(run_of(*metrics(rms_mm=recorded)), run_of(*metrics(rms_mm=replayed)), verdicts)
     assert (found.recorded, found.replayed, found.verdict) == (recorded, replayed, expected)
 
 
+@pytest.mark.parametrize(
+    ("replayed", "verdict"), [(2.5, "same"), (2.5 + 1e-9, "rounding"), (3.5, "code changed")]
+)
+@pytest.mark.parametrize("verdicts", [IDENTICAL, ("within tolerance", "within tolerance")])
+def test_numbers_behind_changed_code_are_its_doing(
+    replayed: float, verdict: str, verdicts: tuple[Verdict, Verdict]
+) -> None:
+    recorded, made = (run_of(*metrics(rms_mm=value)) for value in (2.5, replayed))
+    distances = [
+        ProductDistance(cell=step, port=port, type_name="t", verdict=said, left="l", right="r")
+        for (step, port), said in zip(
+            (("wall", "walls"), ("crack", "found")), verdicts, strict=True
+        )
+    ]
+    changed = {recorded.cells["wall"].method}
+    [found] = replayed_metrics(recorded, made, distances, changed)
+    assert found.verdict == verdict
+
+
 def test_what_the_record_alone_states_is_not_confirmed() -> None:
     both, one = run_of(*metrics(n=1.0, rms_mm=2.0)), run_of(*metrics(n=1.0))
     assert [item.verdict for item in told(both, one, IDENTICAL)] == ["same", "different"]
-    assert [item.verdict for item in told(one, both, IDENTICAL)] == ["same", "excused"]
+    assert [item.verdict for item in told(one, both, IDENTICAL)] == ["same", "not in the record"]
 
 
 def test_times_are_left_out_but_for_a_number_that_one_side_calls_a_time() -> None:

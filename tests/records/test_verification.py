@@ -88,30 +88,34 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
             "it was not read"
         ),
     )
-    assert found.notes == (
-        "2 of 5 published files are not in products/: products/gone, products/same/below",
-    )
+    (note,) = found.notes
+    assert note.code == "missing"
+    assert "products/gone, products/same/below" in note.text
     (note,) = checked(folder, "same").notes
-    assert note == "not covered: products/link, products/other, which the record does not name"
+    assert note.code == "foreign"
+    assert "products/link, products/other" in note.text
     # A record that travels alone.
     (note,) = checked(folder, "gone").notes
-    assert note == (
-        "the 1 published files of the record are not beside it, so they were not checked"
+    assert note.code == "missing"
+    (folder / "notes.txt").touch()
+    assert {note.code for note in checked(folder, "same").notes} == {"foreign", "uncovered"}
+
+
+def test_a_page_is_of_one_record_and_as_it_was_written(tmp_path: Path) -> None:
+    run: Any = SimpleNamespace(content_sha256="a" * 64)
+    text = module.sealed_page(
+        "<html>1.25 mm</html>", [run, SimpleNamespace(content_sha256="b" * 64)]
     )
-    assert checked(folder) == module._PublishedCheck()
-
-
-def test_what_shows_a_record_is_not_covered(folder: Path) -> None:
-    for name in module._VIEWS[:2]:
-        (folder / name).symlink_to("nowhere")
-    (note,) = checked(folder, "same").notes
-    assert note.startswith(f"not covered: {module._VIEWS[0]}, {module._VIEWS[1]}, which show")
-    assert f"`orthoflow report {folder}`" in note
-    for name in ("run.h5", "run.h5.sig", "workflow.yaml"):
-        (folder / name).touch()
-    (folder / "logs").mkdir()
-    (note,) = checked(folder, *STATES).notes[1:]
-    assert note.endswith("; nor what else the record does not name: logs, workflow.yaml")
+    page = tmp_path / "report.html"
+    page.write_text(text)
+    for digest, is_own in (("a" * 64, True), ("b" * 64, True), ("c" * 64, False)):
+        assert module._page_states(tmp_path, digest) == {"report.html": is_own}
+    for changed in (text.replace("1.25", "0.25"), text + " ", text.replace("a" * 64, "c" * 64), ""):
+        page.write_text(changed)
+        assert module._page_states(tmp_path, "a" * 64) == {"report.html": False}
+    page.unlink()
+    page.symlink_to("/dev/zero")
+    assert module._page_states(tmp_path, "a" * 64) == {"report.html": False}
 
 
 def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
@@ -178,12 +182,15 @@ def test_a_signature_counts_where_it_is_asked_for(
     assert found.findings == ()
     assert found.signed_with == ("SHA256:abc" if is_asked else "")
     assert len(found.notes) == (0 if is_asked else 1)
-    assert all("said to be of the key SHA256:abc, that was not checked" in x for x in found.notes)
+    assert all(
+        "said to be of the key SHA256:abc, that was not checked" in x.text for x in found.notes
+    )
     monkeypatch.setattr(module, "check_signature", refusing)
     monkeypatch.setattr(module, "read_signature", refusing)
     found = module._check_signature(Path("r"), signer)
     said = ("the signature is of another record",)
-    assert (found.findings, found.notes) == ((said, ()) if is_asked else ((), said))
+    texts = tuple(note.text for note in found.notes)
+    assert (found.findings, texts) == ((said, ()) if is_asked else ((), said))
     assert found.signed_with == ""
 
 

@@ -51,7 +51,7 @@ from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Orthoimage, Orthoimages
 from orthoflow.records.runs import Run
-from orthoflow.records.wall_results import RoomResults, WallResult, content_digest, room_results
+from orthoflow.records.wall_results import RoomResults, WallResult, room_results
 
 _DEFAULT_PAPER: Final = "A3"
 _GRID_MM: Final = 20.0
@@ -64,7 +64,7 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
     results = room_results(run, chosen.cell, chosen.wall)
     walls = _chosen_walls(results, chosen)
     scale = chosen.scale or fitting_scale([_size_m(wall) for wall in walls], paper)
-    digest = content_digest(run)
+    digest = run.content_sha256
     drawings = [
         _drawing(results, wall, chosen, scale, _sheet_text(run, wall, block, digest))
         for wall in walls

@@ -241,8 +241,8 @@ def test_sheets_are_counted_and_have_one_scale(
         "orthoflow.cli.exports.drawings.room_results",
         lambda _run, _cell, _wall: results(walls=walls),
     )
-    monkeypatch.setattr("orthoflow.cli.exports.drawings.content_digest", lambda _run: "d" * 64)
-    run: Any = SimpleNamespace(record=SimpleNamespace(run_id="r", name="hall", created_by="o"))
+    told = SimpleNamespace(run_id="r", name="hall", created_by="o")
+    run: Any = SimpleNamespace(record=told, content_sha256="d" * 64)
     # On A3 the longer one fits at 1:50, and the other follows.
     said = module.export_sheets(run, tmp_path / "out", Choices())
     assert said == "2 sheets of 2 walls at 1:50"

@@ -21,7 +21,7 @@ from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
 from orthoflow.errors import RecordError
 from orthoflow.records.runs import Run, open_run
-from orthoflow.records.wall_results import content_digest, room_results
+from orthoflow.records.wall_results import room_results
 from tests.drawing_runs import (
     GAP_M,
     GSD_M,
@@ -115,7 +115,7 @@ def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Pag
         *("0.101", "3.5"),
     ):
         assert said in text, said
-    digest = content_digest(open_run(run))
+    digest = open_run(run).content_sha256
     letters = "".join(character["text"] for character in sheet.chars)
     assert all(digest[k : k + 16] in letters for k in (0, 16, 32, 48))
 
