@@ -1,7 +1,7 @@
 """A file layer that fails at the n-th operation, for the process that puts it in place.
 
 It stands between Python and the system, below everything that writes here: HDF5 too writes through
-`os.pwrite` (`orthoflow_provenance.sinks`). Only what lies in folders below one folder is counted.
+`os.pwrite` (`orthoflow_provenance.hdf5`). Only what lies in folders below one folder is counted.
 """
 
 from __future__ import annotations

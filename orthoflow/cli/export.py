@@ -240,11 +240,7 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + (
-            "sealed anew"
-            if after != run.content_sha256
-            else "all of it embedded before, the same seal"
-        )
+        + ("all of it embedded before, the same seal" if is_same else "sealed anew")
         + f": sha256:{after}"
     )
 

