@@ -162,9 +162,9 @@ def test_metrics_carry_what_their_method_calls_them() -> None:
         Metric(name=name, value=1.0, unit="1")
         for name in ("n_patches", "damp_share", "wall_12_rms_mm", "other")
     ]
-    assert [(one.name, one.words, one.good) for one in labelled(Damp, reported)] == [
+    assert [(one.name, one.label, one.better) for one in labelled(Damp, reported)] == [
         ("n_patches", "damp patches", ""),
-        ("damp_share", "share that is damp", "less"),
+        ("damp_share", "share that is damp", "lower"),
         ("wall_12_rms_mm", "RMS, wall 12", ""),
         ("other", "", ""),
     ]
