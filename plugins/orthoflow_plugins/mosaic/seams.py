@@ -32,7 +32,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.agreement import (
     SeamSteps,
@@ -76,6 +76,23 @@ _TINT: Final = 0.45
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
+
+
+CONTRADICTED: Final = DiagnosticSpec(
+    code="photo-against-scan",
+    severity="warning",
+    text="{subject}: {share:.1%} of its cells are shown by one photo alone, and the scan has "
+    "another colour there: something that passed by may be painted",
+    remedy="take a second photo of it, or give the input seams",
+    rank_by="share",
+)
+UNCHECKED: Final = DiagnosticSpec(
+    code="accuracy-not-checked",
+    severity="note",
+    text="{subject}: the accuracy of its orthoimage is not checked: no tie of a photo lies on it",
+    remedy="measure points on it in a photo (input ties), or take a photo that shows it beside a "
+    "wall with ties",
+)
 
 
 class MosaicSeams(Method):
@@ -217,6 +234,7 @@ class MosaicSeams(Method):
                 verdict.shifts_cells,
                 surroundings,
                 inputs.cameras,
+                ctx,
                 allocate,
             )
             verdicts.append(replace(verdict, image=image))
@@ -365,6 +383,7 @@ def _with_errors(
     shifts_cells: NDArray[np.float64],
     surroundings: _Surroundings,
     cameras: Cameras | None,
+    ctx: StepContext,
     allocate: Allocate,
 ) -> Orthoimage:
     """Add the expected error of each cell, where ties lie on the wall that tell of it."""
@@ -374,6 +393,7 @@ def _with_errors(
     if n_control + n_check == 0:
         unknown = np.asarray(allocate("error_m", image.frame.shape, np.float32), np.float32)
         unknown[...] = np.nan
+        ctx.report(UNCHECKED, subject=image.name)
         return replace(image, error_m=unknown)
     errors_m = expected_errors_m(
         surroundings.wall,
@@ -501,11 +521,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     for item in verdicts:
         share = item.n_contradicted / item.image.mask.size
         if share >= _CONTRADICTED_WORTH_WORDS:
-            ctx.warn(
-                f"{item.image.name}: {share:.1%} of its cells are shown by one photo alone, and "
-                "the scan has another colour there: something that passed by may be painted; take "
-                "a second photo of it, or give seams"
-            )
+            ctx.report(CONTRADICTED, subject=item.image.name, share=share)
     _report_errors(ctx, [item.image for item in verdicts])
     _report_gains(ctx, verdicts)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import SurfaceMask, Wall
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
@@ -21,16 +22,65 @@ from orthoflow_plugins.raster.walls import WallRaster
 _CELLS_ASKED: Final = 1 << 26
 # Points of a scan are to lie so many cells apart at most.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
-# Empty and interpolated cells are warned of where so many of a wall are; what to do is told of
-# causes that have so many.
+# Empty and interpolated cells are warned of where so many of a wall are, by causes of so many.
 _SHARE_WORTH_WORDS: Final = 0.1
-_CAUSE_WORTH_ADVICE: Final = 0.01
+_CAUSE_WORTH_WORDS: Final = 0.01
+# What stands before a wall and is left out of it is missed sooner.
+_LEFT_OUT_WORTH_WORDS: Final = 0.05
 # The least share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
 # Where a cell that has points has so many, no cell is empty for want of larger ones.
 _DENSE_POINTS: Final = 4.0
 # A net leaves a few cells void along the rim of every wall.
 _VOID_WORTH_WORDS: Final = 0.01
+
+FRONT_LEFT_OUT: Final = DiagnosticSpec(
+    code="wall-front-left-out",
+    severity="error",
+    text="{subject}: {share:.1%} of it is left out: what stands there up to {before_m} m before "
+    "its plane is not taken for a part of the wall",
+    remedy="{step}.buffer_front_m={buffer_front_m} shows it",
+    rank_by="share",
+)
+BEHIND_BUFFER: Final = DiagnosticSpec(
+    code="wall-behind-buffer",
+    severity="warning",
+    text="{subject}: {share:.1%} of its cells are empty: what was scanned there lies about "
+    "{behind_m} m behind its plane",
+    remedy="{step}.buffer_behind_m={buffer_behind_m} shows it, if that is the wall",
+    rank_by="share",
+)
+HIDDEN: Final = DiagnosticSpec(
+    code="wall-hidden",
+    severity="warning",
+    text="{subject}: {share:.1%} of its cells are empty: something stands between them and every "
+    "scanner",
+    remedy="scan from another station",
+    rank_by="share",
+)
+SPARSE: Final = DiagnosticSpec(
+    code="wall-sparse",
+    severity="warning",
+    text="{subject}: {share:.1%} of its cells are empty beside scanned ones: gaps between points, "
+    "shadows of relief, rims",
+    remedy="a larger {step}.gsd_m or {step}.recover_gap_cells closes narrow gaps",
+    rank_by="share",
+)
+SPARSE_DENSE: Final = replace(SPARSE, remedy="{step}.recover_gap_cells closes narrow gaps")
+UNSEEN: Final = DiagnosticSpec(
+    code="wall-unseen",
+    severity="warning",
+    text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, glass, or "
+    "what no station sees)",
+    rank_by="share",
+)
+_CAUSES: Final = {
+    "behind": BEHIND_BUFFER,
+    "before": FRONT_LEFT_OUT,
+    "hidden": HIDDEN,
+    "sparse": SPARSE,
+    "unseen": UNSEEN,
+}
 
 _Number = TypeVar("_Number", np.float32, np.uint32)
 
@@ -141,59 +191,45 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
-    """Tell why cells are empty: in numbers, and in words where it is many of a wall."""
+    """Report why cells are empty: in numbers, and by cause where it is many of a wall."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
-    for cause in ("behind", "before", "hidden", "sparse", "unseen"):
+    for cause in _CAUSES:
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
         if not wall.count.any() or of_wall.share < _SHARE_LEAST:
             continue
+        shares_of = {cause: getattr(of_wall, f"{cause}_share") for cause in _CAUSES}
+        ctx.log(
+            f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
+            + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
+        )
+        # Tiles on the rim of a hole belong to it and to what is about it: no words for those few.
+        least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
         is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
-        causes = _causes(of_wall, is_dense=is_dense)
-        tell = ctx.warn if of_wall.share >= _SHARE_WORTH_WORDS else ctx.log
-        tell(f"{wall.name}: {of_wall.share:.1%} of its cells are empty: {causes}")
+        if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
+            continue
+        for cause, share in shares_of.items():
+            if share >= least:
+                spec = SPARSE_DENSE if cause == "sparse" and is_dense else _CAUSES[cause]
+                ctx.report(
+                    spec,
+                    subject=wall.name,
+                    share=share,
+                    behind_m=_digits(of_wall.behind_m),
+                    before_m=_digits(of_wall.before_m),
+                    buffer_behind_m=_rounded_up(of_wall.behind_m),
+                    buffer_front_m=_rounded_up(of_wall.before_m),
+                )
 
 
-def _causes(empty: Emptiness, *, is_dense: bool) -> str:
-    """Causes of empty cells in words, the largest first, with what would change the large ones."""
-    closing = "recover_gap_cells closes" if is_dense else "larger gsd_m or recover_gap_cells close"
-    causes = [
-        (
-            empty.behind_share,
-            f"lie behind the buffer, about {empty.behind_m:.2g} m behind the plane",
-            "raise buffer_behind_m if that is the wall",
-        ),
-        (
-            empty.before_share,
-            f"lie behind what stands up to {empty.before_m:.1f} m before the plane and is left out",
-            f"buffer_front_m={_rounded_up(empty.before_m)} shows it as part of the wall",
-        ),
-        (
-            empty.hidden_share,
-            "are hidden by what stands between them and the scanner",
-            "scan from another station",
-        ),
-        (
-            empty.sparse_share,
-            "lie beside scanned cells: gaps between points, shadows of relief, rims",
-            f"{closing} narrow gaps of the depth",
-        ),
-        (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees", ""),
-    ]
-    causes.sort(key=lambda cause: -cause[0])
-    # Tiles on the rim of a hole belong to it and to what is about it: no advice for those few.
-    worth_advice = max(_CAUSE_WORTH_ADVICE, 0.1 * empty.share)
-    return "; ".join(
-        f"{share:.1%} {what}" + (f" ({advice})" if advice and share >= worth_advice else "")
-        for share, what, advice in causes
-        if share >= _SHARE_LEAST
-    )
+def _digits(depth_m: float) -> float | None:
+    return float(f"{depth_m:.2g}") if math.isfinite(depth_m) else None
 
 
-def _rounded_up(depth_m: float) -> str:
+def _rounded_up(depth_m: float) -> float | None:
     """A buffer that takes in a depth, in whole decimetres."""
-    return f"{math.ceil(10.0 * depth_m) / 10.0:.1f}" if math.isfinite(depth_m) else ""
+    return math.ceil(10.0 * depth_m) / 10.0 if math.isfinite(depth_m) else None
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

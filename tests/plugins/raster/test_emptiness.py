@@ -12,11 +12,13 @@ from orthoflow_plugins.raster.emptiness import Sight, emptiness_of
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.sampled_points import SampledPoints
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
 from tests import samples
 
+CODES = {"wall-behind-buffer", "wall-front-left-out", "wall-hidden", "wall-sparse", "wall-unseen"}
 # A wall of 4 m x 3 m seen along +y, points 8 mm apart, cells of 2 cm; depth is -y.
 WALL = scenes.KnownWall(
     normal=np.array([0.0, -1.0, 0.0]),
@@ -45,8 +47,10 @@ def without(
     return points[~(inside & (points[:, 2] > z[0]) & (points[:, 2] < z[1]))]
 
 
-def causes(cloud: PointCloud, folder: Path, **params: object) -> tuple[dict[str, float], list[str]]:
-    """Share of empty cells by cause, and what is said."""
+def causes(
+    cloud: PointCloud, folder: Path, **params: object
+) -> tuple[dict[str, float], list[Diagnostic]]:
+    """Share of empty cells by cause, and the codes that are reported."""
     ctx = scenes.context(folder)
     chosen = RasterGrid.Params.model_validate({"gsd_m": WALL.gsd_m, **params})
     RasterGrid().run(RasterGrid.In(cloud=cloud, planes=WALL.planes()), chosen, ctx)
@@ -56,7 +60,7 @@ def causes(cloud: PointCloud, folder: Path, **params: object) -> tuple[dict[str,
         for cause in ("behind", "before", "hidden", "sparse", "unseen")
     }
     assert sum(shares.values()) == pytest.approx(named["void_share"], abs=1e-9)
-    return shares, [text for text in ctx.warnings if "cells are empty" in text]
+    return shares, [one for one in ctx.diagnostics if one.code in CODES]
 
 
 def only(cause: str, share: float) -> dict[str, object]:
@@ -77,8 +81,9 @@ def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> N
     alcove = grid((1.0, 2.5), (0.5, 2.0), depth_m=-1.3)
     shares, said = causes(scenes.cloud_of(np.vstack([wall, alcove])), tmp_path)
     assert shares == only("behind", 1.5 * 1.5 / 12.0)
-    (text,) = said
-    assert "lie behind the buffer, about 1.3 m behind the plane (raise buffer_behind_m" in text
+    (one,) = said
+    assert (one.code, one.values["behind_m"]) == ("wall-behind-buffer", 1.3)
+    assert "buffer_behind_m=1.3" in one.remedy
 
 
 def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
@@ -90,21 +95,16 @@ def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
     wall = without(grid((0, 4), (0, 3)), (1.0, 1.8), (0.5, 1.3))
     params = RasterGrid.Params.model_validate({"gsd_m": WALL.gsd_m})
     RasterGrid().run(RasterGrid.In(cloud=scenes.cloud_of(wall), planes=WALL.planes()), params, ctx)
-    assert not [text for text in ctx.warnings if "cells are empty" in text]
+    assert not [one for one in ctx.diagnostics if one.code in CODES]
     (told,) = (text for text in lines if "cells are empty" in text)
-    assert told == (
-        "wall 0: 5.0% of its cells are empty: 4.6% show nothing that was scanned: glass, or what "
-        "no station sees; 0.5% lie beside scanned cells: gaps between points, shadows of relief, "
-        "rims"
-    )
+    assert told.startswith("wall 0: 5.0% of its cells are empty")
 
 
 def test_an_opening_that_shows_nothing_has_no_setting(tmp_path: Path) -> None:
     wall = without(grid((0, 4), (0, 3)), (1.0, 2.5), (0.5, 2.0))
     shares, said = causes(scenes.cloud_of(wall), tmp_path)
     assert shares == only("unseen", 1.5 * 1.5 / 12.0)
-    assert "show nothing that was scanned" in said[0]
-    assert "raise" not in said[0]
+    assert [(one.code, one.remedy) for one in said] == [("wall-unseen", "")]
 
 
 def test_the_shadow_of_a_thing_before_the_wall_is_hidden(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_the_shadow_of_a_thing_before_the_wall_is_hidden(tmp_path: Path) -> None
     # A voxel of 10 cm before the station is as wide as 20 cm on the wall.
     assert shares["hidden"] > 0.8 * 1.44 / 12.0
     assert shares["hidden"] + shares["unseen"] == pytest.approx(1.44 / 12.0, abs=SHARE)
-    assert "are hidden by what stands between them and the scanner" in said[0]
+    assert "wall-hidden" in [one.code for one in said]
     nowhere, _ = causes(cloud, tmp_path)
     assert nowhere == only("unseen", 1.44 / 12.0)
 
@@ -129,7 +129,8 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     shares, said = causes(cloud, tmp_path, gsd_m=0.005, recover_gap_cells=0)
     assert shares["sparse"] > 0.9
     assert shares["unseen"] < SHARE
-    assert "rims (larger gsd_m or recover_gap_cells close narrow gaps of the depth)" in said[0]
+    assert [one.code for one in said] == ["wall-sparse"]
+    assert "gsd_m" in said[0].remedy
 
 
 # A wall of 40 x 40 cells of 2 cm, void in the middle: four by four tiles of three cells each.
@@ -222,8 +223,8 @@ def test_what_stands_before_a_wall_is_named_with_the_buffer_that_takes_it_in(
     # They hang together with nothing, as a portico on the ground that was not scanned.
     shares, said = causes(scenes.cloud_of(np.vstack([wall, *before])), tmp_path)
     assert shares["before"] == pytest.approx(0.25, abs=0.05)
-    assert "lie behind what stands up to 2.3 m before the plane and is left out" in said[0]
-    assert "buffer_front_m=2.3 shows it" in said[0]
+    assert [(one.code, one.values["before_m"]) for one in said] == [("wall-front-left-out", 2.3)]
+    assert "buffer_front_m=2.3" in said[0].remedy
     shares, _ = causes(scenes.cloud_of(np.vstack([wall, *before])), tmp_path, buffer_front_m=2.4)
     assert shares["before"] < SHARE
 

@@ -14,7 +14,7 @@ from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
 from orthoflow.products import SurfaceMask, Wall
-from orthoflow.sdk import StepContext, StepEvent
+from orthoflow.sdk import StepContext
 from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -42,14 +42,11 @@ class Listener:
     """A context, and what it was told."""
 
     def __init__(self, folder: Path) -> None:
-        self.warnings: list[str] = []
-        self.context = StepContext(
-            rng=np.random.default_rng(1), cores=1, scratch=folder, listen=self._listen
-        )
+        self.context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder)
 
-    def _listen(self, event: StepEvent) -> None:
-        if event.kind == "warning":
-            self.warnings.append(event.text)
+    @property
+    def warnings(self) -> list[str]:
+        return self.context.warnings
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -203,20 +200,30 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(listener: 
     assert listener.warnings == []
 
 
-def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener: Listener) -> None:
+def told(listener: Listener) -> dict[str, object]:
+    """Share of each cause that is reported, by code."""
+    return {one.code: one.values["share"] for one in listener.context.diagnostics}
+
+
+def test_many_empty_cells_are_reported_by_cause(listener: Listener) -> None:
+    causes = {"behind": 0.2, "hidden": 0.025, "sparse": 0.31, "unseen": 0.06}
     reporting.report_empty(
         listener.context,
         [wall([[1, 1]]), wall([[0, 0]], name="no points")],
-        [emptiness(behind=0.2, hidden=0.025, sparse=0.31, unseen=0.06), emptiness(unseen=1.0)],
+        [emptiness(**causes), emptiness(unseen=1.0)],
     )
-    [said] = listener.warnings
-    assert said == (
-        "wall 0: 59.5% of its cells are empty: 31.0% lie beside scanned cells: gaps between "
-        "points, shadows of relief, rims (larger gsd_m or recover_gap_cells close narrow gaps of "
-        "the depth); 20.0% lie behind the buffer, about 0.43 m behind the plane (raise "
-        "buffer_behind_m if that is the wall); 6.0% show nothing that was scanned: glass, or what "
-        "no station sees; 2.5% are hidden by what stands between them and the scanner"
-    )
+    # A twentieth of what is empty is not worth words.
+    assert told(listener) == {"wall-behind-buffer": 0.2, "wall-sparse": 0.31, "wall-unseen": 0.06}
+    behind = listener.context.diagnostics[0]
+    assert (behind.subject, behind.values["buffer_behind_m"]) == ("wall 0", 0.5)
+
+
+def test_what_is_left_out_is_grave_and_names_the_setting(listener: Listener) -> None:
+    reporting.report_empty(listener.context, [wall([[1, 1]])], [emptiness(before=0.06)])
+    (one,) = listener.context.diagnostics
+    assert (one.code, one.severity, one.subject) == ("wall-front-left-out", "error", "wall 0")
+    assert one.values["buffer_front_m"] == 2.8
+    assert "buffer_front_m=2.8" in one.remedy
 
 
 @pytest.mark.parametrize(
@@ -227,34 +234,9 @@ def test_larger_cells_are_advised_only_where_cells_lack_points(
 ) -> None:
     raster = replace(wall([[1, 1, 1, 1]]), count=np.array(counts))
     reporting.report_empty(listener.context, [raster], [emptiness(sparse=0.5)])
-    [said] = listener.warnings
-    assert ("larger gsd_m" in said) != is_dense
-    assert "recover_gap_cells close" in said
-
-
-@pytest.mark.parametrize(
-    ("sparse", "advised"), [(0.0099, False), (0.0101, True)], ids=["below", "above"]
-)
-def test_a_hundredth_of_a_wall_is_worth_advice(
-    listener: Listener, sparse: float, *, advised: bool
-) -> None:
-    reporting.report_empty(
-        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.0901, sparse=sparse)]
-    )
-    [said] = listener.warnings
-    assert said.startswith("wall 0: 10.0% of its cells are empty: 9.0% are hidden by what stands")
-    assert "; 1.0% lie beside scanned cells" in said
-    assert ("gsd_m" in said) == advised
-
-
-def test_shares_of_causes_are_those_of_the_metrics(listener: Listener) -> None:
-    given = emptiness(hidden=0.154, sparse=0.104, unseen=0.0943, behind=0.0004)
-    reporting.report_empty(listener.context, [wall([[1, 1]])], [given])
-    [said] = listener.warnings
-    shares = [float(text) for text in re.findall(r"([\d.]+)%", said)]
-    assert shares == pytest.approx([35.3, 15.4, 10.4, 9.4])
-    metrics = [listener.metrics[f"void_{cause}_share"] for cause in ("hidden", "sparse", "unseen")]
-    assert shares[1:] == pytest.approx([100.0 * share for share in metrics], abs=0.05)
+    (one,) = listener.context.diagnostics
+    assert ("gsd_m" in one.remedy) != is_dense
+    assert "recover_gap_cells" in one.remedy
 
 
 def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
