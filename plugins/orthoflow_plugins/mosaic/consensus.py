@@ -25,7 +25,6 @@ from orthoflow_plugins.mosaic.light import common, inside, light_of_levels
 
 if TYPE_CHECKING:
     from orthoflow.geometry.levels import Colours
-    from orthoflow_plugins.mosaic.balance import Balance
 
 # Sides of blocks: wider than photos lie apart, narrower than a limb.
 _BLOCK_M: Final = 0.025
@@ -35,19 +34,19 @@ _LEAST_PAINTED: Final = 0.5
 _DARK: Final = 0.02
 # Two witnesses contradict each other where they differ by so much in the logarithm of light, and by
 # so many deviations of all blocks; a region has a core in which they differ by twice as much.
-_APART: Final = 0.25
+_APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
 # What is smooth over so many blocks is light.
 _SMOOTH_BLOCKS: Final = 40.0
-_SMOOTH_SWEEPS: Final = 2
 # Regions: thinner ones are edges that do not fit; gaps of so many blocks close, and rims grow.
 _OPENING_BLOCKS: Final = 2
 _CLOSING_BLOCKS: Final = 5
 _GROWTH_BLOCKS: Final = 2
 # The grey of a laser bears witness where it goes with that of a photo so well.
 _LEAST_CORRELATION: Final = 0.6
+_LEAST_BLOCKS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,28 +70,25 @@ class _Witness:
 
     box: Box
     log_light: NDArray[np.float64]
+    is_grey: bool = False
 
 
-def consensus(
-    layers: Sequence[Layer], wall: Wall | None, balance: Balance | None, *, allocate: Allocate
-) -> Consensus:
+def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate) -> Consensus:
     """Take from each photo the regions in which better borne out photos contradict it.
 
     Args:
-        layers: photos of one wall, all of which paint something.
+        layers: photos of one wall as they are, all of which paint something.
         wall: what the scan shows of it; None where that is not known.
-        balance: how the colours of the layers are balanced, or None.
         allocate: gives the masks of changed layers, by name.
     """
     shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
     side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
     blocks = Blocks.over((shape[0], shape[1]), side)
     witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
-    if balance is not None:
-        witnesses = [
-            _balanced(item, index, balance, blocks) for index, item in enumerate(witnesses)
-        ]
     scan = None if wall is None else _scan(wall, blocks, witnesses)
+    if scan is not None:
+        # A photo shows more of the scan than of any other photo, so that who passes by is less.
+        witnesses = [_in_light_of(scan, item) for item in witnesses]
     everyone = [*witnesses, *([] if scan is None else [scan])]
     supports, apart = _compared(everyone, len(layers), blocks)
     outvoted = [
@@ -181,17 +177,6 @@ def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Wi
     )
 
 
-def _balanced(witness: _Witness, index: int, balance: Balance, blocks: Blocks) -> _Witness:
-    rows, columns = (
-        middles.astype(np.int64)[part]
-        for middles, part in zip(blocks.centres(), witness.box, strict=True)
-    )
-    at = [side.ravel() for side in np.broadcast_arrays(rows[:, None], columns)]
-    gains = balance.log_gains(index, at[0], at[1]).reshape(witness.log_light.shape)
-    light = (np.exp(witness.log_light) - _DARK) * np.exp(gains)
-    return replace(witness, log_light=np.log(np.maximum(light, 0.0) + _DARK))
-
-
 def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | None:
     """The scan's colours, or its grey where it goes with that of the photos."""
     if wall.rgb is not None and wall.rgb_mask is not None:
@@ -204,32 +189,66 @@ def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | 
 
 
 def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
-    """A grey on the scale of the photos' light, channel by channel; None where it is another."""
-    x, y = [], []
+    """A grey on the scale of the photos' light; None where it is another."""
+    given, shown = [np.empty(0)], [np.empty(0)]
     for photo in photos:
         box = common(grey.box, photo.box)
         if box is not None:
-            x.append(grey.log_light[inside(box, grey.box)][..., 0].ravel())
-            y.append(photo.log_light[inside(box, photo.box)].reshape(-1, 3))
-    if not x:
+            given.append(grey.log_light[inside(box, grey.box)].mean(axis=2).ravel())
+            shown.append(photo.log_light[inside(box, photo.box)].mean(axis=2).ravel())
+    x, y = np.concatenate(given), np.concatenate(shown)
+    known = np.isfinite(x) & np.isfinite(y)
+    if known.sum() < _LEAST_BLOCKS or min(x[known].std(), y[known].std()) < 1e-6:
         return None
-    given, shown = np.concatenate(x), np.concatenate(y)
-    known = np.isfinite(given) & np.isfinite(shown).all(axis=1)
-    if known.sum() < 100 or given[known].std() < 1e-6:
+    x, y = x[known] - x[known].mean(), y[known]
+    slope = float(x @ (y - y.mean()) / (x @ x))
+    # Who passes by is no part of the scale.
+    near = np.abs(y - np.median(y) - slope * x) <= _CORE_TIMES * _APART
+    if near.sum() < _LEAST_BLOCKS or np.corrcoef(x[near], y[near])[0, 1] < _LEAST_CORRELATION:
         return None
-    given, shown = given[known], shown[known]
-    if np.corrcoef(given, shown.mean(axis=1))[0, 1] < _LEAST_CORRELATION:
-        return None
-    centred = given - given.mean()
-    slopes = centred @ (shown - shown.mean(axis=0)) / (centred @ centred)
-    values = shown.mean(axis=0) + slopes * (grey.log_light[..., :1] - given.mean())
-    return replace(grey, log_light=values)
+    slope = float(np.polyfit(x[near], y[near], 1)[0])
+    return replace(grey, log_light=slope * grey.log_light, is_grey=True)
+
+
+def _in_light_of(scan: _Witness, photo: _Witness) -> _Witness:
+    """A photo without what is smooth of how its light differs from the scan's."""
+    box = common(scan.box, photo.box)
+    if box is None:
+        return photo
+    part = inside(box, photo.box)
+    difference, _ = _difference(photo, scan, box)
+    whole = np.full(photo.log_light.shape, np.nan)
+    whole[part] = difference
+    return replace(photo, log_light=photo.log_light - _light_between(whole))
 
 
 def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
     known = np.zeros(blocks.shape, dtype=np.bool_)
     known[witness.box] = np.isfinite(witness.log_light[..., 0])
     return known
+
+
+def _difference(
+    one: _Witness, other: _Witness, box: Box
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """How two differ (r, c, 3) in a box, in grey where one of them is; and where both are known."""
+    difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
+    if one.is_grey or other.is_grey:
+        difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
+    return difference, np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
+
+
+def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What is smooth (r, c, 3) of how two witnesses differ (r, c, 3), NaN where unknown."""
+    known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
+    if not known.any():
+        return np.zeros(difference.shape)
+    filled = np.where(known[..., None], difference, 0.0)
+    light = np.broadcast_to(np.median(filled[known], axis=0), filled.shape)
+    for most in (_CORE_TIMES * _APART, _APART):
+        is_light = known & (np.abs(filled - light).max(axis=2) <= most)
+        light = light + _smooth(filled - light, is_light)
+    return np.asarray(light)
 
 
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
@@ -240,21 +259,15 @@ def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64
     box = common(one.box, other.box)
     if box is None:
         return None
-    difference = (
-        one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
-    ).astype(np.float64)
-    known = np.isfinite(difference).all(axis=2)
+    difference, known = _difference(one, other, box)
     if not known.any():
         return None
-    difference[~known] = 0.0
-    rest = difference - np.median(difference[known], axis=0)
-    for _ in range(_SMOOTH_SWEEPS):
-        is_light = known & (np.abs(rest).max(axis=2) <= _CORE_TIMES * _APART)
-        rest = rest - _smooth(rest, is_light)
+    rest = difference - _light_between(difference)
     sizes = np.abs(rest).max(axis=2)
     typical = NMAD_FACTOR * float(np.median(sizes[known]))
+    least = max(_APART, min(_DEVIATIONS * typical, _CORE_TIMES * _APART))
     ratio = np.full(blocks.shape, np.nan)
-    ratio[box] = np.where(known, sizes / max(_APART, _DEVIATIONS * typical), np.nan)
+    ratio[box] = np.where(known, sizes / least, np.nan)
     return ratio
 
 

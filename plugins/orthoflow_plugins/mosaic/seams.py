@@ -329,14 +329,15 @@ def _join(
     # What paints nothing is no source; it still tells what is hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
+    agreed = None
+    if params.robust and painters:
+        # Before colours are balanced: who passes by says nothing of light.
+        agreed = consensus(painters, wall, allocate=allocate)
+        painters = list(agreed.layers)
     balance = None
     if params.gains != "none" and len(painters) > 1:
         cameras = [surroundings.cameras.get(layer.source) for layer in painters]
         balance = balance_of(painters, wall, cameras, is_local=params.local_balance)
-    agreed = None
-    if params.robust and painters:
-        agreed = consensus(painters, wall, balance, allocate=allocate)
-        painters = list(agreed.layers)
     wish = SeamWish(
         rule=params.seams,
         priority=params.priority,

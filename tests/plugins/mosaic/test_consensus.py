@@ -1,0 +1,132 @@
+"""Who passes by in a photo: drawn onto photos of a known wall, with and without a scan."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic.consensus import consensus
+
+from orthoflow.geometry.bands import in_memory
+from orthoflow.products import Layer, LayerMask, Wall
+from tests import samples
+
+SHAPE, GSD_M = (240, 400), 0.01
+FRAME = samples.facing_south(GSD_M, SHAPE[1], SHAPE[0])
+# A person of 0.5 x 1.7 m.
+PERSON = (slice(60, 230), slice(180, 230))
+
+
+def painted_wall(seed: int = 3) -> NDArray[np.float64]:
+    """Levels (rows, cols, 3) of a wall with stains and joints."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(90.0, 200.0, (12, 20, 3))
+    wall = cv2.resize(coarse, (SHAPE[1], SHAPE[0]), interpolation=cv2.INTER_CUBIC)
+    wall[::40] *= 0.6
+    wall[:, ::50] *= 0.6
+    return np.asarray(wall)
+
+
+def photo(
+    name: str, levels: NDArray[np.float64], *, seed: int, columns: slice | None = None
+) -> Layer:
+    """A photo of all or some columns of the wall, a third of a cell aside, noisy."""
+    rng = np.random.default_rng(seed)
+    moved = levels + (1 / 3) * (np.roll(levels, 1, axis=1) - levels)
+    rgb = np.clip(moved + rng.normal(0.0, 2.0, levels.shape), 0, 255).astype(np.uint8)
+    mask = np.full(SHAPE, LayerMask.PAINTED, np.uint8)
+    if columns is not None:
+        mask[:] = LayerMask.OUTSIDE
+        mask[:, columns] = LayerMask.PAINTED
+    return Layer(
+        frame=FRAME, wall=0, source=name, rgb=rgb, mask=mask, quality=np.ones(SHAPE, np.float32)
+    )
+
+
+def with_person(levels: NDArray[np.float64]) -> NDArray[np.float64]:
+    passed = levels.copy()
+    passed[PERSON] = [35.0, 50.0, 110.0]
+    return passed
+
+
+def scanned(levels: NDArray[np.float64] | None, *, intensity: bool = False) -> Wall | None:
+    """The wall as the scan has it, darker, in colour or as the laser sees it."""
+    if levels is None:
+        return None
+    wall = samples.wall(FRAME, depth_m=np.zeros(SHAPE, np.float32))
+    noisy = 0.7 * levels + np.random.default_rng(9).normal(0.0, 6.0, levels.shape)
+    if intensity:
+        return replace(wall, intensity=(noisy.mean(axis=2) / 255.0).astype(np.float32))
+    rgb = np.clip(noisy, 0, 255).astype(np.uint8)
+    return replace(wall, rgb=rgb, rgb_mask=np.ones(SHAPE, np.uint8))
+
+
+def outvoted(before: Layer, after: Layer) -> NDArray[np.bool_]:
+    return (before.mask == LayerMask.PAINTED) & (after.mask != LayerMask.PAINTED)
+
+
+@pytest.mark.parametrize("witness", ["third photo", "colours", "laser"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_passer_by_yields_to_what_others_show(witness: str, place: int) -> None:
+    levels = painted_wall()
+    photos = [photo(f"{k}.jpg", levels, seed=k) for k in range(3 if "photo" in witness else 2)]
+    photos[place] = photo("passed.jpg", with_person(levels), seed=7)
+    wall = scanned(levels if "photo" not in witness else None, intensity=witness == "laser")
+    found = consensus(photos, wall, allocate=in_memory)
+    for k, (before, after) in enumerate(zip(photos, found.layers, strict=True)):
+        lost = outvoted(before, after)
+        if k != place:
+            assert not lost.any()
+            continue
+        person = np.zeros(SHAPE, np.bool_)
+        person[PERSON] = True
+        # At most a cell in a thousand still shows him, and little beside him is lost.
+        assert np.count_nonzero(person & ~lost) <= 1e-3 * person.size
+        assert np.count_nonzero(lost & ~person) < 0.5 * np.count_nonzero(person)
+    assert found.n_outvoted == np.count_nonzero(outvoted(photos[place], found.layers[place]))
+
+
+def test_two_photos_alone_cannot_say_who_is_right() -> None:
+    levels = painted_wall()
+    photos = [photo("a.jpg", levels, seed=1), photo("b.jpg", with_person(levels), seed=2)]
+    found = consensus(photos, None, allocate=in_memory)
+    assert found.n_outvoted == 0
+    assert all(one is other for one, other in zip(photos, found.layers, strict=True))
+
+
+def test_what_one_photo_alone_shows_stays_and_is_counted() -> None:
+    levels = painted_wall()
+    photos = [
+        photo("a.jpg", with_person(levels), seed=1),
+        photo("b.jpg", levels, seed=2, columns=slice(0, 150)),
+    ]
+    found = consensus(photos, scanned(levels), allocate=in_memory)
+    assert found.n_outvoted == 0
+    n_person = np.zeros(SHAPE, np.bool_)
+    n_person[PERSON] = True
+    assert found.n_contradicted == pytest.approx(np.count_nonzero(n_person), rel=0.5)
+    clean = [photo("a.jpg", levels, seed=1), photos[1]]
+    assert consensus(clean, scanned(levels), allocate=in_memory).n_contradicted == 0
+
+
+def test_light_that_changes_smoothly_is_no_contradiction() -> None:
+    levels = painted_wall()
+    across = np.linspace(0.75, 1.25, SHAPE[1])[None, :, None]
+    photos = [
+        photo("a.jpg", levels * across, seed=1),
+        photo("b.jpg", levels * across[:, ::-1], seed=2),
+        photo("c.jpg", 0.8 * levels, seed=3),
+    ]
+    found = consensus(photos, scanned(levels), allocate=in_memory)
+    assert (found.n_outvoted, found.n_contradicted) == (0, 0)
+
+
+def test_a_scan_that_sees_other_patterns_bears_no_witness() -> None:
+    levels = painted_wall()
+    photos = [photo("a.jpg", levels, seed=1), photo("b.jpg", with_person(levels), seed=2)]
+    other = scanned(painted_wall(seed=99)[::-1, ::-1], intensity=True)
+    assert consensus(photos, other, allocate=in_memory).n_outvoted == 0
