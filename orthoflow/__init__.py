@@ -9,8 +9,9 @@ from orthoflow.version import __version__
 if TYPE_CHECKING:
     from orthoflow.cli.from_python import run as run
     from orthoflow.report.notebooks import open_run as open_run
+    from orthoflow.report.notebooks import open_runs as open_runs
 
-__all__ = ["__version__", "open_run", "run"]
+__all__ = ["__version__", "open_run", "open_runs", "run"]
 
 
 def __dir__() -> list[str]:
@@ -20,10 +21,10 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     # Lazy: `orthoflow --help` must not load numpy and h5py for a name it never uses.
-    if name == "open_run":
-        from orthoflow.report.notebooks import open_run  # noqa: PLC0415
+    if name in ("open_run", "open_runs"):
+        from orthoflow.report import notebooks  # noqa: PLC0415
 
-        return open_run
+        return getattr(notebooks, name)
     if name == "run":
         from orthoflow.cli.from_python import run  # noqa: PLC0415
 

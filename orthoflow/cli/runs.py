@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -81,6 +81,12 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     is_flag=True,
     help="Print CSV, with every metric and parameter; > FILE keeps it.",
 )
+@click.option(
+    "--table",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write one CSV table of every cell and metric of the runs named, each cell once.",
+)
 @json_option
 def runs(
     folders: tuple[Path, ...],
@@ -90,8 +96,8 @@ def runs(
     as_json: bool,
     sort: str,
     metrics: tuple[str, ...],
-    page: Path | None,
-    **only: tuple[str, ...],
+    # Any: where to write, and which runs to choose, whose types click has checked.
+    **chosen: Any,
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
 
@@ -99,14 +105,20 @@ def runs(
     (of several datasets, the median), and which parameters and inputs differ from those of other
     runs of the workflow. What --split wrote into a run is listed where its folder is named. Runs
     without a record, and records that cannot be read, say why.
+    --table FILE joins the runs named, or those below the folders named, into one table with a row
+    per cell and metric: what was computed with the same methods, parameters, seeds and data in
+    several of them is one cell, and `environments` says on how many machines.
     """
+    table, page = chosen.pop("table"), chosen.pop("page")
+    if table is not None:
+        return _write_table(folders, table)
     if as_csv and as_json:
         raise click.UsageError("--csv and --json exclude each other")
     for folder in folders:
         if as_csv and folder.suffix == ".csv" and not folder.exists():
             raise click.UsageError(f"--csv prints its table: write it into a file by > {folder}")
     found = list_runs(folders or (Path(),))
-    kept = _sorted(_filtered(found, where, **only), sort)
+    kept = _sorted(_filtered(found, where, **chosen), sort)
     if as_json:
         echo_json(runs_json(kept, found))
     elif as_csv:
@@ -119,6 +131,36 @@ def runs(
         write_run_table(kept, page, among=found)
         if not (as_json or as_csv):
             echo(f"page: {page}")
+    return EXIT_GOOD
+
+
+def _write_table(folders: Sequence[Path], table: Path) -> int:
+    """Join runs into one CSV table."""
+    from orthoflow.engine.durability import write_whole, writing_to
+    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.errors import ArgumentError
+    from orthoflow.records.joined import join_runs, joined_csv
+    from orthoflow.records.runs import open_run
+    from orthoflow.report.browsing import run_folders
+
+    if not table.absolute().parent.is_dir():
+        raise ArgumentError(f"{table.parent} does not exist: make the folder, or choose another")
+    places: dict[Path, None] = {}
+    for folder in folders or (Path(),):
+        if folder.is_dir() and not (folder / RECORD_FILE).is_file():
+            places |= dict.fromkeys(
+                place for place in run_folders([folder]) if (place / RECORD_FILE).is_file()
+            )
+        else:
+            places[folder] = None
+    joined = join_runs([open_run(place) for place in places])
+    with writing_to(table):
+        write_whole(table, joined_csv(joined).encode("utf-8", "backslashreplace"))
+    n_shared = sum(len(one.found) > 1 for one in joined.cells)
+    shared = f", {n_shared} of them in several" if n_shared else ""
+    echo(
+        f"{counted(len(joined.runs), 'run')}, {counted(len(joined.cells), 'cell')}{shared}: {table}"
+    )
     return EXIT_GOOD
 
 

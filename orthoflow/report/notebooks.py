@@ -6,7 +6,7 @@ import base64
 import json
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -27,6 +27,7 @@ from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product
 from orthoflow.records import RecordedFigure
 from orthoflow.records.comparison import Difference, RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
+from orthoflow.records.joined import RunSet, join_runs
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.runs import open_run as open_plain_run
@@ -238,6 +239,19 @@ def open_run(path: str | Path) -> OpenedRun:
     if doubt := broken_seal(plain):
         warnings.warn(f"{doubt}; rely on nothing that is said of it here", stacklevel=2)
     return OpenedRun(path=plain.path, record=plain.record)
+
+
+def open_runs(paths: Sequence[str | Path]) -> RunSet:
+    """Open several runs of one comparison as one table, see `RunSet.metrics`.
+
+    Args:
+        paths: run folders, or the `run.h5` in them.
+
+    Raises:
+        ArgumentError: nothing is at one of them, or there is none.
+        RecordError: a record is damaged, no record at all, or of another version.
+    """
+    return join_runs([open_run(path) for path in paths])
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -1,0 +1,249 @@
+"""Records of one comparison, of several people or days, as one table with statistics over all."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from orthoflow_provenance.document import RecordedCell, sha256_text
+
+from orthoflow.errors import ArgumentError
+from orthoflow.foreign_text import Value, csv_text
+from orthoflow.products.product import JsonValue
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import Run
+from orthoflow.workflow.model import DATA, SEED
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# What a step calls: its method and, as JSON, the parameters.
+Choice: TypeAlias = tuple[str, str]
+
+_BEHIND: Final = ("unit", "better", "step", "cell", "repeat", "runs", "environments")
+_RANGE: Final = ("lowest", "highest")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JoinedCell:
+    """One cell of a comparison, in every record that has it.
+
+    Attributes:
+        found: run and cell, in the order of the runs.
+        choices: step that varies -> what it calls on the way to this cell.
+        dataset: name; empty where the run has but one.
+        seed: of the workflow, or as swept.
+    """
+
+    found: tuple[tuple[Run, RecordedCell], ...]
+    choices: Mapping[str, Choice]
+    dataset: str
+    seed: str
+
+    @property
+    def cell(self) -> RecordedCell:
+        """The cell of the first record that has it."""
+        return self.found[0][1]
+
+    @property
+    def n_environments(self) -> int:
+        """In how many environments it was computed; their results may differ by rounding."""
+        return len({cell.environment for _, cell in self.found})
+
+    def values(self) -> Iterator[tuple[MetricRow, list[float]]]:
+        """Return each metric as the first record states it, and its values in all of them."""
+        rows = [cell_metrics(cell) for _, cell in self.found]
+        first = {row.metric: row for found in reversed(rows) for row in found}
+        for name in dict.fromkeys(row.metric for found in rows for row in found):
+            stated = [row.value for found in rows for row in found if row.metric == name]
+            yield first[name], stated
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSet:
+    """Several runs whose cells are one table.
+
+    Cells are the same where method, result version, parameters, seed and repeat, and those of all
+    cells behind them, down to the bytes of the input files, are the same, whatever variants, inputs
+    and datasets are called. What a variant is called comes from the first record that has it.
+
+    Attributes:
+        runs: in the order in which they were given.
+    """
+
+    runs: tuple[Run, ...]
+    _identities: dict[tuple[Path, str], str] = field(default_factory=dict, compare=False)
+
+    def __repr__(self) -> str:
+        return f"<RunSet of {len(self.runs)} runs: {len(self.cells)} cells>"
+
+    @cached_property
+    def steps(self) -> tuple[str, ...]:
+        """Steps that vary in any of the runs."""
+        factors = (name for run in self.runs for one in run.record.cells for name in one.assignment)
+        return tuple(name for name in dict.fromkeys(factors) if name not in (DATA, SEED))
+
+    @cached_property
+    def cells(self) -> tuple[JoinedCell, ...]:
+        """Each cell once that came to a result in any of the runs."""
+        found: dict[str, list[tuple[Run, RecordedCell]]] = {}
+        for run in self.runs:
+            for cell in run.record.cells:
+                if cell.status == "ok":
+                    found.setdefault(self._identity(run, cell), []).append((run, cell))
+        return tuple(self._joined(tuple(same)) for same in found.values())
+
+    def metrics(self) -> pd.DataFrame:
+        """Return a row per cell and metric.
+
+        Returns:
+            Columns `dataset`, `seed`, `variant.<step>` of each step that varies, `method`,
+            `metric`, `value` as the first record states it, `unit`, `better`, `step`, `cell` (its
+            address in the first record), `repeat`, `runs` and `environments` (how many records
+            have the cell, and from how many environments), `lowest` and `highest` of the values in
+            these records.
+        """
+        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+
+        header, *rows = self.rows()
+        return pd.DataFrame(rows, columns=header)
+
+    def statistics(self) -> pd.DataFrame:
+        """Return statistics over datasets, seeds and repeats of all records, each cell once.
+
+        Returns:
+            A row per combination of variants, step, method and metric, with `n`, `median`, `mean`,
+            `standard_deviation` (NaN for one value), `lowest` and `highest`.
+        """
+        import pandas as pd  # noqa: PLC0415 - as above
+
+        header, *rows = self.rows()
+        keys = [*(f"variant.{step}" for step in self.steps), "step", "method", "metric", "unit"]
+        keys.append("better")
+        groups: dict[tuple[Value, ...], list[float]] = {}
+        for row in rows:
+            named = dict(zip(header, row, strict=True))
+            values = groups.setdefault(tuple(named[key] for key in keys), [])
+            values.append(float(named["value"] or 0.0))
+        columns = [*keys, "n", "median", "mean", "standard_deviation", *_RANGE]
+        return pd.DataFrame(
+            [(*key, *_summary(values)) for key, values in groups.items()], columns=columns
+        )
+
+    def rows(self) -> Iterator[tuple[Value, ...]]:
+        """Return the table of `metrics`, its header first."""
+        variants = tuple(f"variant.{step}" for step in self.steps)
+        yield ("dataset", "seed", *variants, "method", "metric", "value", *_BEHIND, *_RANGE)
+        names = self._variant_names
+        for one in self.cells:
+            chosen = (
+                names[step, one.choices[step]] if step in one.choices else "" for step in self.steps
+            )
+            front: tuple[Value, ...] = (one.dataset, int(one.seed), *chosen, one.cell.method)
+            for row, values in one.values():
+                yield (
+                    *front,
+                    *(row.metric, row.value, row.unit, row.better, one.cell.step),
+                    *(one.cell.address, one.cell.repeat, len(one.found), one.n_environments),
+                    *(min(values), max(values)),
+                )
+
+    @cached_property
+    def _variant_names(self) -> dict[tuple[str, Choice], str]:
+        """What each choice of a step is called; one name for several gets their parameters."""
+        first: dict[tuple[str, Choice], str] = {}
+        for run in self.runs:
+            for cell in run.record.cells:
+                if cell.step in self.steps:
+                    name = cell.assignment.get(cell.step, cell.method)
+                    first.setdefault((cell.step, _choice(cell)), name)
+        names: dict[tuple[str, Choice], str] = {}
+        for (step, choice), name in first.items():
+            others = [two for (one, two), said in first.items() if (one, said) == (step, name)]
+            names[step, choice] = name + _told_apart(choice, others)
+        return names
+
+    def _joined(self, same: tuple[tuple[Run, RecordedCell], ...]) -> JoinedCell:
+        run, cell = same[0]
+        upstream = list(run.upstream(cell.address))
+        factors = {
+            name: value for one in reversed(upstream) for name, value in one.assignment.items()
+        }
+        return JoinedCell(
+            found=same,
+            choices={
+                one.step: _choice(one) for one in reversed(upstream) if one.step in self.steps
+            },
+            dataset=factors.get(DATA, ""),
+            seed=factors.get(SEED, str(run.record.seed)),
+        )
+
+    def _identity(self, run: Run, cell: RecordedCell) -> str:
+        known = self._identities.get((run.path, cell.address))
+        if known is not None:
+            return known
+        # Against records that lead round in a circle: no cell is behind itself.
+        self._identities[run.path, cell.address] = ""
+        inputs: dict[str, JsonValue] = {}
+        for port, given in cell.inputs.items():
+            owner, _, name = given.source.rpartition(".")
+            before = run.cells.get(owner)
+            inputs[port] = given.digest if before is None else [self._identity(run, before), name]
+        content = {
+            "step": cell.step,
+            "method": cell.method,
+            "result_version": cell.result_version,
+            "params": dict(cell.params),
+            "seed": cell.seed,
+            "repeat": cell.repeat,
+            "inputs": inputs,
+        }
+        identity = sha256_text(json.dumps(content, sort_keys=True))
+        self._identities[run.path, cell.address] = identity
+        return identity
+
+
+def join_runs(runs: Sequence[Run]) -> RunSet:
+    """Join runs into one table.
+
+    Raises:
+        ArgumentError: there is none.
+    """
+    if not runs:
+        raise ArgumentError("give at least one run, a run folder or its run.h5")
+    return RunSet(runs=tuple(runs))
+
+
+def joined_csv(runs: RunSet) -> str:
+    """Return the table of `RunSet.metrics` as CSV."""
+    return csv_text(runs.rows())
+
+
+def _choice(cell: RecordedCell) -> Choice:
+    return cell.method, json.dumps(dict(cell.params), sort_keys=True)
+
+
+def _told_apart(choice: Choice, others: Sequence[Choice]) -> str:
+    """Return in what a choice differs from others of its name; empty where there are none."""
+    if len(set(others)) < 2:
+        return ""
+    params = json.loads(choice[1])
+    told = [
+        f"{name}={json.dumps(value)}"
+        for name, value in params.items()
+        if any(json.loads(other).get(name) != value for _, other in others)
+    ]
+    methods = {method for method, _ in others}
+    said = [*([choice[0]] if len(methods) > 1 else []), *told]
+    return f" ({', '.join(said)})"
+
+
+def _summary(values: Sequence[float]) -> tuple[float, ...]:
+    spread = statistics.stdev(values) if len(values) > 1 else float("nan")
+    middle = statistics.median(values), statistics.fmean(values)
+    return (len(values), *middle, spread, min(values), max(values))
