@@ -11,6 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Final, cast
@@ -46,7 +47,7 @@ from orthoflow.errors import (
 from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
-from orthoflow.sdk.context import StepContext, StepEvent
+from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, Part, Ports, checked_part, labelled
 from orthoflow.system import children_processor_s
@@ -185,6 +186,28 @@ class _News:
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
+@dataclass(kw_only=True)
+class _TimedContext(StepContext):
+    """A context that knows how long figures took, which is no time of the method.
+
+    Attributes:
+        drawing_s: seconds by the clock, and of the processor.
+    """
+
+    drawing_s: tuple[float, float] = (0.0, 0.0)
+
+    def figure(
+        self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
+    ) -> None:
+        """See `StepContext.figure`."""
+        clock_s, processor_s = self.clock_s(), self.processor_s()
+        try:
+            super().figure(name, content, caption)
+        finally:
+            taken_s = self.clock_s() - clock_s, self.processor_s() - processor_s
+            self.drawing_s = self.drawing_s[0] + taken_s[0], self.drawing_s[1] + taken_s[1]
+
+
 class _Call:
     """One call of a method, with what it measured so far also when it fails."""
 
@@ -204,7 +227,7 @@ class _Call:
         self._store = Store(Path(task.store), workspace=Path(task.folder))
         with writing_to(self._store.folder):
             task.scratch.mkdir(parents=True, exist_ok=True)
-        self._context = StepContext(
+        self._context = _TimedContext(
             rng=np.random.default_rng(task.seed),
             cores=task.cores,
             scratch=task.scratch,
@@ -240,9 +263,10 @@ class _Call:
             if os.getpid() != process:
                 # The method forked, and this is not the process whose result counts.
                 os._exit(1)
-            self._wall_s = round(self._meter.clock_s() - wall_s, 4)
+            drawing_s, drawing_cpu_s = self._context.drawing_s
+            self._wall_s = round(self._meter.clock_s() - wall_s - drawing_s, 4)
             # Clocks of threads run ahead of their process's by ticks.
-            self._processor_s = max(0.0, round(self._cpu_s() - cpu_s, 4))
+            self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
         # Not through `progress`: who was asked to stop, and ended all the same, has a result.
         self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
         self._check_inputs(inputs)

@@ -35,10 +35,6 @@ _CUT: Final = frozenset(("rms_mm", "fit_rms_mm"))
 _CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
 # Of detectors: whether they found what there is, before how well.
 FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean")
-# Seconds of the clock beyond those of the processor, and how many times these, that a machine with
-# other work is known by.
-_BUSY_S: Final = 2.0
-_BUSY_TIMES: Final = 3.0
 # Seconds of loading and compiling in which a compiler was at work.
 _COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
@@ -85,9 +81,9 @@ class Row:
         failure: where and why it failed, empty when it did not.
         missing: addresses that the run was broken off before.
         values: one per column.
-        time: seconds of the cells that the variants have a part in.
+        time: processor seconds of the cells that the variants have a part in: they hardly depend
+            on what else the machine does.
         memory: largest memory of these cells.
-        is_busy: the time hangs on what else the machine did, so that no times are ranked.
         has_compiler: the memory is also that of compiling, so that no memory is ranked.
         remark: what was cached and what else to know, in words.
     """
@@ -100,7 +96,6 @@ class Row:
     values: tuple[Value, ...]
     time: Value
     memory: Value
-    is_busy: bool
     remark: str
     has_compiler: bool = False
 
@@ -136,7 +131,8 @@ class Standing:
         best_in: what it is clearly best in, at most three.
         groups: signs of its environments and data, where there are several.
         is_unranked: nothing of it is ranked, as no other has a sign of it.
-        time: seconds of the cells that the variants have a part in.
+        time: processor seconds of the cells that the variants have a part in: they hardly depend
+            on what else the machine does.
     """
 
     name: str
@@ -220,7 +216,7 @@ class ComparisonTable:
     @property
     def glance(self) -> tuple[Standing, ...]:
         """How often each combination leads; who is best, then near the best most often first."""
-        labels = [*(f"{one.step}: {one.label}" for one in self.columns), "time", "memory"]
+        labels = [*(f"{one.step}: {one.label}" for one in self.columns), "processor time", "memory"]
         found = []
         groups = [row.groups for row in self.rows]
         for row, name, own in zip(self.rows, self._names, groups, strict=True):
@@ -368,10 +364,7 @@ def _row(
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     group = origins.letters(one, varied[0].environment if varied else "")
     has_cost = failed is None and not one.missing and bool(varied)
-    time_s = sum(cell.wall_s for cell in varied)
-    cpu_s = sum(cell.cpu_s for cell in varied)
-    # Old records do not know the seconds of the processor.
-    is_busy = has_cost and cpu_s > 0.0 and max(cpu_s + _BUSY_S, _BUSY_TIMES * cpu_s) < time_s
+    time_s = sum(cell.cpu_s for cell in varied)
     has_compiler = has_cost and max(cell.compile_s or 0.0 for cell in varied) > _COMPILING_S
     cost_group = "".join(dict.fromkeys(origins.letters(one, cell.environment) for cell in varied))
     return Row(
@@ -386,15 +379,10 @@ def _row(
         ),
         time=_time(time_s, cost_group) if has_cost else Value(),
         memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
-        is_busy=is_busy,
         has_compiler=has_compiler,
         remark="; ".join(
             part
             for part in (
-                f"{cpu_s:.1f} s of processor in {time_s:.1f} s: the machine was busy, so that no "
-                "time is ranked"
-                if is_busy
-                else "",
                 "a step compiled, which takes memory, too: none is ranked" if has_compiler else "",
                 _remark(one),
             )
@@ -505,8 +493,7 @@ def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
         rank([row.values[index] for row in rows], column.sense, column.metric)
         for index, column in enumerate(columns)
     ]
-    is_busy = any(row.is_busy for row in rows)
-    times = rank([row.time for row in rows], Sense.NEITHER if is_busy else Sense.LESS, "wall_s")
+    times = rank([row.time for row in rows], Sense.LESS, "cpu_s")
     has_compiler = any(row.has_compiler for row in rows)
     memory_sense = Sense.NEITHER if has_compiler else Sense.LESS
     memories = rank([row.memory for row in rows], memory_sense, "peak_rss_mib")

@@ -294,7 +294,8 @@ class Costs:
     Attributes:
         wall_s: seconds on the clock that the method ran, without `compile_s`; with it where
             `compile_s` is None.
-        cpu_s: processor seconds of the step's process meanwhile, likewise.
+        cpu_s: processor seconds of the step's process meanwhile, likewise and without drawing
+            figures: rankings use it.
         peak_rss_mib: largest memory of the step's process.
         stored_mib: what its products, their published files and its figures take in the store;
             equal ones of several cells lie there once. None for cells without a result too.

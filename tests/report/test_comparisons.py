@@ -14,7 +14,7 @@ from orthoflow.report.rankings import Mark, Sense, Value
 def row(*variants: str, **more: Any) -> Row:
     plain: dict[str, Any] = {
         "run": "hall 1", "variants": variants, "is_baseline": False, "failure": "", "missing": (),
-        "values": (), "time": None, "memory": None, "is_busy": False, "remark": "",
+        "values": (), "time": None, "memory": None, "remark": "",
     }  # fmt: skip
     return Row(**(plain | more))
 

@@ -537,39 +537,32 @@ def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
     assert "0 metrics, 1 file</span>" in page
 
 
-def test_a_busy_machine_ranks_no_times() -> None:
+def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
     def row(name: str, wall_s: float, cpu_s: float) -> object:
         return cell(f"plane@plane={name}", wall_s=wall_s, cpu_s=cpu_s)
 
-    calm = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", 9.0, 6.0))])
-    busy = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", 22.0, 1.6))])
-    assert calm is not None
-    assert busy is not None
-    assert [one.time.mark for one in calm.rows] == [Mark.BEST, Mark.WORST]
-    assert [one.time.mark for one in busy.rows] == [Mark.NONE, Mark.NONE]
-    # Of a tenth of a second nobody knows which is shorter.
-    short = comparison_table([run(row("hough", 0.08, 0.08), row("ransac", 0.11, 0.11))])
+    def marks(wall_s: float, cpu_s: float) -> list[Mark]:
+        table = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", wall_s, cpu_s))])
+        assert table is not None
+        return [one.time.mark for one in table.rows]
+
+    assert marks(9.0, 6.0) == [Mark.BEST, Mark.WORST]
+    assert marks(0.5, 6.0) == [Mark.BEST, Mark.WORST]
+    assert marks(22.0, 0.5) == [Mark.WORST, Mark.BEST]
+    # Either may be wrong by a tenth of a second.
+    short = comparison_table([run(row("hough", 2.0, 0.08), row("ransac", 2.0, 0.11))])
     assert short is not None
     assert [(one.time.text, one.time.mark) for one in short.rows] == [
         ("0.08", Mark.NONE),
         ("0.11", Mark.NONE),
     ]
-    # Two seconds more than those of the processor, and three times as many, are of others.
-    for wall_s, cpu_s, is_busy in (
-        *((2.4, 0.5, False), (2.6, 0.5, True), (8.9, 3.0, False), (9.1, 3.0, True)),
-        *((9.1, 0.0, False),),
-    ):
-        table = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", wall_s, cpu_s))])
-        assert table is not None
-        assert [one.is_busy for one in table.rows] == [False, is_busy]
-    # What ran for a second and longer is told to a tenth; the largest memory counts.
     cells = [
-        cell("plane@plane=hough", wall_s=0.75, peak_rss_mib=1234.6),
-        cell("wall@plane=hough", wall_s=0.75, peak_rss_mib=99.0),
-        cell("plane@plane=ransac", wall_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("plane@plane=hough", cpu_s=0.75, peak_rss_mib=1234.6),
+        cell("wall@plane=hough", cpu_s=0.75, peak_rss_mib=99.0),
+        cell("plane@plane=ransac", cpu_s=0.996, peak_rss_mib=50.0, compile_s=None),
         cell("wall@plane=ransac", status="failed", error_message="no wall"),
-        cell("plane@plane=region", wall_s=0.996, peak_rss_mib=50.0, compile_s=None),
-        cell("wall@plane=region", wall_s=0.0),
+        cell("plane@plane=region", cpu_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("wall@plane=region", cpu_s=0.0),
     ]
     table = comparison_table([run(*cells)])
     assert table is not None
@@ -579,15 +572,6 @@ def test_a_busy_machine_ranks_no_times() -> None:
     assert [one.remark for one in table.rows][::2] == [
         "",
         "1 of 2 steps with loading and compiling in their time",
-    ]
-    # By how much the clock may be wrong: a tenth of a second for either.
-    for wall_s, marks in ((0.6, [Mark.NONE, Mark.NONE]), (0.7, [Mark.BEST, Mark.WORST])):
-        told = comparison_table([run(row("hough", 0.5, 0.5), row("ransac", wall_s, 0.5))])
-        assert told is not None
-        assert [one.time.mark for one in told.rows] == marks
-    assert [one.remark for one in busy.rows] == [
-        "",
-        "1.6 s of processor in 22.0 s: the machine was busy, so that no time is ranked",
     ]
 
 
