@@ -79,6 +79,7 @@ def cell(address: str, **more: object) -> RecordedCell:
         "repeat": int(address.partition("#")[2] or 0),
         "environment": "e1",
         "wall_s": 1.0,
+        "cpu_s": more.get("wall_s", 1.0),
         "compile_s": 0.25,
         "params_set": more.get("params", {}),
     }
