@@ -23,9 +23,7 @@ from orthoflow.products.product import JsonValue
 from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
 from orthoflow.records.metrics import cell_metrics, is_rounding
 from orthoflow.records.runs import Run
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA, SEED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -309,9 +307,9 @@ class RunComparison:
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:
     """Lay two runs side by side.
 
-    Cells are the same when their addresses are; else when they are of one step and dataset, and
-    each step that varies on their way has one method with the same parameters; else when it has
-    one method, and the same values of those of its parameters that vary in either run.
+    Cells are the same when they are of one step, dataset and seed, and each step that varies on
+    their way has one method with the same parameters; else when their addresses are the same; else
+    when those steps have one method, and the same values of the parameters that vary in either run.
 
     Args:
         left: the first run.
@@ -325,7 +323,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
 
     readdressed = _readdressed(left, right)
     # How the second run's cells are called here -> how the run itself calls them.
-    own = {readdressed.get(address, address): address for address in right.cells}
+    own = {_label(right, address, readdressed): address for address in right.cells}
     both = [address for address in left.cells if address in own]
     sides = (left.record, right.record)
     return RunComparison(
@@ -386,31 +384,58 @@ def _per_cell(
 
 
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
-    """Find cells of the second run that the first has under another address."""
+    """Find cells of the second run that the first has under another address.
+
+    Names of variants are labels, not identity: what has the same method and parameters is the same,
+    then what has the same address, then what has the same values of the parameters that vary.
+    """
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
-    telling = _telling_parameters((left, right), varied)
+    varying = _telling_parameters((left, right), varied)
     # What was skipped has no inputs, so that nobody knows what it would have come from.
     ours, theirs = (
-        [at for at, cell in run.cells.items() if at not in other.cells and cell.status != "skipped"]
-        for run, other in ((left, right), (right, left))
+        {at: _way(run, cell, varied, None) for at, cell in run.cells.items() if _has_run(cell)}
+        for run in (left, right)
     )
-    found: dict[str, str] = {}
-    for names in (None, telling):
-        free: dict[tuple[object, ...], list[str]] = {}
-        taken = set(found.values())
-        for address in ours:
-            if address not in taken:
-                way = _way(left, left.cells[address], varied, names)
-                free.setdefault(way, []).append(address)
-        for address in theirs:
-            if address in found:
-                continue
-            same = free.get(_way(right, right.cells[address], varied, names))
-            if same:
-                found[address] = same.pop(0)
-    return found
+    found = {address: address for address, way in theirs.items() if ours.get(address) == way}
+    _pair(found, ours, theirs)
+    free = left.cells.keys() - found.values()
+    found |= {at: at for at in right.cells.keys() - found.keys() if at in free}
+    _pair(
+        found,
+        {at: _way(left, left.cells[at], varied, varying) for at in ours},
+        {at: _way(right, right.cells[at], varied, varying) for at in theirs},
+    )
+    return {theirs: ours for theirs, ours in found.items() if theirs != ours}
+
+
+def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
+    """Return how a cell of the second run is called: as its partner in the first run."""
+    if address not in readdressed and address in readdressed.values():
+        # It has no partner, and its address means another cell in the first run.
+        return f"{address} ({right.record.run_id})"
+    return readdressed.get(address, address)
+
+
+def _has_run(cell: RecordedCell) -> bool:
+    return cell.status != "skipped"
+
+
+def _pair(
+    found: dict[str, str],
+    ours: Mapping[str, tuple[object, ...]],
+    theirs: Mapping[str, tuple[object, ...]],
+) -> None:
+    """Pair cells of the second run with those of the first that stand for the same."""
+    taken = set(found.values())
+    free: dict[tuple[object, ...], list[str]] = {}
+    for address, way in ours.items():
+        if address not in taken:
+            free.setdefault(way, []).append(address)
+    for address, way in theirs.items():
+        if address not in found and free.get(way):
+            found[address] = free[way].pop(0)
 
 
 def _telling_parameters(
@@ -452,7 +477,8 @@ def _way(
             names = one.params if telling is None else telling.get((one.step, one.method), ())
             params = {name: value for name, value in one.params.items() if name in names}
             called[one.step] = (one.method, canonical_json(params))
-    return cell.step, cell.repeat, cell.assignment.get(DATA), tuple(sorted(called.items()))
+    factors = tuple(cell.assignment.get(factor) for factor in (DATA, SEED))
+    return cell.step, cell.repeat, factors, tuple(sorted(called.items()))
 
 
 def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:

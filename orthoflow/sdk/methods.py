@@ -126,6 +126,7 @@ class MetricSpec:
         better: `lower`, `higher` or `one`: which values are better; empty where none are: then it
             is shown, and nobody is best in it.
         description: a sentence on how it is measured.
+        needs: optional input ports without which it is not reported.
     """
 
     name: str
@@ -133,6 +134,7 @@ class MetricSpec:
     label: str = ""
     better: Literal["", "lower", "higher", "one"] = ""
     description: str = ""
+    needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not is_name(self.name) or (self.label and not is_name(self.label, also_of_file=False)):

@@ -340,27 +340,41 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     if not _has_wildcard(step) and step not in step_names:
         return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
     chosen = [one for one in steps if fnmatchcase(one.name, step)]
-    calls = [call for one in chosen for call in one.calls]
-    methods = [call.info.method for call in calls if call.info is not None]
+    calls = [(one, call) for one in chosen for call in one.calls]
+    methods = [(one, call.info.method) for one, call in calls if call.info is not None]
     if not methods or len(methods) < len(calls):
         return ""
-    declared = [spec.name for method in methods for spec in method.metric_specs()]
-    known = [
-        *dict.fromkeys(name for name in declared if not _has_wildcard(name)),
-        *MEASURED_BY_THE_ENGINE,
-    ]
-    is_possible = any(fnmatchcase(name, metric) for name in known)
-    if _has_wildcard(metric):
-        # What two patterns have in common is not searched for.
-        is_possible = is_possible or any(map(_has_wildcard, declared))
-    if is_possible or any(not method.metrics or method.may_report(metric) for method in methods):
+    specs = [(one, spec) for one, method in methods for spec in method.metric_specs()]
+    matching = [(one, spec) for one, spec in specs if _may_match(spec.name, metric)]
+    if any(not method.metrics for _, method in methods) or any(
+        fnmatchcase(name, metric) for name in MEASURED_BY_THE_ENGINE
+    ):
         return ""
     names = " and ".join(one.name for one in chosen)
-    ids = ", ".join(dict.fromkeys(call.method for call in calls))
+    lacking = [[port for port in spec.needs if port not in one.inputs] for one, spec in matching]
+    if lacking and all(lacking):
+        ports = " and ".join(lacking[0])
+        return (
+            f"step {names} reports {metric} only with {ports} wired; wire that under in:, or take "
+            "the metric out"
+        )
+    if matching:
+        return ""
+    known = [name for _, spec in specs if not _has_wildcard(name := spec.name)]
+    ids = ", ".join(dict.fromkeys(call.method for _, call in calls))
     return (
-        f"step {names} reports no metric {metric}{did_you_mean(metric, known)}; `orthoflow plugins "
-        f"show METHOD` lists those of {ids}"
+        f"step {names} reports no metric {metric}"
+        f"{did_you_mean(metric, [*dict.fromkeys(known), *MEASURED_BY_THE_ENGINE])}; `orthoflow "
+        f"plugins show METHOD` lists those of {ids}"
     )
+
+
+def _may_match(declared: str, metric: str) -> bool:
+    """Whether a declared name and what is asked for may be the same; either may have wildcards."""
+    if fnmatchcase(metric, declared) or fnmatchcase(declared, metric):
+        return True
+    # What two patterns have in common is not searched for.
+    return _has_wildcard(declared) and _has_wildcard(metric)
 
 
 def _has_wildcard(text: str) -> bool:

@@ -302,3 +302,34 @@ def test_a_preimage_that_says_nothing_costs_nothing(studio: Studio, preimage: st
     (pair, *_) = compare_runs(first, second).cells
     assert pair.right is not None
     assert (pair.right.code, pair.right.tools) == ({}, {})
+
+
+def _swept(**values: float) -> HeldRun:
+    """A run of a step whose variants have a parameter each."""
+    cells = [
+        cell(f"plane@plane={name}", assignment={"plane": name}, params={"x": value}, seed=None)
+        for name, value in values.items()
+    ]
+    return HeldRun(path=Path("run.h5"), record=record(cells))
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "pairs"),
+    [
+        # Names that changed places are paired by what they stand for.
+        ({"a": 1.0, "b": 2.0}, {"a": 2.0, "b": 1.0}, {"a": "b", "b": "a"}),
+        ({"a": 1.0, "b": 2.0}, {"a": 0.0, "b": 1.0, "c": 2.0}, {"b": "a", "c": "b"}),
+        # A parameter that was changed belongs to the variant of that name.
+        ({"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 2.0}, {}),
+        ({"a": 1.0, "b": 2.0}, {"a": 2.0, "b": 2.0}, {}),
+        ({"a": 1.0, "b": 2.0}, {"c": 1.0, "b": 3.0}, {"c": "a"}),
+    ],
+)
+def test_rows_are_paired_by_parameters_and_not_by_names_of_variants(
+    left: dict[str, float], right: dict[str, float], pairs: dict[str, str]
+) -> None:
+    one, two = _swept(**left), _swept(**right)
+    found = module._readdressed(one, two)
+    assert found == {f"plane@plane={b}": f"plane@plane={a}" for b, a in pairs.items()}
+    own = {module._label(two, address, found): address for address in two.cells}
+    assert sorted(own.values()) == sorted(two.cells)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
+from orthoflow.sdk import MetricSpec
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.problems import (
     InvalidWorkflowError,
@@ -424,6 +425,30 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
     lines = text.splitlines()
     shown = [lines[item.line - 1][item.column - 1 :] for item in caught.value.problems]
     assert shown == ["plane.rsm_mm, plane]", "plane]"]
+
+
+def test_metrics_that_the_wiring_cannot_produce_are_refused(
+    write: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    declared = (MetricSpec("n_photos"), MetricSpec("lens_[xy]_px", needs=("calibration",)))
+    monkeypatch.setattr(catalog.method("read.photos").load(), "metrics", declared)
+
+    def problem(metric: str, text: str = GOOD) -> str:
+        write.write_text(text.replace("plane.rms_mm", metric))
+        try:
+            load_workflow(write, catalog)
+        except InvalidWorkflowError as error:
+            return "\n".join(f"{one.path}: {one.message}" for one in error.problems)
+        return ""
+
+    alone = GOOD.replace(", calibration: inputs.calibration", "")
+    assert [problem(metric) for metric in ("shots.lens_x_px", "'shots.lens_*'")] == ["", ""]
+    for metric in ("lens_x_px", "lens_*"):
+        assert problem(f"'shots.{metric}'", alone).startswith(
+            f"compare.metrics[0]: step shots reports {metric} only with calibration wired"
+        )
+    assert problem("'shots.*'", alone) == problem("'*.n_photos'", alone) == ""
+    assert "step shots reports no metric depth_mm" in problem("shots.depth_mm")
 
 
 def test_what_takes_from_a_step_of_an_unknown_kind_is_no_mistake_of_its_own(

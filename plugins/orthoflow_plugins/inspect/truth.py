@@ -25,7 +25,7 @@ from orthoflow.products import (
     Truth,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
@@ -91,8 +91,14 @@ _OF_WALLS: Final = (
     *("completeness", "completeness_filled", "completeness_seen_by_both", "unseen_painted_share"),
     *("n_traced", "far_source_share", "n_ghost_cells"),
     *("within_1_sigma_share", "within_2_sigma_share"),
-    *("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"),
 )
+# Of planes, also where there are no orthoimages.
+_OF_PLANES: Final = ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm")
+
+
+def _needing(ports: tuple[str, ...], *names: str) -> tuple[MetricSpec, ...]:
+    """Declare metrics that are reported only where these ports are wired."""
+    return tuple(MetricSpec(name, needs=ports) for name in names)
 
 
 class InspectTruth(Method):
@@ -120,17 +126,24 @@ class InspectTruth(Method):
     id: ClassVar[str] = "inspect.truth"
     result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "loose"
-    metrics: ClassVar[tuple[str, ...]] = (
-        *of_walls(_OF_WALLS),
-        *IMAGE_QUALITY,
-        *("n_photos", "n_oriented", "n_misoriented", "pose_error_over_sigma", "pose_wall_rms_mm"),
-        *("pose_centre_max_mm", "pose_centre_median_mm", "pose_wall_max_mm"),
-        *("pose_wall_median_mm", "pose_rotation_max_deg", "pose_rotation_median_deg"),
-        *("match_wrong_share", "match_wrong_share_own_wall", "n_ties_kept", "tie_wrong_share"),
-        *("tie_error_median_cells", "true_planes", "true_planes_found", "main_found"),
+    metrics: ClassVar[tuple[str | MetricSpec, ...]] = (
+        *_needing(("orthoimages", "walls"), *of_walls(_OF_WALLS), *IMAGE_QUALITY),
+        *of_walls(_OF_PLANES),
+        *_needing(
+            ("cameras", "orthoimages", "walls"),
+            *("n_photos", "n_oriented", "n_misoriented", "pose_error_over_sigma"),
+            *("pose_wall_rms_mm", "pose_centre_max_mm", "pose_centre_median_mm"),
+            *("pose_wall_max_mm", "pose_wall_median_mm", "pose_rotation_max_deg"),
+            *("pose_rotation_median_deg", "match_wrong_share", "match_wrong_share_own_wall"),
+            *("n_ties_kept", "tie_wrong_share", "tie_error_median_cells"),
+        ),
+        *_needing(("planes",), "true_planes", "true_planes_found", "main_found"),
         *("worst_plane_angle_deg", "worst_plane_offset_mm", "worst_plane_corner_max_mm"),
-        *("label_precision", "label_recall", "label_f1", "label_iou"),
-        *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
+        *_needing(
+            ("labels",),
+            *("label_precision", "label_recall", "label_f1", "label_iou"),
+            *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
+        ),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
