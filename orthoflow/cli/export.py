@@ -266,7 +266,7 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
 def _folder_inside(run: Run, *names: str) -> Path:
     """A folder of the run that nobody named; a link there would lead to where nobody wants it."""
-    folder = run.folder
+    folder = run.home_folder
     for name in names:
         folder /= name
         if folder.is_symlink():

@@ -41,7 +41,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
         raise ArgumentError(
             f"{len(opened)} runs were given: say with -o FILE where their common report goes"
         )
-    target = output if output is not None else opened[0].folder / REPORT_FILE
+    target = output if output is not None else opened[0].home_folder / REPORT_FILE
     if not target.parent.is_dir():
         raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
     doubts = {run.path: doubt for run in opened if (doubt := broken_seal(run))}

@@ -191,6 +191,7 @@ class Call:
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine.scheduling import execute
+        from orthoflow.records.writing import begin_run
 
         # Before minutes pass.
         say_doubts(self.workflow)
@@ -198,8 +199,13 @@ class Call:
             make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
             _json_log(self.json_log, self.plan) as log,
         ):
+            has_begun = False
 
             def listen(event: RunEvent) -> None:
+                nonlocal has_begun
+                if not has_begun:
+                    has_begun = True
+                    begin_run(self.plan, self.workflow, folder, self.store, run_id)
                 progress.tell(event)
                 log(event)
 

@@ -242,7 +242,7 @@ def require_run_folder(folder: Path, name: str) -> None:
     _check_folder(folder)
     if is_running(folder):
         raise _is_in_use(folder)
-    for line in _readable_lines(folder):
+    for line in readable_lines(folder):
         if isinstance(line, RunBegan):
             _check_workflow(folder, line, name)
 
@@ -277,7 +277,8 @@ def _check_workflow(folder: Path, first: RunBegan, name: str) -> None:
         )
 
 
-def _readable_lines(folder: Path) -> list[JournalLine]:
+def readable_lines(folder: Path) -> list[JournalLine]:
+    """Return the lines of a journal, also while it is written; none where it cannot be read."""
     with suppress(OSError, ValueError):
         return _parsed((folder / JOURNAL).read_bytes())
     return []
@@ -305,7 +306,7 @@ def _check_folder(folder: Path) -> None:
             raise ArgumentError(
                 f"{folder} holds {what}, {path.name}, as no run makes them; {_ANOTHER}"
             )
-    if (folder / RECORD_FILE).exists() and not _lacked_room(_readable_lines(folder)):
+    if (folder / RECORD_FILE).exists() and not _lacked_room(readable_lines(folder)):
         raise _is_finished(folder)
     if not folder.is_dir():
         return

@@ -53,6 +53,7 @@ class Run:
         output: reads an output by address and port from the record that is held open; None where
             it is opened for it.
         files_folder: what stands for the folder of the record, where its files lie elsewhere.
+        home: the run folder of a run that is not finished, whose record lies elsewhere.
         content_sha256: the digest that seals the record; empty where it was not read from a file.
         later_name: name that the record file gets once all beside it is written; empty where it has
             its name.
@@ -62,6 +63,7 @@ class Run:
     record: RunRecord
     output: Callable[[str, str], StoredPayload] | None = field(default=None, compare=False)
     files_folder: Path | None = field(default=None, compare=False)
+    home: Path | None = field(default=None, compare=False)
     content_sha256: str = field(default="", compare=False)
     later_name: str = field(default="", compare=False)
 
@@ -88,6 +90,11 @@ class Run:
     def folder(self) -> Path:
         """The folder the record lies in, with `products/` and the report beside it."""
         return self.files_folder or self.path.parent
+
+    @property
+    def home_folder(self) -> Path:
+        """The folder that what is made of the run goes to."""
+        return self.home or self.folder
 
     @cached_property
     def cells(self) -> Mapping[str, RecordedCell]:
@@ -246,7 +253,7 @@ class Run:
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a finished run.
+    """Open a run; one that goes on or was broken off as far as it is.
 
     Args:
         path: a run folder, or the `run.h5` in it.
@@ -255,8 +262,14 @@ def open_run(path: str | Path) -> Run:
         ArgumentError: nothing is there, or the folder holds no finished run.
         RecordError: the record is damaged, no record at all, or of a newer format.
     """
-    record_path = find_record(path)
-    return read_run(record_path)
+    from orthoflow.records.unfinished import (  # noqa: PLC0415 - builds on this
+        has_outline,
+        open_unfinished,
+    )
+
+    if has_outline(Path(path)):
+        return open_unfinished(Path(path))
+    return read_run(find_record(path))
 
 
 def read_run(path: Path, *, later_name: str = "") -> Run:

@@ -37,6 +37,7 @@ from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowEr
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, read_run
+from orthoflow.records.unfinished import OUTLINE_FILE, write_outline
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import (
@@ -152,6 +153,7 @@ def _write_run(
         # All that the record names, before its own name says that it is there.
         sync_tree(run_folder)
         finished = unfinished.replace(run_folder / RECORD_FILE)
+        (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
         sync_folder(run_folder)
     return read_run(finished)
 
@@ -205,6 +207,47 @@ def show_unfinished(
     Returns:
         False when it cannot be shown, as on a full disk: the run itself loses nothing by that.
     """
+    whole = _with_missing(outcome, plan)
+    try:
+        unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
+        try:
+            show(_under_way(unfinished))
+        finally:
+            unfinished.unlink(missing_ok=True)
+    except (OrthoflowError, OSError):
+        return False
+    return True
+
+
+def begin_run(
+    plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
+) -> None:
+    """Keep the outline of a run that begins, see `records.unfinished`.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    from orthoflow.engine.clock import now  # noqa: PLC0415 - runs alone begin
+    from orthoflow.engine.scheduling import RunOutcome  # noqa: PLC0415
+
+    began = now()
+    outcome = RunOutcome(run_id=run_id, started=began, ended=began, results={})
+    write_outline(
+        build_record(_with_missing(outcome, plan), plan, workflow, store),
+        run_folder,
+        store,
+        sources={
+            item.cell.address: {port: str(source) for port, source in item.cell.inputs.items()}
+            for item in plan.cells
+        },
+        embedded=[
+            name for name, spec in plan.products.items() if resolve_name(spec.target).embedded
+        ],
+    )
+
+
+def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
+    """Return an outcome in which what has no result yet is skipped."""
     missing = {
         item.cell.address: CellResult(
             status="skipped",
@@ -218,16 +261,7 @@ def show_unfinished(
         for item in plan.cells
         if item.cell.address not in outcome.results
     }
-    whole = dataclasses.replace(outcome, results={**outcome.results, **missing})
-    try:
-        unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
-        try:
-            show(_under_way(unfinished))
-        finally:
-            unfinished.unlink(missing_ok=True)
-    except (OrthoflowError, OSError):
-        return False
-    return True
+    return dataclasses.replace(outcome, results={**outcome.results, **missing})
 
 
 def executed_and_written(

@@ -235,8 +235,12 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     ]
     assert "Traceback" not in rest
     assert {path.name for path in (tmp_path / "r").iterdir()} == {
-        *("figures", "journal.jsonl", "logs", "products", "report.html")
+        ".outline.json",
+        *("figures", "journal.jsonl", "logs", "products", "report.html"),
     }
+    shown = orthoflow(tmp_path, "show", "r", "--json")
+    assert shown.returncode == 0, shown.stderr
+    assert "skipped" in {cell["status"] for cell in json.loads(shown.stdout)["cells"]}
     page = (tmp_path / "r" / "report.html").read_text()
     assert "<li>There: survey</li>" in page
     assert "<li>Not reached: paint</li>" in page

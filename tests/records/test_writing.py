@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 import shutil
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 import pytest
+from orthoflow_provenance.verify import verify_record
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
@@ -25,7 +27,7 @@ from orthoflow.errors import DamageError, StoreError
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, open_run
 from orthoflow.records.verification import verify_run
-from orthoflow.records.writing import executed_and_written, show_unfinished, write_run
+from orthoflow.records.writing import begin_run, executed_and_written, show_unfinished, write_run
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from orthoflow.workflow.model import (
@@ -174,6 +176,39 @@ def test_what_was_broken_off_is_shown_and_stays_unfinished(executed: Executed) -
     assert (executed.folder / "products" / "survey" / "planes.json").is_file()
     assert not list(executed.folder.glob("*run.h5*"))
     assert executed.write().record.status == "ok"
+
+
+@pytest.mark.parametrize("is_going_on", [False, True])
+def test_a_run_that_is_not_finished_opens_as_far_as_it_is(
+    executed: Executed, monkeypatch: pytest.MonkeyPatch, is_going_on: bool
+) -> None:
+    begin_run(executed.plan, executed.workflow, executed.folder, executed.store, "later")
+    journal = executed.folder / "journal.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    [end] = [
+        index
+        for index, line in enumerate(lines)
+        if json.loads(line).get("address") == "survey" and json.loads(line)["event"] == "finished"
+    ]
+    # As at the moment at which the first step had ended.
+    journal.write_text("".join(lines[: end + 1]))
+    monkeypatch.setattr("orthoflow.records.unfinished.is_running", lambda _: is_going_on)
+    run = open_run(executed.folder)
+    assert run.record.run_id == executed.outcome.run_id
+    assert {address: cell.status for address, cell in run.cells.items()} == {
+        "survey": "ok",
+        "paint": "skipped",
+    }
+    assert run.product("survey", "planes") is not None
+    assert [path.name for path in run.files["survey"]]
+    assert verify_record(run.path) == ()
+    assert run.home_folder == executed.folder
+    # What a run does that goes on is not touched.
+    assert (executed.folder / "products").exists() is not is_going_on
+    journal.write_text("".join(lines))
+    finished = executed.write()
+    assert open_run(executed.folder).record == finished.record
+    assert not list(executed.folder.glob(".outline*"))
 
 
 def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> None:

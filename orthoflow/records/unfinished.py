@@ -1,0 +1,194 @@
+"""A run that goes on, or was broken off, as far as it is: from its outline, journal and store.
+
+The outline is written when a run begins: the record of a run in which nothing was computed yet.
+What the journal says has ended since comes from the store.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import json
+import shutil
+import tempfile
+from collections.abc import Collection, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from orthoflow_provenance.document import (
+    CellOutcome,
+    Figure,
+    ProductRef,
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedProduct,
+    RecordFormatError,
+    RunRecord,
+    from_json,
+    parse_json,
+    shared_fields,
+    to_json,
+)
+from orthoflow_provenance.record import write_record
+
+from orthoflow.engine.durability import write_whole, writing_to
+from orthoflow.engine.run_folder import (
+    RECORD_FILE,
+    CellEnded,
+    RunBegan,
+    is_running,
+    kept_from_others,
+    readable_lines,
+)
+from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.records.published import publish_products
+from orthoflow.records.runs import Run, read_run
+
+if TYPE_CHECKING:
+    from orthoflow.engine.results import CellResult
+    from orthoflow.engine.store import Store
+
+OUTLINE_FILE: Final = ".outline.json"
+
+
+def write_outline(
+    record: RunRecord,
+    run_folder: Path,
+    store: Store,
+    *,
+    sources: Mapping[str, Mapping[str, str]],
+    embedded: Collection[str],
+) -> None:
+    """Keep what a run is about to compute, for whoever looks at it before it is finished.
+
+    Args:
+        record: of the run, with every cell skipped.
+        run_folder: existing folder.
+        store: where its results go.
+        sources: address -> input port -> where it comes from.
+        embedded: product types whose arrays go into a record.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    content = {
+        "store": str(store.folder.absolute()),
+        "record": to_json(record),
+        "sources": {address: dict(ports) for address, ports in sources.items()},
+        "embedded": sorted(embedded),
+    }
+    with writing_to(run_folder):
+        write_whole(run_folder / OUTLINE_FILE, json.dumps(content).encode("utf-8", "replace"))
+
+
+def has_outline(folder: Path) -> bool:
+    """Return whether a folder holds a run that began and has no record yet."""
+    return (folder / OUTLINE_FILE).is_file() and not (folder / RECORD_FILE).is_file()
+
+
+def open_unfinished(folder: Path) -> Run:
+    """Open a run that is not finished; what has no result yet is skipped in it.
+
+    Its record lies in a folder of its own, which vanishes with this process. Published files of a
+    run that goes on lie there, too; those of one that was broken off, in its run folder.
+
+    Raises:
+        ArgumentError: its outline or its store are gone or cannot be read.
+        StoreError: the disk refuses.
+    """
+    from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run
+
+    try:
+        content: Any = parse_json((folder / OUTLINE_FILE).read_text("utf-8"), OUTLINE_FILE)
+        record = from_json(RunRecord, content["record"], lambda _: b"")
+        store = Store(Path(content["store"]))
+        sources, embedded = content["sources"], frozenset(content["embedded"])
+    except (OSError, RecordFormatError, KeyError, TypeError) as error:
+        raise ArgumentError(
+            f"{folder} holds a run that is not finished, and what it has so far cannot be read: "
+            f"{error}; repeat the run with -o {folder} to finish it"
+        ) from error
+    lines = readable_lines(folder)
+    ended = [line for line in lines if isinstance(line, CellEnded)]
+    found = {line.address: (line, store.result(line.key)) for line in ended if line.key}
+    results = {address: result for address, (_, result) in found.items() if result is not None}
+    cached = {address for address, (line, _) in found.items() if line.cached}
+    began = next((line for line in lines if isinstance(line, RunBegan)), None)
+    record = dataclasses.replace(
+        record,
+        # One that was gone on with keeps its first id.
+        run_id=began.run_id if began else record.run_id,
+        started=began.time if began else record.started,
+        ended=lines[-1].time if lines else record.ended,
+        status="failed" if any(one.status == "failed" for one in results.values()) else "ok",
+        environments=_environments(results),
+        cells=tuple(
+            _Filled(
+                cell=cell,
+                sources=sources.get(cell.address, {}),
+                embedded=embedded,
+                is_cached=cell.address in cached,
+            ).with_result(results.get(cell.address), store)
+            for cell in record.cells
+        ),
+    )
+    aside = Path(tempfile.mkdtemp(prefix="orthoflow-"))
+    atexit.register(shutil.rmtree, aside, ignore_errors=True)
+    is_going_on = is_running(folder)
+    target = aside if is_going_on else folder
+    files = {
+        address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
+        for address, result in results.items()
+    }
+    with nullcontext() if is_going_on else kept_from_others(folder):
+        published = publish_products(target, record.cells, files)
+    path = aside / RECORD_FILE
+    try:
+        write_record(path, dataclasses.replace(record, published=published), store.product_file)
+    except RecordFormatError as error:
+        raise StoreError(f"the record of {folder} cannot be assembled: {error}") from error
+    return dataclasses.replace(read_run(path), files_folder=target, home=folder)
+
+
+def _environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
+    given = (result.environment for result in results.values())
+    return tuple({one.id: one for one in given if one is not None}.values())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Filled:
+    """A cell of the outline, and what its result is recorded with."""
+
+    cell: RecordedCell
+    sources: Mapping[str, str]
+    embedded: Collection[str]
+    is_cached: bool
+
+    def with_result(self, result: CellResult | None, store: Store) -> RecordedCell:
+        """Return the cell as it is recorded with a result; as it is without one."""
+        if result is None:
+            return self.cell
+        return dataclasses.replace(
+            self.cell,
+            **shared_fields(result, CellOutcome),
+            environment=result.environment.id if result.environment else "",
+            cached_from=result.run_id if self.is_cached else "",
+            figures=tuple(
+                RecordedFigure(data=store.blob(figure.sha256), **shared_fields(figure, Figure))
+                for figure in result.figures
+            ),
+            inputs={
+                port: RecordedProduct(
+                    source=self.sources.get(port, ""), **shared_fields(ref, ProductRef)
+                )
+                for port, ref in result.inputs.items()
+            },
+            outputs={
+                port: RecordedProduct(
+                    embedded=ref.type_name in self.embedded, **shared_fields(ref, ProductRef)
+                )
+                for port, ref in result.outputs.items()
+            },
+        )
