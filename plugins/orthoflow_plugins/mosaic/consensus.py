@@ -42,7 +42,7 @@ _LEAST_CORE_BLOCKS: Final = 6
 _SMOOTH_BLOCKS: Final = 40.0
 # Regions: thinner ones are edges that do not fit; gaps of so many blocks close, and rims grow.
 _OPENING_BLOCKS: Final = 2
-_CLOSING_BLOCKS: Final = 5
+_CLOSING_BLOCKS: Final = 9
 _GROWTH_BLOCKS: Final = 2
 # The grey of a laser bears witness where it goes with that of a photo so well.
 _LEAST_CORRELATION: Final = 0.6
@@ -117,9 +117,13 @@ def _compared(
             if ratio is None:
                 continue
             apart[i, j] = ratio
-            supports[i] += ratio <= 1.0
+            agrees = (ratio <= 1.0).astype(np.int8)
             if j < n_photos:
-                supports[j] += ratio <= 1.0
+                supports[i] += agrees
+                supports[j] += agrees
+            else:
+                # Somebody may stand in two photos alike, but in no photo as in the scan.
+                supports[i] += agrees * np.int8(1 if everyone[j].is_grey else n_photos)
     return supports, apart
 
 
@@ -292,12 +296,24 @@ def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
     cores = np.bincount(labels[(ratio > _CORE_TIMES) & (is_apart > 0)], minlength=count)
     is_thing = cores >= _LEAST_CORE_BLOCKS
     is_thing[0] = False
+    return np.asarray(is_thing[labels], dtype=np.bool_)
+
+
+def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A region with its rim, where what it shows is mixed with what is behind it."""
+    import cv2
+
     side = 2 * _GROWTH_BLOCKS + 1
-    grown = cv2.dilate(
-        is_thing[labels].astype(np.uint8),
-        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)),
-    )
-    return grown > 0
+    rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.dilate(region.astype(np.uint8), rim) > 0, dtype=np.bool_)
+
+
+def _any_left(
+    painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
+    """Cells that some layer paints that is not to lose them."""
+    left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
+    return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 
 
 def _without(
@@ -311,6 +327,7 @@ def _without(
     if not changed:
         return tuple(layers), 0
     shape = layers[0].frame.shape
+    grown = [_grown(region) for region in outvoted]
     masks = {
         index: np.asarray(allocate(f"consensus.{index}", shape, np.uint8), np.uint8)
         for index in changed
@@ -321,10 +338,11 @@ def _without(
     for rows in row_bands(shape):
         at = np.ix_(of_row[rows], of_column)
         painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
-        is_out = [region[at] & shows for region, shows in zip(outvoted, painted, strict=True)]
-        stays = np.logical_or.reduce(
-            [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
-        )
+        is_out = [region[at] & shows for region, shows in zip(grown, painted, strict=True)]
+        stays = _any_left(painted, is_out)
+        # Between two people the rim of one is better than the other.
+        is_out = [out & (stays | region[at]) for out, region in zip(is_out, outvoted, strict=True)]
+        stays = _any_left(painted, is_out)
         for index in changed:
             loses = is_out[index] & stays
             masks[index][rows] = np.where(loses, LayerMask.OCCLUDED, layers[index].mask[rows])
