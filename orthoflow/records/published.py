@@ -54,10 +54,17 @@ def publish_products(
         with suppress(FileNotFoundError):
             shutil.rmtree(target)
         target.mkdir(parents=True, exist_ok=True)
+        replaced = _replaced(cells)
         for cell in cells:
             if cell.status == "ok":
                 folder = path_below(target, cell_file_name(cell.address))
-                expected |= _publish_cell(folder, cell, files_of)
+                ports = files_of.get(cell.address, {})
+                current = {
+                    port: files
+                    for port, files in ports.items()
+                    if f"{cell.address}.{port}" not in replaced
+                }
+                expected |= _publish_cell(folder, cell, current)
         write_walls_json(target, cells)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
@@ -82,14 +89,37 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
     )
 
 
+def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
+    """Outputs, `address.port`, that a later cell takes and gives another of the same type for.
+
+    Beside its successor, as planes whose sides are found anew, the first would contradict it. What
+    was read from files stays.
+    """
+    made = {
+        cell.address
+        for cell in cells
+        if any(not given.source.startswith("inputs.") for given in cell.inputs.values())
+    }
+    return {
+        given.source
+        for cell in cells
+        if cell.status == "ok"
+        for given in cell.inputs.values()
+        for output in cell.outputs.values()
+        if output.type_name == given.type_name
+        and output.digest != given.digest
+        and given.source.rpartition(".")[0] in made
+    }
+
+
 def _publish_cell(
-    folder: Path, cell: RecordedCell, files_of: Mapping[str, Mapping[str, Mapping[Path, str]]]
+    folder: Path, cell: RecordedCell, files_of: Mapping[str, Mapping[Path, str]]
 ) -> dict[Path, str]:
-    """Copy the files of a cell; give the SHA-256 that each copy must have."""
+    """Copy the files of a cell, by port; give the SHA-256 that each copy must have."""
     folder.mkdir()
     expected: dict[Path, str] = {}
     taken = [METRICS_FILE]
-    for port, files in files_of.get(cell.address, {}).items():
+    for port, files in files_of.items():
         for file, sha256 in files.items():
             # Two outputs of one type publish equal names: the port tells them apart.
             marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))

@@ -56,6 +56,7 @@ class WallResult:
         accuracy: sentences on the expected error of its orthoimage, its plane's noise, and what
             inspections of this wall found; all by evidence on this wall alone.
         colours: what was done to the colours of the photos; empty without an orthoimage.
+        intensity_source: `laser`, or `luminance` where the grey of colours stands in for it.
     """
 
     number: int
@@ -65,6 +66,7 @@ class WallResult:
     rasters: dict[str, Path]
     accuracy: tuple[str, ...]
     colours: str
+    intensity_source: str = "laser"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,6 +326,7 @@ def _wall_result(
         rasters=rasters,
         accuracy=tuple(said),
         colours=colours if "ortho" in rasters else "",
+        intensity_source=str(about.get("intensity_source", "laser")),
     )
 
 

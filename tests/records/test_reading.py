@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -285,6 +286,46 @@ def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path
         "metrics.csv": '"cell","step","metho',
     }
     assert len(published) == 7
+
+
+@pytest.mark.parametrize("changes", [True, False])
+def test_what_a_later_step_gives_anew_is_not_published_beside_it(
+    tmp_path: Path, *, changes: bool
+) -> None:
+    def made(address: str, digit: str, **inputs: str) -> RecordedCell:
+        """A cell that gives planes, of cells by name -> digit of what they give."""
+        planes = RecordedProduct(
+            type_name="planes", encoding_version=1, digest=f"sha256:{64 * digit}"
+        )
+        return dataclasses.replace(
+            cloud_cell(),
+            address=address,
+            step=address,
+            inputs={
+                f"from_{name}": dataclasses.replace(
+                    planes, digest=f"sha256:{64 * given}", source=f"{name}.planes"
+                )
+                for name, given in inputs.items()
+            },
+            outputs={"planes": planes},
+        )
+
+    cells = [
+        made("read", "1", inputs="0"),
+        made("plane", "2", read="1"),
+        made("sides", "3" if changes else "2", plane="2"),
+    ]
+    files: dict[str, dict[str, Mapping[Path, str]]] = {}
+    for cell in cells:
+        (tmp_path / cell.address).mkdir()
+        path = tmp_path / cell.address / "planes.json"
+        path.write_text(cell.address, encoding="utf-8")
+        files[cell.address] = {"planes": as_stored(path)}
+    publish_products(tmp_path / "run", cells, files)
+    products = tmp_path / "run" / "products"
+    # What was read stays, and what nobody changed.
+    found = {path.parent.name for path in products.glob("*/planes.json")}
+    assert found == ({"read", "sides"} if changes else {"read", "plane", "sides"})
 
 
 def test_products_are_not_published_through_a_link(tmp_path: Path) -> None:

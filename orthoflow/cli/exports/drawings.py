@@ -118,6 +118,7 @@ def _drawing(
         interval_m=0.0 if depths is None else depths.interval,
         depth_range_m=None if depths is None else (depths.low, depths.high),
         areas=_areas(results, wall),
+        intensity_is_grey=wall.intensity_source != "laser",
     )
 
 

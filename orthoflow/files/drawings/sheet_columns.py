@@ -35,8 +35,9 @@ _LEAST_PLAN_MM: Final = 15.0
 _MOST_PLAN_MM: Final = 90.0
 _MOST_SEGMENTS: Final = 5
 _SEGMENT_MM: Final = 25.0
-# Where the laser saw no intensity, the grey of the scan's colours stands in.
-_KINDS: Final = {"ortho": "orthoimage", "depth": "depth contours", "intensity": "grey of the scan"}
+_KINDS: Final = {"ortho": "orthoimage", "depth": "depth contours", "intensity": "laser intensity"}
+# Where the laser saw no intensity, it stands in.
+_GREY: Final = "grey of the scan's colours"
 
 
 @dataclass
@@ -121,7 +122,8 @@ def _write_title(column: _Column, drawing: WallDrawing, sheet: Sheet) -> None:
     column.write(block.title or drawing.text.name, high_mm=2.8, is_bold=True)
     if block.title:
         column.write(drawing.text.name, high_mm=2.2)
-    kinds = " and ".join(_KINDS[kind] for kind in dict.fromkeys(view.kind for view in sheet.views))
+    named = _KINDS | ({"intensity": _GREY} if drawing.intensity_is_grey else {})
+    kinds = " and ".join(named[kind] for kind in dict.fromkeys(view.kind for view in sheet.views))
     column.write(kinds, high_mm=2.2)
     column.top -= 1.5
     column.write(f"scale 1:{drawing.scale}", high_mm=3.5, is_bold=True)

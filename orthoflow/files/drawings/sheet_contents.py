@@ -76,6 +76,7 @@ class WallDrawing:
         interval_m: of the contours of depth.
         depth_range_m: depths that the grey of the depth picture shows as black and as white.
         areas: openings of the wall.
+        intensity_is_grey: the intensity is the grey of the scan's colours, not of its laser.
     """
 
     number: int
@@ -88,6 +89,7 @@ class WallDrawing:
     interval_m: float = 0.0
     depth_range_m: tuple[float, float] | None = None
     areas: tuple[MarkedArea, ...] = ()
+    intensity_is_grey: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

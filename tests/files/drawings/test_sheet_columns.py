@@ -131,7 +131,7 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
     text = replace(drawing().text, block=block)
     module._write_title(column(drawn), drawing(text=text), sheet("intensity", number=0, count=3))
     assert written(drawn) == [
-        *("Hall", "West", "wall 7", "grey of the scan", "scale 1:50", "index of 3 sheets"),
+        *("Hall", "West", "wall 7", "laser intensity", "scale 1:50", "index of 3 sheets"),
         *("checked by: A B", "drawing: 21-017, wall 7, index", "note: n"),
     ]
     high = {one.text: one.high for one in drawn.texts}
@@ -140,13 +140,13 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
     assert "drawing: 21-017, wall 7, sheet 2" in written(other)
     # The project is the largest text with the scale, its own title the next; fields the smallest.
     assert 4.0 > high["Hall"] == high["scale 1:50"] > high["West"] > high["wall 7"]
-    assert high["wall 7"] == high["grey of the scan"] == high["index of 3 sheets"]
+    assert high["wall 7"] == high["laser intensity"] == high["index of 3 sheets"]
     assert high["wall 7"] > high["note: n"] == high["checked by: A B"] > 1.9
     is_bold = {one.text for one in drawn.texts if one.is_bold}
     assert is_bold == {"Hall", "West", "scale 1:50"}
     # The scale stands apart.
     bottoms = {one.text: one.bottom for one in drawn.texts}
-    apart = bottoms["grey of the scan"] - bottoms["scale 1:50"] - 1.7 * high["scale 1:50"]
+    apart = bottoms["laser intensity"] - bottoms["scale 1:50"] - 1.7 * high["scale 1:50"]
     assert 1.0 < apart < 2.0
 
 
