@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from orthoflow_provenance.document import PublishedFile, RunRecord, UnsafeFileError
+from orthoflow_provenance.document import (
+    PublishedFile,
+    RecordedCell,
+    RunRecord,
+    UnsafeFileError,
+    shared_fields,
+)
 from orthoflow_provenance.paths import files_below, open_below
-from orthoflow_provenance.record import open_record
+from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.alike import first_few
 from orthoflow.engine.run_folder import JOURNAL, LOGS
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
+from orthoflow.products import Inspection
+from orthoflow.products.product import Payload
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import (
     FIGURES_FOLDER,
@@ -37,6 +46,8 @@ _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # A crate has its description, two files of the workflow and one per environment.
 _UNCOVERED_MOST: Final = 8
+# Before the names of findings in metrics.
+_OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 # Before the digests at the end of a page.
 _PAGE_MARK: Final = "orthoflow report of"
 _LARGEST_PAGE_BYTES: Final = 1 << 30
@@ -128,6 +139,9 @@ def verify_run(
         return Verification(path=record_path, findings=findings, wrong=wrong)
     with record_errors(record_path), open_record(record_path) as opened:
         record, seal = opened.record, opened.content_sha256
+        contradictions = tuple(
+            said for cell in record.cells for said in _contradictions(opened, cell)
+        )
     products = [product for cell in record.cells for product in cell.outputs.values()]
     n_products = sum(product.embedded for product in products)
     check = _check_published(record_path, record) if also_published else _PublishedCheck()
@@ -136,8 +150,10 @@ def verify_run(
     changed_pages = tuple(_page_note(record_path.parent, name) for name in pages if not pages[name])
     return Verification(
         path=record_path,
-        findings=(*signature.findings, *check.changed),
-        wrong=_wrong_beside(record_path, signature, check),
+        findings=(*contradictions, *signature.findings, *check.changed),
+        wrong=f"{record_path} contradicts itself"
+        if contradictions
+        else _wrong_beside(record_path, signature, check),
         notes=(*signature.notes, *changed_pages, *check.notes),
         seal=seal,
         signed_with=signature.signed_with,
@@ -147,6 +163,35 @@ def verify_run(
         n_published=check.n_same,
         n_pages=sum(pages.values()),
     )
+
+
+def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
+    """Compare the metrics of an inspection with the findings of the product that it gave.
+
+    A metric is a finding of one wall, of all together, or with the wall's number before its name.
+    """
+    places = [
+        port
+        for port, output in cell.outputs.items()
+        if output.embedded and output.type_name == Inspection.type_name
+    ]
+    stated: dict[str, set[tuple[float, str]]] = {}
+    for port in places:
+        found = Inspection.from_payload(_payload(opened, cell.address, port)).findings
+        for finding in found:
+            stated.setdefault(finding.name, set()).add((finding.value, finding.unit))
+    for metric in cell.metrics:
+        name = metric.name if metric.name in stated else _OF_WALLS.sub("", metric.name)
+        if name in stated and (metric.value, metric.unit) not in stated[name]:
+            values = first_few([f"{value:g} {unit}" for value, unit in sorted(stated[name])])
+            yield (
+                f"/cells/{cell.address}: the metric {metric.name} is {metric.value:g} "
+                f"{metric.unit}, its inspection has {values}"
+            )
+
+
+def _payload(opened: OpenRecord, address: str, port: str) -> Payload:
+    return Payload(**shared_fields(opened.payload(address, port), Payload))
 
 
 def sealed_page(text: str, runs: Sequence[Run]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +12,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from orthoflow_provenance.document import Metric, RecordedProduct
+from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import RecordError
+from orthoflow.products.inspections import Finding
 from orthoflow.records import verification as module
 from orthoflow.records.verification import (
     Verification,
@@ -20,6 +24,8 @@ from orthoflow.records.verification import (
     require_unchanged,
     verify_run,
 )
+from tests.provenance_records import ProductShelf, sample_record
+from tests.report_runs import inspection_product
 
 CONTENT = b"a picture"
 
@@ -252,3 +258,45 @@ def test_a_record_with_something_forbidden_is_not_as_it_was_written(tmp_path: Pa
         "/: x.h5:/@creator has a type outside the format: the file is not opened",
     )
     assert found.wrong == f"{path} is not as it was written"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit", "is_found"),
+    [
+        ("rmse_u_mm", 1.25, "mm", False),
+        ("all_rmse_u_mm", 2.5, "mm", False),
+        ("wall_3_rmse_u_mm", 1.25, "mm", False),
+        # Of what the inspection does not have, nothing is known.
+        ("n_points", 7.0, "1", False),
+        ("rmse_u_mm", 1.0, "mm", True),
+        ("rmse_u_mm", 1.25, "m", True),
+        ("wall_3_rmse_u_mm", 0.25, "mm", True),
+        ("all_rmse_u_mm", 9.0, "mm", True),
+    ],
+)
+def test_metrics_of_an_inspection_are_those_of_its_product(
+    tmp_path: Path, name: str, value: float, unit: str, is_found: bool
+) -> None:
+    findings = (
+        Finding(name="rmse_u_mm", value=1.25, unit="mm", wall=0),
+        Finding(name="rmse_u_mm", value=2.5, unit="mm"),
+    )
+    product = replace(inspection_product(), findings=findings).to_payload()
+    shelf = ProductShelf(tmp_path)
+    digest = shelf.put(product)  # type: ignore[arg-type] # a payload as good as that of a test
+    base = sample_record("sha256:" + "c" * 64, digest)
+    output = RecordedProduct(
+        type_name="inspection", encoding_version=1, digest=digest, embedded=True
+    )
+    check = replace(
+        base.cells[1],
+        outputs={"inspection": output},
+        metrics=(Metric(name=name, value=value, unit=unit),),
+    )
+    record = replace(base, cells=(base.cells[0], check, base.cells[2]))
+    write_record(tmp_path / "run.h5", record, shelf.find)
+    found = verify_run(tmp_path)
+    assert bool(found.findings) is is_found, found.findings
+    if is_found:
+        assert name in found.findings[0]
+        assert "contradicts itself" in found.wrong
