@@ -296,10 +296,10 @@ def test_only_an_index_shows_how_the_wall_is_cut(
     tmp_path: Path, drawn: Page, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     @contextmanager
-    def canvas(_path: Path, _sheet: Sheet) -> Iterator[Page]:
+    def canvas(_path: Path, _paper: Paper) -> Iterator[Page]:
         yield drawn
 
-    monkeypatch.setattr(module, "_canvas", canvas)
+    monkeypatch.setattr(module, "sheet_canvas", canvas)
     paper = Paper(width_mm=420.0, height_mm=297.0)
     numbered = ((1, PART), (2, replace(PART, right_m=4.0)))
     sheet = Sheet(paper=paper, views=(VIEW,), number=number, count=2, numbered=numbered)
@@ -324,7 +324,7 @@ def test_only_an_index_shows_how_the_wall_is_cut(
 def test_a_page_is_as_large_as_its_paper_and_the_same_on_another_day(tmp_path: Path) -> None:
     sheet = Sheet(paper=Paper(width_mm=400.0, height_mm=250.0), views=())
     for name in ("a.pdf", "b.pdf"):
-        with module._canvas(tmp_path / name, sheet) as canvas:
+        with module.sheet_canvas(tmp_path / name, sheet.paper) as canvas:
             canvas.showPage()
             canvas.save()
     assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
