@@ -187,9 +187,14 @@ def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | 
         return _witness(wall.rgb, wall.rgb_mask > 0, blocks)
     if wall.intensity is None:
         return None
-    levels = np.rint(255.0 * np.clip(np.nan_to_num(wall.intensity), 0.0, 1.0)).astype(np.uint8)
-    grey = _witness(np.repeat(levels[..., None], 3, axis=2), np.isfinite(wall.intensity), blocks)
-    return _fitted(grey, photos)
+    levels = np.empty(wall.frame.shape, dtype=np.uint8)
+    is_known = np.empty(wall.frame.shape, dtype=np.bool_)
+    for rows in row_bands(wall.frame.shape):
+        is_known[rows] = np.isfinite(wall.intensity[rows])
+        shares = np.clip(np.nan_to_num(wall.intensity[rows]), 0.0, 1.0)
+        levels[rows] = np.rint(255.0 * shares)
+    grey = np.broadcast_to(levels[..., None], (*levels.shape, 3))
+    return _fitted(_witness(grey, is_known, blocks), photos)
 
 
 def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:

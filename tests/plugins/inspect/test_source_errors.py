@@ -72,6 +72,19 @@ def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
     assert shares[0] == pytest.approx((n_far + 1) / 9.0)
 
 
+def test_shares_within_what_the_orthoimage_states_are_of_both_coordinates() -> None:
+    errors = source_errors()
+    stated = np.full(errors.traced.shape, 0.002, np.float32)
+    known = replace(errors, expected_m=stated)
+    # Of 1, -2, 3, 4 mm along u and 0, 1, 0, -5 mm along v, five are within 2 mm and all but 5 mm
+    # within 4 mm. Cells at steps, ghosts and those without a place do not count.
+    found = {item.name: item.value for item in source_findings([known], 0)}
+    assert found["within_1_sigma_share"] == pytest.approx(5 / 8)
+    assert found["within_2_sigma_share"] == pytest.approx(7 / 8)
+    stated[...] = np.nan
+    assert "within_1_sigma_share" not in {item.name for item in source_findings([known], 0)}
+
+
 def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out() -> None:
     errors = source_errors()
     empty = replace(errors, traced=np.zeros((1, 10), dtype=np.bool_))
