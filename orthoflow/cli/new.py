@@ -62,6 +62,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
                 "recipe": draft.recipe,
                 "inputs": dict(draft.inputs),
                 "left_out": list(draft.left_out),
+                "advice": list(draft.advice),
             }
         )
     else:
@@ -84,6 +85,8 @@ def _print(draft: Draft, output: Path) -> None:
         echo(f"{name}: {said}")
     for said in draft.left_out:
         echo_folded(f"not used: {said}")
+    for text in draft.advice:
+        echo_folded(f"note: {text}")
     name = shlex.quote(str(output))
     echo(
         f"wrote {output}, after the recipe {draft.recipe}",

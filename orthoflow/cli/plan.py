@@ -45,7 +45,7 @@ def plan(
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.store import Store
-    from orthoflow.workflow.expand import expand_cells
+    from orthoflow.workflow.expand import expand_cells, swept_indices
 
     catalog = discover_catalog()
     loaded = changes.load(workflow, catalog)
@@ -58,6 +58,9 @@ def plan(
         ("step", "method", "status", "reason"),
         [(item.cell.address, item.cell.method, item.status, item.reason) for item in planned],
     )
+    if indices := swept_indices(loaded):
+        echo()
+        echo_table(("variant", "parameters"), indices)
     say_doubts(loaded)
     echo("", _summary(planned))
     return EXIT_GOOD

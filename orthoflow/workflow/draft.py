@@ -6,10 +6,13 @@ import json
 import os
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
+
+import numpy as np
 
 from orthoflow.alike import first_few
 from orthoflow.errors import InputError
@@ -18,13 +21,13 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.containers import HOW_TO_DEVELOP
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
+from orthoflow.files.exif import read_exif
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
+from orthoflow.files.points.blocks import ScanFile
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.sdk.lines import text_of_path
-from orthoflow.workflow.source import (
-    shipped_workflow,
-)
+from orthoflow.workflow.source import shipped_workflow
 
 FileKind: TypeAlias = Literal[
     "scan", "photos", "calibration", "checkpoints", "ties", "cameras", "other", "unknown"
@@ -54,7 +57,9 @@ class Recognised:
         said: what is in it, in words; why nothing is known of it.
         n_photos: photos in it, also those in a scan.
         n_posed: photos in a scan whose lens and pose it states.
-        fields: what each point of a scan has besides coordinates.
+        fields: what the points of a scan have besides coordinates, empty fields left out.
+        lens: camera and focal length of a photo, as its EXIF data state them.
+        advice: what to set or to give, as far as the data show it.
     """
 
     kind: FileKind
@@ -63,6 +68,8 @@ class Recognised:
     n_photos: int = 0
     n_posed: int = 0
     fields: frozenset[str] = frozenset()
+    lens: str = ""
+    advice: tuple[str, ...] = ()
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
@@ -106,7 +113,7 @@ def _file(path: Path) -> Recognised:
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
         return Recognised(kind="other", path=path, said="an orthoimage with its frame beside it")
     if suffix in PHOTO_SUFFIXES:
-        return Recognised(kind="photos", path=path, said="a photo", n_photos=1)
+        return Recognised(kind="photos", path=path, said="a photo", n_photos=1, lens=_lens(path))
     readers: dict[str, Callable[[Path], Recognised]] = {
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),
@@ -127,15 +134,26 @@ def _raw(path: Path) -> Recognised:
     return Recognised(kind="unknown", path=path, said=said)
 
 
+def _lens(path: Path) -> str:
+    """Return what EXIF states of the lens; empty where it states no focal length."""
+    with path.open("rb") as file:
+        exif = read_exif(file.read(_HEAD_BYTES))
+    lengths = {"mm": exif.focal_mm, "mm (35 mm equivalent)": exif.focal_35mm}
+    stated = [f"{value:g} {unit}" for unit, value in lengths.items() if value]
+    return f"{exif.camera} {stated[0]}".strip() if stated else ""
+
+
 def _scan(path: Path) -> Recognised:
     scan = open_scan(path)
-    fields = frozenset(str(name) for name in scan.fields)
+    stated = {str(name) for name in scan.fields} & _FIELDS.keys()
+    fields, extent, is_finite = _seen_in(scan)
     is_e57 = path.suffix.lower() == E57_SUFFIX
     photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
-    if has := [word for name, word in _FIELDS.items() if name in fields]:
-        # Files may have room for them and nothing in it.
-        words.append(f"fields for {' and '.join(has)}")
+    for beginning, names in (("", fields), ("nothing in its fields for ", stated - fields)):
+        if names:
+            listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
+            words.append(f"{beginning}{listed}")
     if photos.n_images:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
@@ -146,9 +164,53 @@ def _scan(path: Path) -> Recognised:
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
         fields=fields,
+        advice=_about_extent(path.name, extent) if is_finite else (),
     )
 
 
+def _seen_in(scan: ScanFile) -> tuple[frozenset[str], float, bool]:
+    """Look at the first points of a scan: fields that hold something, largest extent, any point."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    found: set[str] = set()
+    n_seen = 0
+    for block in scan.read():
+        points = block.points[np.isfinite(block.points).all(axis=1)]
+        if len(points):
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        values = {"intensity": block.intensity, "rgb": block.rgb}
+        found |= {
+            name for name, one in values.items() if one is not None and np.nan_to_num(one).any()
+        }
+        n_seen += block.n_read
+        if n_seen >= _LOOKED_AT:
+            break
+    is_finite = bool(np.isfinite(low).all())
+    return frozenset(found), float((high - low).max()) if is_finite else 0.0, is_finite
+
+
+def _about_extent(name: str, extent: float) -> tuple[str, ...]:
+    """Ask for the unit where coordinates as metres are larger or smaller than what is scanned."""
+    if extent > _MAX_EXTENT_M:
+        text = (
+            f"{_word(name)} is {extent:,.0f} m long if its coordinates are metres; if they are "
+            "millimetres, set cloud.unit=mm"
+        )
+        return (text,)
+    if 0 < extent < _MIN_EXTENT_M:
+        text = (
+            f"{_word(name)} is {extent * 1000:.3g} mm long if its coordinates are metres: check "
+            "the unit that it was exported in"
+        )
+        return (text,)
+    return ()
+
+
+# Longer, and shorter, than what is scanned from a tripod.
+_MAX_EXTENT_M: Final = 2000.0
+_MIN_EXTENT_M: Final = 0.2
+# Points of a scan that are looked at, and bytes of a photo: EXIF stands at its beginning.
+_LOOKED_AT: Final = 1_000_000
+_HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
@@ -248,12 +310,14 @@ class Draft:
         text: of the file.
         inputs: what each input holds, in words.
         left_out: files that no input takes, and why.
+        advice: what to set or to give, as far as the data show it.
     """
 
     recipe: Recipe
     text: str
     inputs: Mapping[str, str]
     left_out: Sequence[str]
+    advice: Sequence[str] = ()
 
 
 def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | None) -> Draft:
@@ -297,6 +361,13 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
         raise InputError("photos-on-scan needs photos, and there are none among the files")
+    has_paint = any({"intensity", "rgb"} & scan.fields for scan in scans)
+    if recipe is None and chosen == "direct" and not has_paint:
+        raise InputError(
+            f"{_some([scan.path.name for scan in scans])}: the points have neither colours nor "
+            "intensity, so no orthoimage can be painted from them: give photos too, or export the "
+            "scan with its colours (--recipe direct writes the workflow all the same)"
+        )
     if own_photos and "photos" not in by_kind:
         # Photos that a scanner took lie in its file, with their poses.
         inside = [replace(scan, said="the photos in it") for scan in own_photos]
@@ -328,7 +399,21 @@ class _Drafting:
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", self.target.stem).strip("-") or self.recipe
         body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
         text = f"{self._heading(start, described, left_out)}{body}\n{_without_stand_ins(steps)}"
-        return Draft(recipe=self.recipe, text=text, inputs=described, left_out=left_out)
+        return Draft(
+            recipe=self.recipe, text=text, inputs=described, left_out=left_out, advice=self._advice
+        )
+
+    @property
+    def _advice(self) -> list[str]:
+        advice = [text for items in self.by_kind.values() for item in items for text in item.advice]
+        photos = [item for item in self.by_kind.get("photos", ()) if item.kind == "photos"]
+        without = [item.path.name for item in photos if not item.lens]
+        if without and not {"calibration", "cameras"} & self.by_kind.keys():
+            advice.append(
+                f"{len(without)} of {len(photos)} photos state no focal length: {_some(without)}; "
+                "give a calibration, if there is one"
+            )
+        return advice
 
     def _assigned(self, inputs: str) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
         """Which input takes which files, and what is left over."""
@@ -376,6 +461,7 @@ class _Drafting:
         said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
         said += [f"#   {name}: {text}" for name, text in described.items()]
         said += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
+        said += [f"# Note: {text}" for text in self._advice[:_MOST_LISTED]]
         run = shlex.quote(self.target.name)
         said += [
             "#",
@@ -414,7 +500,9 @@ def _described(items: Sequence[Recognised]) -> str:
         return f"{_word(items[0].path.name)}, {items[0].said}"
     n_photos = sum(item.n_photos for item in items)
     if n_photos == len(items):
-        return f"{n_photos} photos"
+        lenses = Counter(item.lens for item in items if item.lens)
+        listed = [f"{_word(lens)} ({count})" for lens, count in lenses.most_common()]
+        return ", ".join([f"{n_photos} photos", *([first_few(listed, most=4)] if listed else [])])
     return f"{len(items)} files: {_some([item.path.name for item in items])}"
 
 

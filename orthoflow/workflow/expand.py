@@ -30,10 +30,7 @@ from orthoflow.workflow.model import (
     Workflow,
     WorkflowStep,
 )
-from orthoflow.workflow.parameters import (
-    MethodInfo,
-    describe_method,
-)
+from orthoflow.workflow.parameters import SWEEP, MethodInfo, describe_method
 
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]
@@ -136,6 +133,19 @@ def is_plain(cells: Iterable[Cell]) -> bool:
 def variants_text(assignment: Mapping[str, str]) -> str:
     """Write which variants are chosen, `plane=ransac, orient=pnp`; empty for none."""
     return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
+
+
+def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
+    """Return the variants whose names are an index, each with the values that it stands for."""
+    return [
+        (
+            f"{step.name}={variant.name}",
+            ", ".join(f"{name} {json.dumps(value)}" for name, value in variant.swept.items()),
+        )
+        for step in workflow.steps.values()
+        for variant in step.variants
+        if variant.swept and SWEEP in variant.name.split("-")
+    ]
 
 
 def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:

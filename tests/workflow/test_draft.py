@@ -11,6 +11,7 @@ import cv2
 import laspy
 import numpy as np
 import pytest
+from PIL import Image
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
@@ -31,6 +32,7 @@ POINTS = "name,x,y,z\nP1,1,2,3\nP2,2,2,3\n"
 def write_scan(path: Path) -> Path:
     cloud = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
     cloud.x = cloud.y = cloud.z = np.arange(500.0)
+    cloud.intensity = cloud.red = np.arange(500)
     cloud.write(str(path))
     return path
 
@@ -77,7 +79,7 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     }
     text = Path("jobs/hall 1.yaml").read_text()
     assert 'photos: {files: "../the [old] hall/photos"}  # 3 photos' in text
-    assert "scan: hall.las, LAS/LAZ, 500 points, fields for intensity and colours" in out
+    assert "scan: hall.las, LAS/LAZ, 500 points, intensity and colours" in out
     assert "calibration: calibration.yaml, a calibration of *" in out
     assert "checkpoints: checks.csv, 2 surveyed points" in out
     assert "ties: ties.csv, 1 tie" in out
@@ -195,12 +197,62 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     assert f"not used: {name}, link-{name}: a pipe or a device" in told
 
 
+# --- what the data show ---
+
+
+def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
+    cloud = laspy.read(data / "hall.las")
+    cloud.intensity[:] = cloud.red[:] = 0
+    cloud.write(str(data / "bare.las"))
+    result = asked("new", data / "bare.las")
+    assert result.exit_code == 2
+    assert "bare.las: the points have neither colours nor intensity" in result.output
+    assert not Path("workflow.yaml").exists()
+    out = said("new", data / "bare.las", data / "photos")
+    assert "nothing in its fields for intensity and colours" in out
+    assert "after the recipe photos-on-scan" in out
+    said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
+
+
+@pytest.mark.parametrize(("scale", "note"), [(1000, "set cloud.unit=mm"), (1, ""), (1e-4, "unit")])
+def test_a_scan_of_another_unit_is_asked_about(data: Path, scale: float, note: str) -> None:
+    points = np.random.default_rng(1).uniform(0, 8, (50, 3)) * scale
+    rows = "\n".join(f"{x:.6f} {y:.6f} {z:.6f} {k % 7}" for k, (x, y, z) in enumerate(points))
+    (data / "room.xyz").write_text(rows)
+    out = json.loads(said("new", data / "room.xyz", "--json"))
+    assert bool(out["advice"]) is bool(note)
+    assert note in "".join(out["advice"])
+
+
+def test_photos_are_told_by_their_lenses(data: Path) -> None:
+    for name, length in (("a", 24), ("b", 24), ("c", 50)):
+        exif = Image.Exif()
+        exif[0x0110] = "Lens-o-matic"
+        exif.get_ifd(0x8769)[0x920A] = float(length)
+        Image.new("RGB", (40, 30)).save(data / "photos" / f"{name}.jpg", exif=exif)
+    out = said("new", data / "hall.las", data / "photos")
+    assert "photos: 3 photos, Lens-o-matic 24 mm (2), Lens-o-matic 50 mm (1)" in out
+    assert "note:" not in out
+    Image.new("RGB", (40, 30)).save(data / "photos" / "c.jpg")
+    out = said("new", data / "hall.las", data / "photos", "-o", "again.yaml")
+    assert "note: 1 of 3 photos state no focal length: c.jpg; give a calibration" in out
+    assert "# Note: 1 of 3 photos" in Path("again.yaml").read_text()
+
+
 # --- drafts by themselves ---
 
 
 def found(kind: str, name: str, said: str = "something", n_photos: int = 0) -> Recognised:
     posed = n_photos if kind == "scan" else 0
-    return Recognised(kind=kind, path=Path(name), said=said, n_photos=n_photos, n_posed=posed)  # type: ignore[arg-type]
+    fields = frozenset(["rgb"] if kind == "scan" else [])
+    return Recognised(
+        kind=kind,  # type: ignore[arg-type]
+        path=Path(name),
+        said=said,
+        n_photos=n_photos,
+        n_posed=posed,
+        fields=fields,
+    )
 
 
 def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
@@ -318,11 +370,12 @@ def test_numbers_in_rows_are_a_scan_and_not_points_with_names(tmp_path: Path) ->
 def test_a_scan_says_how_many_points_it_has_and_what_of_each(tmp_path: Path) -> None:
     cloud = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
     cloud.x = cloud.y = cloud.z = np.arange(1500.0)
+    cloud.green = np.arange(1500)
     cloud.write(str(tmp_path / "hall.las"))
     (found,) = recognised([tmp_path / "hall.las"])
     assert (found.kind, found.n_photos) == ("scan", 0)
-    assert found.said == "LAS/LAZ, 1,500 points, fields for intensity and colours"
-    assert found.fields == {"intensity", "rgb"}
+    assert found.said == "LAS/LAZ, 1,500 points, colours, nothing in its fields for intensity"
+    assert found.fields == {"rgb"}
 
 
 def test_camera_raw_says_what_to_do(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.expand import expand_cells
+from orthoflow.workflow.expand import expand_cells, swept_indices
 from orthoflow.workflow.hints import (
     meant_number,
     meant_parameter,
@@ -478,6 +478,17 @@ def test_two_lists_in_another_order_make_the_same_variants(catalog: Catalog) -> 
     assert swept("[0.05, 0.10000001, 0.1]") == swept("[0.1, 0.05, 0.10000001]")
     variant = load_swept(catalog).steps["plane"].variant("tolerance_m-0_05")
     assert variant.swept == {"tolerance_m": 0.05}
+
+
+def test_an_index_is_explained_by_its_values(catalog: Catalog) -> None:
+    swept = (
+        "{cell_m: {sweep: [0.01, 0.02]}, normal: {sweep: [[0, 0, 1], [1.23456, 0.23456, 0.12345]]}}"
+    )
+    text = re.sub(r"params: \{.*\}\}", f"params: {swept}", ROOM)
+    workflow = load_swept(catalog, text)
+    assert swept_indices(workflow)[0] == ("plane=sweep-1", "cell_m 0.01, normal [0, 0, 1]")
+    assert len(swept_indices(workflow)) == 4
+    assert swept_indices(load_swept(catalog)) == []
 
 
 def test_editors_are_told_that_a_value_may_be_a_sweep(catalog: Catalog) -> None:
