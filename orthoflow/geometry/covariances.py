@@ -94,36 +94,46 @@ class AdjustedPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonError:
-    """An error of places that neighbours share, with a correlation exp(-distance / length).
+    """An error of places that neighbours share: a sum of parts that reach differently far.
 
     Attributes:
-        sigma_m: of each coordinate; 0 where points err independently.
-        length_m: correlation length.
+        sigmas_m: of each coordinate, of each part; none where points err independently.
+        lengths_m: of each part, whose correlation is exp(-distance / length).
         sigma_alone: what is left to each observation alone, in its standard deviations.
     """
 
-    sigma_m: float
-    length_m: float
+    sigmas_m: tuple[float, ...] = ()
+    lengths_m: tuple[float, ...] = ()
     sigma_alone: float
 
-    def correlation(
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of each coordinate of all parts together."""
+        return math.hypot(*self.sigmas_m)
+
+    def covariance(
         self, places: NDArray[np.float64], others: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the correlation (n, m) of the errors at two sets of places."""
-        return np.asarray(np.exp(-_distances(places, others) / self.length_m), dtype=np.float64)
+        """Return the covariance (n, m) in square metres of the errors at two sets of places."""
+        distances_m = _distances(places, others)
+        total = np.zeros_like(distances_m)
+        for sigma_m, length_m in zip(self.sigmas_m, self.lengths_m, strict=True):
+            if sigma_m:
+                total += sigma_m**2 * np.exp(-distances_m / length_m)
+        return total
 
 
 def common_error(photos: Sequence[AdjustedPoints]) -> CommonError:
     """Estimate the error that neighbouring points share from the products of their residuals.
 
     An adjustment takes up a part of such an error, the more the longer it reaches; expected
-    products are those of residuals after that. Means of products of pairs within classes of
-    distances are compared with what independent errors and shared ones of each length would
-    give (a variogram by moments; Cressie 1993, Statistics for spatial data, 2.6).
+    products are those of residuals after that. Sums of products of pairs within classes of
+    distances are explained by those of independent errors and of shared ones of each length (a
+    variogram by moments; Cressie 1993, Statistics for spatial data, 2.6).
     """
     parts = [part.thinned() for part in photos if len(part.places) >= _MIN_POINTS]
     if not parts:
-        return CommonError(sigma_m=0.0, length_m=math.inf, sigma_alone=1.0)
+        return CommonError(sigma_alone=1.0)
     extents = [np.linalg.norm(part.places - part.places.mean(axis=0), axis=1) for part in parts]
     extent_m = 2.0 * float(np.median([np.percentile(each, 90) for each in extents]))
     n_classes = len(_DISTANCES) + 1
@@ -170,21 +180,18 @@ def _fitted_error(
     from scipy.optimize import nnls  # noqa: PLC0415 - most who load this module adjust nothing
 
     own = max(0.0, float(found @ alone) / max(float(alone @ alone), 1e-300))
-    nothing = CommonError(sigma_m=0.0, length_m=math.inf, sigma_alone=math.sqrt(own))
-    best = float(np.linalg.norm(found - own * alone)) / _LEAST_GAIN, nothing
-    for share, products in zip(_LENGTHS, shared, strict=True):
-        scale = max(float(np.linalg.norm(products)), 1e-300)
-        columns = np.column_stack([alone, products * (np.linalg.norm(alone) / scale)])
-        (own, common), off = nnls(columns, found)
-        error = CommonError(
-            # Rounded: what comes behind must not hang on the order of sums.
-            sigma_m=float(f"{math.sqrt(common * float(np.linalg.norm(alone)) / scale):.4g}"),
-            length_m=float(f"{share * extent_m:.4g}"),
-            sigma_alone=float(f"{math.sqrt(own):.4g}"),
-        )
-        if off < best[0]:
-            best = off, error
-    return best[1]
+    off = float(np.linalg.norm(found - own * alone))
+    scales = np.maximum(np.linalg.norm(shared, axis=1), 1e-300) / np.linalg.norm(alone)
+    (rest, *common), left = nnls(np.column_stack([alone, (shared / scales[:, None]).T]), found)
+    variances = np.array(common) / scales
+    if left * _LEAST_GAIN > off or not variances.any():
+        return CommonError(sigma_alone=math.sqrt(own))
+    # Rounded: what comes behind must not hang on the order of sums.
+    return CommonError(
+        sigmas_m=tuple(float(f"{math.sqrt(variance):.4g}") for variance in variances),
+        lengths_m=tuple(float(f"{share * extent_m:.4g}") for share in _LENGTHS),
+        sigma_alone=float(f"{math.sqrt(rest):.4g}"),
+    )
 
 
 def _distances(places: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -205,9 +212,9 @@ def with_common_error(
     some = points.thinned()
     scale = len(points.places) / len(some.places)
     pulls = np.einsum("nip,nid->npd", some.jacobian, some.by_place)
-    correlation = error.correlation(some.places, some.places)
-    shared = np.einsum("npd,nqd->pq", pulls, np.einsum("nm,mqd->nqd", correlation, pulls))
-    move = scale * error.sigma_m * points.cofactors
+    together = error.covariance(some.places, some.places)
+    shared = np.einsum("npd,nqd->pq", pulls, np.einsum("nm,mqd->nqd", together, pulls))
+    move = scale * points.cofactors
     spread = error.sigma_alone**2 * points.cofactors + move @ stable(shared) @ move.T
     return widened(covariance, spread)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -188,4 +190,5 @@ def test_a_shared_error_is_found_with_its_size_and_independent_ones_are_none() -
     assert found[0.0].sigma_m == 0.0
     assert found[0.0].sigma_alone == pytest.approx(1.0, abs=0.1)
     assert found[0.002].sigma_m == pytest.approx(0.002, rel=0.3)
-    assert 0.3 < found[0.002].length_m < 2.5
+    together = found[0.002].covariance(np.zeros((1, 3)), np.array([[0.0, 0, 0], [0.8, 0, 0]]))
+    assert together[0, 1] / together[0, 0] == pytest.approx(math.exp(-1.0), abs=0.2)

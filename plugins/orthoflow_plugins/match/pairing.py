@@ -29,6 +29,10 @@ _FIRST_ON_WALL: Final = 4000
 _LOOSE_SHARE: Final = 0.02
 # A factor of 1.4 between pixels and cells is nothing to key points that have a size of their own.
 _LOG_SCALE_APART: Final = 0.35
+# A photo whose mirror image is recognised by so many matches, and by so many times more than it, is
+# mirrored; a front that is symmetric or repeats gives both about as many.
+_CLEARLY_MIRRORED: Final = 24
+_MIRRORED_OVER: Final = 2
 # In the second look, a key point's size (log2) and direction are those expected, up to so much.
 _LOG_SIZE_MOST: Final = 0.7
 _ANGLE_MOST_DEG: Final = 30.0
@@ -97,6 +101,8 @@ class PhotoPairs:
         radius_px: matches were also searched so far from where a homography puts them; a wrong
             one's matches lie evenly within this.
         is_mirrored: the walls recognise the mirrored photo better; then none counts as shown.
+        is_surely_mirrored: they do so clearly, at two sizes of the photo with key points of their
+            own; else it may show a pattern that repeats, or another wall.
         n_recognised: matches that agreed before others were searched where these put them.
         picture: what of the photo was matched.
     """
@@ -106,6 +112,7 @@ class PhotoPairs:
     pairs: tuple[Pair, ...]
     radius_px: float
     is_mirrored: bool = False
+    is_surely_mirrored: bool = False
     n_recognised: int = 0
     picture: str = "grey"
 
@@ -141,9 +148,17 @@ def pair_photo(
     first, key_points = seeker.first_look(walls)
     if not first.n_verified:
         return first
-    if seeker.n_verified_mirrored(first, walls) > first.n_verified:
+    n_mirrored = seeker.n_verified_mirrored(first, walls)
+    if n_mirrored > first.n_verified:
         refused = tuple(replace(pair, is_shown=False, homography=None) for pair in first.pairs)
-        return replace(first, pairs=refused, is_mirrored=True, n_recognised=first.n_verified)
+        return replace(
+            first,
+            pairs=refused,
+            is_mirrored=True,
+            is_surely_mirrored=_is_mirror(n_mirrored, first.n_verified)
+            and seeker.is_mirror_at_another_size(first, walls),
+            n_recognised=first.n_verified,
+        )
     wanted = min(seeker.finest, first.scale * _cells_per_pixel(first, walls))
     if abs(math.log(wanted / first.scale)) > _LOG_SCALE_APART:
         key_points = seeker.key_points(wanted)
@@ -319,6 +334,23 @@ class _Seeker:
         few = len(mirrored) <= _FIRST_IN_PHOTO
         shown = _shown(first, _strongest(walls) if few else walls)
         return self.pairs(_KeyPoints(features=mirrored, scale=first.scale), shown).n_verified
+
+    def is_mirror_at_another_size(
+        self, first: PhotoPairs, walls: Sequence[Features | None]
+    ) -> bool:
+        """Whether the mirrored photo is also recognised by key points of another size of it."""
+        scale = 2.0 * first.scale if 2.0 * first.scale <= self.finest else 0.5 * first.scale
+        features, shown = self.key_points(scale).features, _shown(first, walls)
+        direct, mirrored = (
+            self.pairs(_KeyPoints(features=seen, scale=scale), shown).n_verified
+            for seen in (features, features.mirrored(self.grey.shape[1]))
+        )
+        return _is_mirror(mirrored, direct)
+
+
+def _is_mirror(n_mirrored: int, n_direct: int) -> bool:
+    """Whether so many matches speak for a mirrored photo that a pattern's symmetry cannot."""
+    return n_mirrored >= max(_CLEARLY_MIRRORED, _MIRRORED_OVER * n_direct)
 
 
 def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:

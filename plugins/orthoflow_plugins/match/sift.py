@@ -357,8 +357,13 @@ def _note(
             "agreeing_share": placed.share,
         }
     shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
-    if pairs.is_mirrored:
+    if pairs.is_surely_mirrored:
         ctx.warn(f"photo {name}: the walls show it mirrored, so it gets no ties: turn it back")
+    elif pairs.is_mirrored:
+        ctx.warn(
+            f"photo {name}: its mirror image agrees with the walls no worse than it does, so it "
+            "gets no ties: it shows a pattern that repeats, another wall, or is mirrored"
+        )
     elif not shown:
         ctx.warn(f"photo {name}: no wall is recognised in it, so it gets no ties")
     return {

@@ -359,11 +359,11 @@ def _with_common_error(
         places.append(part.places[some])
         pulls.append(wide)
         start += len(part.places)
-    own, correlation = np.concatenate(pulls), error.correlation(*[np.concatenate(places)] * 2)
+    own, together = np.concatenate(pulls), error.covariance(*[np.concatenate(places)] * 2)
     shared = np.zeros_like(cofactors)
     for axis in range(3):
-        shared += own[:, :, axis].T @ correlation @ own[:, :, axis]
-    move = step * error.sigma_m * cofactors
+        shared += own[:, :, axis].T @ together @ own[:, :, axis]
+    move = step * cofactors
     spread = error.sigma_alone**2 * cofactors + move @ stable(shared) @ move.T
     return widened(covariance, spread)
 

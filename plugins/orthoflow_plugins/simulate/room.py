@@ -103,6 +103,29 @@ class SimulateRoom(Method):
             le=0.1,
             description="Standard deviation of a distance at 3 m, square onto a plain wall.",
         )
+        registration_error_m: float = Field(
+            0.0,
+            ge=0.0,
+            le=0.1,
+            description="Standard deviation of each coordinate of where a station is taken to be.",
+        )
+        bending_m: float = Field(
+            0.0,
+            ge=0.0,
+            le=0.5,
+            description="How far the cloud is bent 5 m from the middle of the room, as clouds of "
+            "SLAM and of photos are.",
+        )
+        shared_noise_m: float = Field(
+            0.0,
+            ge=0.0,
+            le=0.1,
+            description="Standard deviation of each coordinate that neighbouring points have in "
+            "common, as in clouds from photos.",
+        )
+        shared_noise_length_m: float = Field(
+            1.0, gt=0.0, le=50.0, description="Distance over which shared_noise_m changes."
+        )
         colour_noise_grey: float = Field(
             2.0, ge=0.0, le=50.0, description="Standard deviation of a point's colour."
         )
@@ -345,6 +368,10 @@ def _errors(params: SimulateRoom.Params, band_seed: int) -> Errors:
         colour_noise=params.colour_noise_grey,
         inversion=_inversion(params),
         band_seed=band_seed,
+        registration_m=params.registration_error_m,
+        bending_m=params.bending_m,
+        shared_m=params.shared_noise_m,
+        shared_length_m=params.shared_noise_length_m,
     )
 
 

@@ -53,6 +53,9 @@ _OWN_PATTERN: Final = 0.35
 _WET_M: Final = 0.7
 _WET_FROM: Final = 0.6
 _WET_DARKER: Final = 0.45
+_WAVES: Final = 24
+# Half the length of a room: bent by the whole `bending_m` there.
+_BENT_M: Final = 5.0
 _SPOT_EVERY_M: Final = 0.4
 _SPOT_SHARE: Final = 0.05
 _SPOT_RADIUS_M: Final = 0.012
@@ -91,7 +94,12 @@ class Errors:
         beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
         colour_noise: standard deviation of a colour, grey levels.
         inversion: how far the laser sees contrast the other way round, as `LaserBand` has it.
-        band_seed: of the materials in the laser's band.
+        band_seed: of the materials in the laser's band, and of what the points share.
+        registration_m: standard deviation of each coordinate of a station's place.
+        bending_m: how far the room's ends are bent from its middle, as by drift along a path.
+        shared_m: standard deviation of each coordinate that neighbouring points of all scans have
+            in common, as in clouds from photos.
+        shared_length_m: distance over which that changes.
     """
 
     noise_m: float
@@ -100,6 +108,10 @@ class Errors:
     colour_noise: float
     inversion: float
     band_seed: int
+    registration_m: float = 0.0
+    bending_m: float = 0.0
+    shared_m: float = 0.0
+    shared_length_m: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,9 +253,10 @@ class Scanner:
         start = sweep.station[:, None]
         into.rectangle[:] = echoes.hits.rectangle
         measured = self._measured(sweep, echoes, into.rectangle)
-        for coordinate, along in zip((into.x, into.y, into.z), range(3), strict=True):
-            coordinate[:] = sweep.station[along] + measured * echoes.ways[along]
         points = points_on(start, echoes.ways, echoes.hits)
+        off = shared_errors(points, sweep.station, self._errors)
+        for coordinate, along in zip((into.x, into.y, into.z), range(3), strict=True):
+            coordinate[:] = sweep.station[along] + measured * echoes.ways[along] + off[along]
         colours = self._rays.colours(echoes.hits.rectangle, points)
         seen = self._band.reflectance(echoes.hits.rectangle, points, colours)
         bright = seen * echoes.cosine**0.7
@@ -305,6 +318,32 @@ class Scanner:
         share = 0.5 * uniforms(states[beside], 4)
         mixed[beside] = (1.0 - share) * distance[beside] + share * other[beside]
         return mixed
+
+
+def shared_errors(
+    points: NDArray[np.float64], station: NDArray[np.float64], errors: Errors
+) -> NDArray[np.float64]:
+    """Return what points (3, n) of a station are off by together with others (3, n), metres."""
+    off = np.zeros_like(points)
+    if errors.registration_m:
+        place_mm = np.rint(1e3 * station).astype(np.int64) % 2**31
+        of_station = np.random.default_rng([errors.band_seed, *place_mm.tolist()])
+        off += errors.registration_m * of_station.normal(size=(3, 1))
+    if errors.bending_m:
+        # A parabola across the longer way through the room, upwards and sideways.
+        along = (points[0] / _BENT_M) ** 2
+        off[1:] += errors.bending_m * along / math.sqrt(2.0)
+    if errors.shared_m:
+        # Waves of random directions: their sum is as good as Gaussian, with a Gaussian correlation.
+        waves = np.random.default_rng([errors.band_seed, 1])
+        for axis in range(3):
+            ways = waves.normal(size=(_WAVES, 3)) / errors.shared_length_m
+            phases = waves.uniform(0.0, _TURN, _WAVES)
+            field = np.zeros(points.shape[1])
+            for way, phase in zip(ways, phases, strict=True):
+                field += np.cos(way @ points + phase)
+            off[axis] += errors.shared_m * math.sqrt(2.0 / _WAVES) * field
+    return off
 
 
 def _sweep(  # the range comes last, as `in_runs` gives it

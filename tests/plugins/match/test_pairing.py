@@ -355,12 +355,24 @@ def test_a_photo_that_shows_no_wall_is_not_looked_at_again(monkeypatch: pytest.M
     assert (found.n_verified, found.n_recognised, looked) == (0, 0, [])
 
 
+@pytest.mark.parametrize(
+    ("n_mirrored", "n_direct", "is_mirror"),
+    [(60, 20, True), (39, 20, False), (40, 20, True), (23, 0, False), (24, 0, True)],
+)
+def test_a_fact_of_a_mirror_image_needs_many_matches_and_twice_as_many(
+    n_mirrored: int, n_direct: int, is_mirror: bool
+) -> None:
+    assert pairing._is_mirror(n_mirrored, n_direct) == is_mirror
+
+
 @pytest.mark.parametrize(("mirrored", "is_mirrored"), [(20, False), (21, True)])
 def test_a_photo_whose_mirror_image_fits_better_shows_nothing(
     monkeypatch: pytest.MonkeyPatch, mirrored: int, is_mirrored: bool
 ) -> None:
     found, _ = paired(monkeypatch, mirrored=mirrored)
     assert found.is_mirrored == is_mirrored
+    # One sign is none.
+    assert not found.is_surely_mirrored
     assert [pair.is_shown for pair in found.pairs] == [not is_mirrored]
     assert (found.pairs[0].homography is None) == is_mirrored
     assert found.n_recognised == (20 if is_mirrored else 30)

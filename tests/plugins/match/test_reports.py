@@ -188,7 +188,12 @@ def pairs(*of: Pair, n_recognised: int = 0, is_mirrored: bool = False) -> PhotoP
         (
             False,
             True,
-            ["photo a: the walls show it mirrored, so it gets no ties: turn it back"],
+            [
+                (
+                    "photo a: its mirror image agrees with the walls no worse than it does, so it "
+                    "gets no ties: it shows a pattern that repeats, another wall, or is mirrored"
+                )
+            ],
         ),
     ],
 )

@@ -16,6 +16,7 @@ from orthoflow_plugins.simulate.scanning import (
     Scanner,
     Sweep,
     scan_scene,
+    shared_errors,
 )
 
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
@@ -253,3 +254,33 @@ def test_of_a_scan_that_meets_something_everywhere_nothing_is_left_out(tmp_path:
     found = scan_scene(surface(3.0), [sweep], NO_ERRORS, context(tmp_path))
     assert found.row.tolist() == [0, 1, 2] * 5
     assert found.column.tolist() == np.repeat(np.arange(5), 3).tolist()
+
+
+@pytest.mark.parametrize("length_m", [0.5, 2.0])
+def test_neighbouring_points_share_an_error_of_the_stated_size_and_reach(length_m: float) -> None:
+    rng = np.random.default_rng(1)
+    errors = replace(NO_ERRORS, shared_m=0.004, shared_length_m=length_m, band_seed=3)
+    first = rng.uniform(-4.0, 4.0, (3, 4000))
+    found = [
+        shared_errors(first + np.array([[apart], [0.0], [0.0]]), np.zeros(3), errors)
+        for apart in (0.0, length_m)
+    ]
+    assert found[0].std() == pytest.approx(0.004, rel=0.3)
+    # A Gaussian: exp(-1/2) at its length.
+    together = float((found[0] * found[1]).mean() / (found[0] ** 2).mean())
+    assert together == pytest.approx(np.exp(-0.5), abs=0.25)
+
+
+def test_a_station_that_is_registered_wrongly_moves_all_its_points_alike() -> None:
+    points = np.random.default_rng(1).uniform(-4.0, 4.0, (3, 50))
+    errors = replace(NO_ERRORS, registration_m=0.003)
+    one, other = (shared_errors(points, np.array([x, 0.0, 1.5]), errors) for x in (0.0, 2.0))
+    assert np.ptp(one, axis=1).max() == 0.0
+    assert np.abs(one - other).max() > 1e-4
+    assert not shared_errors(points, np.zeros(3), NO_ERRORS).any()
+
+
+def test_a_bent_cloud_is_off_by_the_stated_bend_five_metres_from_its_middle() -> None:
+    points = np.array([[0.0, 5.0, -5.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
+    off = shared_errors(points, np.zeros(3), replace(NO_ERRORS, bending_m=0.02))
+    np.testing.assert_allclose(np.linalg.norm(off, axis=0), [0.0, 0.02, 0.02])
