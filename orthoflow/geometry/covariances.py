@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 # Correlation lengths that are tried, and ends of the classes of distances between points, as shares
 # of the extent of what a photo sees.
-_LENGTHS: Final = (0.03, 0.08, 0.2, 0.5, 1.0)
+_LENGTHS: Final = (0.03, 0.08, 0.2, 0.5)
 _DISTANCES: Final = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 # The products of all pairs of more points tell nothing new.
 _MAX_POINTS: Final = 180
@@ -71,6 +71,7 @@ class AdjustedPoints:
         jacobian: (n, 2, p) derivatives by the unknowns, in standard deviations.
         by_place: (n, 2, 3) derivatives by the place, standard deviations per metre.
         cofactors: (p, p) of these unknowns in the inverse of the whole normal matrix.
+        weight: for how many points of the adjustment each stands.
     """
 
     places: NDArray[np.float64]
@@ -78,6 +79,7 @@ class AdjustedPoints:
     jacobian: NDArray[np.float64]
     by_place: NDArray[np.float64]
     cofactors: NDArray[np.float64]
+    weight: float = 1.0
 
     def thinned(self) -> AdjustedPoints:
         """Return points spread evenly over all, as many as tell how they err together."""
@@ -89,6 +91,7 @@ class AdjustedPoints:
             jacobian=self.jacobian[chosen],
             by_place=self.by_place[chosen],
             cofactors=self.cofactors,
+            weight=n_points / len(chosen),
         )
 
 
@@ -142,7 +145,11 @@ def common_error(photos: Sequence[AdjustedPoints]) -> CommonError:
     for part in parts:
         n_points, n_free = len(part.places), part.cofactors.shape[0]
         flat = part.jacobian.reshape(-1, n_free)
-        left = np.eye(2 * n_points) - flat @ part.cofactors @ flat.T
+        taken_up = flat @ part.cofactors @ flat.T
+        # Of an error of its own, each point takes up what it does alone; of a shared one, as much
+        # as all the points for which it stands.
+        left_alone = np.eye(2 * n_points) - taken_up
+        left = np.eye(2 * n_points) - part.weight * taken_up
         distance_m = _distances(part.places, part.places)
         # The first class is each point with itself.
         kind = np.digitize(distance_m / extent_m, _DISTANCES)
@@ -152,7 +159,7 @@ def common_error(photos: Sequence[AdjustedPoints]) -> CommonError:
 
         counts += _by_class(kind, np.ones_like(distance_m))
         found += _by_class(kind, part.residuals @ part.residuals.T)
-        alone += _by_class(kind, _traces(left))
+        alone += _by_class(kind, _traces(left_alone))
         same = np.einsum("iad,jbd->iajb", part.by_place, part.by_place)
         for nth, share in enumerate(_LENGTHS):
             correlation = np.exp(-distance_m / (share * extent_m))
@@ -210,11 +217,10 @@ def with_common_error(
     if not error.sigma_m:
         return covariance
     some = points.thinned()
-    scale = len(points.places) / len(some.places)
     pulls = np.einsum("nip,nid->npd", some.jacobian, some.by_place)
     together = error.covariance(some.places, some.places)
     shared = np.einsum("npd,nqd->pq", pulls, np.einsum("nm,mqd->nqd", together, pulls))
-    move = scale * points.cofactors
+    move = some.weight * points.cofactors
     spread = error.sigma_alone**2 * points.cofactors + move @ stable(shared) @ move.T
     return widened(covariance, spread)
 

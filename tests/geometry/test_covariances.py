@@ -153,7 +153,7 @@ def drawn_resection(seed: int, sigma_m: float, length_m: float) -> tuple[float, 
 
 @pytest.mark.parametrize(
     ("sigma_m", "length_m", "least", "most"),
-    [(0.0, 1.0, 0.8, 1.6), (0.003, 0.2, 0.8, 1.4), (0.005, 2.0, 0.55, 1.1), (0.003, 4.0, 0.5, 1.1)],
+    [(0.0, 1.0, 0.8, 1.6), (0.003, 0.2, 0.8, 1.8), (0.005, 2.0, 0.7, 1.4), (0.003, 4.0, 0.65, 1.4)],
 )
 def test_what_neighbours_share_is_stated(
     sigma_m: float, length_m: float, least: float, most: float

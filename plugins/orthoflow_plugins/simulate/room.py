@@ -62,7 +62,7 @@ class SimulateRoom(Method):
     """
 
     id: ClassVar[str] = "simulate.room"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_points",
