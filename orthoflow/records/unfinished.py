@@ -12,7 +12,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Collection, Mapping
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -38,13 +37,12 @@ from orthoflow.engine.run_folder import (
     RECORD_FILE,
     CellEnded,
     RunBegan,
-    is_running,
-    kept_from_others,
     readable_lines,
 )
 from orthoflow.errors import ArgumentError, StoreError
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, read_run
+from orthoflow.records.verification import published_state
 
 if TYPE_CHECKING:
     from orthoflow.engine.results import CellResult
@@ -91,8 +89,8 @@ def has_outline(folder: Path) -> bool:
 def open_unfinished(folder: Path) -> Run:
     """Open a run that is not finished; what has no result yet is skipped in it.
 
-    Its record lies in a folder of its own, which vanishes with this process. Published files of a
-    run that goes on lie there, too; those of one that was broken off, in its run folder.
+    Its record lies in a folder that vanishes with this process, as do its published files where the
+    run folder does not have them. The run folder is not written to.
 
     Raises:
         ArgumentError: its outline or its store are gone or cannot be read.
@@ -136,20 +134,21 @@ def open_unfinished(folder: Path) -> Run:
     )
     aside = Path(tempfile.mkdtemp(prefix="orthoflow-"))
     atexit.register(shutil.rmtree, aside, ignore_errors=True)
-    is_going_on = is_running(folder)
-    target = aside if is_going_on else folder
     files = {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in results.items()
     }
-    with nullcontext() if is_going_on else kept_from_others(folder):
-        published = publish_products(target, record.cells, files)
+    published = publish_products(aside, record.cells, files)
     path = aside / RECORD_FILE
     try:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)
     except RecordFormatError as error:
         raise StoreError(f"the record of {folder} cannot be assembled: {error}") from error
-    return dataclasses.replace(read_run(path), files_folder=target, home=folder)
+    # A run that was broken off has left them; one that goes on is not touched.
+    is_there = all(published_state(folder, file) == "same" for file in published)
+    return dataclasses.replace(
+        read_run(path), files_folder=folder if is_there else aside, home=folder
+    )
 
 
 def _environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
