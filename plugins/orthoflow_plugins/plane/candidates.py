@@ -80,6 +80,24 @@ class Candidate:
     start: Plane | None = None
 
 
+# What may refuse a candidate: too few points, none that crowd about it, a strip as narrow as a
+# line, points that only pass through, a rounded surface, or a tilt that was not asked for.
+Criterion = Literal["few", "scattered", "strip", "smear", "bent", "tilt"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why a candidate is no plane.
+
+    Attributes:
+        criterion: what refused it.
+        share: share of all points that it held.
+    """
+
+    criterion: Criterion
+    share: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rules:
     """When a plane counts, and when the search ends.
@@ -148,21 +166,37 @@ class Verification:
     adjusted: AdjustedPlane
 
 
-def verify(candidate: Candidate, unassigned: Unassigned, rules: Rules) -> FoundPlane | None:
-    """Refine a candidate and see whether it is a plane of points that no other has."""
+def verify(
+    candidate: Candidate,
+    unassigned: Unassigned,
+    rules: Rules,
+    refusals: list[Refusal] | None = None,
+) -> FoundPlane | None:
+    """Refine a candidate and see whether it is a plane of points that no other has.
+
+    Args:
+        candidate: what a detector proposed.
+        unassigned: the points that remain.
+        rules: when a plane counts.
+        refusals: gets the criterion that refused the candidate.
+    """
+    refused = [] if refusals is None else refusals
     corners, up = unassigned.box_corners_m, unassigned.up
     freedom = _freedom_of(candidate, up, rules)
-    refined = _refined(candidate, unassigned, rules, freedom)
-    if refined is None or not _leans_little(refined, candidate, up, rules):
+    refined = _refined(candidate, unassigned, rules, freedom, refused)
+    if refined is None:
+        return None
+    if not _leans_little(refined, candidate, up, rules):
+        refused.append(Refusal(criterion="tilt", share=0.0))
         return None
     rough = surface_raster(refined.plane, corners, up, cell_m=refined.cell_m)
-    found = _verified_on(rough, unassigned, rules, freedom)
+    found = _verified_on(rough, unassigned, rules, freedom, refused)
     for _ in range(PASSES_MOST - 1):
         # A plane that moved saw its points through a tolerance that lay askew: look again.
         if found is None or found.adjusted.moved_m < SETTLED_SHARE * rules.fit_m:
             break
         rough = surface_raster(found.adjusted.plane, corners, up, cell_m=rough.cell_m)
-        found = _verified_on(rough, unassigned, rules, freedom)
+        found = _verified_on(rough, unassigned, rules, freedom, refused)
     if found is None:
         return None
     return FoundPlane(
@@ -182,19 +216,37 @@ def verification(
     *,
     n_least: float,
     settled_m: float = SETTLED_M,
+    refusals: list[Refusal] | None = None,
 ) -> Verification | None:
-    """Say which cells belong to a plane and how it fits them; None when it is none."""
+    """Return which cells belong to a plane and how it fits them; None when it is none."""
     place = support_of(raster, crowded_cells(sums), sums, joins_parts=rules.joins_parts)
-    if place is None or place.n_points < n_least:
-        return None
-    if _is_strip(place, raster) or _is_smear(place, raster, sums):
-        return None
-    adjusted = adjust_plane(
-        raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom, settled_m=settled_m
-    )
-    if adjusted is None or _is_bent(adjusted):
+    adjusted = None
+    criterion = _refused_by(place, raster, sums, n_least)
+    if place is not None and not criterion:
+        adjusted = adjust_plane(
+            raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom, settled_m=settled_m
+        )
+        criterion = "bent" if adjusted is None or _is_bent(adjusted) else ""
+    if place is None or adjusted is None or criterion:
+        if refusals is not None:
+            n_points = 0.0 if place is None else float(place.n_points)
+            share = rules.least_share * n_points / max(n_least, 1e-9)
+            refusals.append(Refusal(criterion=criterion or "bent", share=share))
         return None
     return Verification(support=place, adjusted=adjusted)
+
+
+def _refused_by(
+    place: Support | None, raster: SurfaceRaster, sums: CellSums, n_least: float
+) -> Criterion | Literal[""]:
+    """The criterion that refuses the cells of a plane, before it is fitted; empty for none."""
+    if place is None:
+        return "scattered"
+    if place.n_points < n_least:
+        return "few"
+    if _is_strip(place, raster):
+        return "strip"
+    return "smear" if _is_smear(place, raster, sums) else ""
 
 
 def carried(raster: SurfaceRaster, plane: Plane, up: NDArray[np.float64]) -> SurfaceRaster:
@@ -227,7 +279,11 @@ def _freedom_of(candidate: Candidate, up: NDArray[np.float64], rules: Rules) -> 
 
 
 def _verified_on(
-    raster: SurfaceRaster, unassigned: Unassigned, rules: Rules, freedom: Freedom
+    raster: SurfaceRaster,
+    unassigned: Unassigned,
+    rules: Rules,
+    freedom: Freedom,
+    refusals: list[Refusal],
 ) -> Verification | None:
     """One pass over the free points: the cells that belong, and the fit to them."""
     sums = measure_cells(
@@ -244,6 +300,7 @@ def _verified_on(
         freedom,
         n_least=rules.least_share * len(unassigned.claims),
         settled_m=_SETTLED_ON_SAMPLE_M,
+        refusals=refusals,
     )
 
 
@@ -289,7 +346,11 @@ class _Refined:
 
 
 def _refined(
-    candidate: Candidate, unassigned: Unassigned, rules: Rules, freedom: Freedom
+    candidate: Candidate,
+    unassigned: Unassigned,
+    rules: Rules,
+    freedom: Freedom,
+    refusals: list[Refusal],
 ) -> _Refined | None:
     """Move a candidate to the surface near it; None where too few of the sample crowd there."""
     free_points = unassigned.free().offsets_m
@@ -298,6 +359,7 @@ def _refined(
     some = _thinned(free_points, _FIT_POINTS)
     plane = refine_plane(some, start, first, freedom=freedom, up=unassigned.up)
     if plane is None:
+        refusals.append(Refusal(criterion="scattered", share=0.0))
         return None
     distances_m = free_points @ plane.normal - plane.offset_m
     near = free_points.take(np.flatnonzero(np.abs(distances_m) <= rules.find_m), axis=0)
@@ -305,11 +367,15 @@ def _refined(
     place = support_of(raster, crowded_cells(sums), sums, joins_parts=rules.joins_parts)
     least = _SAMPLE_CAUTION * rules.least_share * len(unassigned.claims)
     if place is None or place.n_points < least:
+        n_points = 0.0 if place is None else float(place.n_points)
+        share = n_points / max(1, len(unassigned.claims))
+        refusals.append(Refusal(criterion="scattered" if place is None else "few", share=share))
         return None
     plane = _fitted_to_parts(
         plane, _thinned(near, _FIT_POINTS), raster, place, (first, *rest), freedom, unassigned.up
     )
     if plane is None:
+        refusals.append(Refusal(criterion="scattered", share=0.0))
         return None
     n_held = float(sums.n_find[place.cells].sum())
     area_m2 = float(place.cells.sum()) * raster.cell_m**2

@@ -7,7 +7,7 @@ for each. All planes are found in the sample; one pass over all points fits them
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -19,10 +19,19 @@ from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
 from orthoflow.products import Planes, PointCloud, PointLabels, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly, RawPlane, assemble, warn_of_guesses
-from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, as_proposed, verify
+from orthoflow_plugins.plane.candidates import (
+    Candidate,
+    Criterion,
+    FoundPlane,
+    Refusal,
+    Rules,
+    as_proposed,
+    verify,
+)
 from orthoflow_plugins.plane.figures import draw_deviations, draw_planes, draw_thickness
 from orthoflow_plugins.plane.final_fit import fit_to_all, label, name_points
 from orthoflow_plugins.plane.measuring import measure_planes, measure_thickness, row_points
+from orthoflow_plugins.plane.noise import CloudNoise, measure_noise
 from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare, thinned
 from orthoflow_plugins.plane.support import CELL_LEAST_M
@@ -37,18 +46,26 @@ _PLANE_FOUND: Final = "plane"
 _REJECTED_MOST: Final = 30
 
 _NO_PLANE: Final = (
-    "no plane was found that holds {share:.2%} of the {count} points within {tolerance} m; "
-    "the cloud is {size}: {advice}{small} ({method})"
+    "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
+    "{share:.2%}: {why}; {advice}{small} ({method})"
 )
+_CRITERIA: Final[Mapping[Criterion, str]] = {
+    "few": "the largest candidate holds {share:.2%} of the points",
+    "scattered": "no points crowd about any candidate",
+    "strip": "the candidates are strips too narrow for a plane",
+    "smear": "most points near the largest candidate, which holds {share:.2%} of all, only pass "
+    "through it, as on a rounded body or in a cloud noisier than the tolerance",
+    "bent": "the largest candidate, which holds {share:.2%} of the points, is a curved surface",
+    "tilt": "the candidates lean by more than max_tilt_deg",
+}
+_NO_CANDIDATE: Final = "no candidate was proposed"
 _ADVICE: Final = (
-    "raise tolerance_m or fit_tolerance_m for rough or noisy walls, lower min_share for small "
-    "ones, or raise max_tilt_deg"
+    "wider tolerances up to {wider:.3g} m were tried and find none either: lower min_share for "
+    "small planes, or raise max_tilt_deg"
 )
-# Points are seen to crowd about a plane only within a tolerance well above their noise.
-_ADVICE_WIDER: Final = (
-    "with tolerance_m {wider:g} one is found; it should be at least three times the noise of the "
-    "points"
-)
+_ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
+# Tolerances that are tried for the message, as multiples of the one that found nothing.
+_WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
 # Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
 _SMALL: Final = (
@@ -108,11 +125,12 @@ class Detection:
     raw: tuple[RawPlane, ...]
 
 
-def rules_of(params: DetectorParams) -> Rules:
-    """Give the rules that parameters state."""
+def rules_of(params: DetectorParams, noise: CloudNoise | None = None) -> Rules:
+    """Return the rules that parameters state, of a cloud with a noise (None: unknown)."""
+    find_m, fit_m = params.tolerances_m(noise)
     return Rules(
-        find_m=params.tolerance_m,
-        fit_m=min(params.fit_tolerance_m, params.tolerance_m),
+        find_m=find_m,
+        fit_m=fit_m,
         n_planes_most=params.n_planes_max,
         least_share=params.min_share,
         stop_unclassified_share=params.stop_unclassified_share,
@@ -139,10 +157,9 @@ def detect(
         MethodError: the points fix no plane, or none has enough of them; or materials are asked for
             of a cloud without intensity.
     """
-    rules = rules_of(params)
     if params.materials and cloud.intensity is None:
         raise MethodError(_NO_INTENSITY.format(method=detector.method))
-    prepared, found = _found(cloud, params, ctx, detector)
+    prepared, found, rules = _found(cloud, params, ctx, detector)
     ctx.progress(0.8, "measuring deviations")
     deviations = measure_planes(
         prepared,
@@ -155,6 +172,8 @@ def detect(
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     name_points(prepared, assembly.labels_from_claims, labels)
     ctx.metric("thinning", params.thinning, "1")
+    ctx.metric("tolerance_m", rules.find_m, "m")
+    ctx.metric("fit_tolerance_m", rules.fit_m, "m")
     _report_planes(ctx, assembly, n_points=len(cloud))
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, assembly)
@@ -199,7 +218,11 @@ def find_planes(
 
 
 def greedy_search(
-    unassigned: Unassigned, proposer: Proposer, rules: Rules, report: Report
+    unassigned: Unassigned,
+    proposer: Proposer,
+    rules: Rules,
+    report: Report,
+    refusals: list[Refusal] | None = None,
 ) -> list[FoundPlane]:
     """Find planes one after the other until a stop rule holds.
 
@@ -208,6 +231,7 @@ def greedy_search(
         proposer: the detector.
         rules: when a plane counts and when to stop.
         report: hears progress, 0..1.
+        refusals: gets what refused each candidate that is none.
 
     Returns:
         The planes in the order they were found; `unassigned.claims` refers to that order.
@@ -221,7 +245,7 @@ def greedy_search(
         candidate = proposer.propose(unassigned)
         if candidate is None:
             break
-        plane = verify(candidate, unassigned, rules)
+        plane = verify(candidate, unassigned, rules, refusals)
         if plane is None:
             proposer.reject(candidate)
             n_rejected += 1
@@ -237,9 +261,8 @@ def greedy_search(
 
 def _found(
     cloud: PointCloud, params: DetectorParams, ctx: StepContext, detector: Detector
-) -> tuple[PreparedCloud, list[FoundPlane]]:
+) -> tuple[PreparedCloud, list[FoundPlane], Rules]:
     """Prepare a cloud, and find, fit and label its planes; reports how long that takes."""
-    rules = rules_of(params)
     moments_s = [_now(ctx)]
     ctx.progress(0.0, "preparing the points")
 
@@ -259,13 +282,18 @@ def _found(
         ctx.progress(0.1 + 0.7 * part, text)
 
     whole = prepared(thinned(cloud, params.thinning))
+    noise = measure_noise(whole.sample.offsets_m)
+    if noise is not None:
+        ctx.metric("noise_mm", 1000.0 * noise.single_m, "mm")
+    rules = rules_of(params, noise)
     found = find_planes(whole, detector.proposer_of, rules, heard)
     if not found:
         raise MethodError(
             _NO_PLANE.format(
                 share=params.min_share,
                 count=len(cloud),
-                tolerance=params.tolerance_m,
+                tolerance=rules.find_m,
+                why=_why_none(whole, detector.proposer_of, rules),
                 advice=_advice(whole, detector.proposer_of, rules),
                 **_said_of_size(cloud),
                 method=detector.method,
@@ -281,20 +309,35 @@ def _found(
         detector.relabel(found, whole)
     moments_s.append(_now(ctx))
     _report_times(ctx, np.diff(moments_s, axis=0))
-    return whole, found
+    return whole, found, rules
+
+
+def _why_none(cloud: PreparedCloud, proposer_of: ProposerOf, rules: Rules) -> str:
+    """State the criterion that refused the candidate with most points."""
+    refusals: list[Refusal] = []
+    unassigned = Unassigned.of(cloud)
+    proposer = proposer_of(cloud, unassigned, rules)
+    greedy_search(unassigned, proposer, rules, lambda _part, _text: None, refusals)
+    if not refusals:
+        return _NO_CANDIDATE
+    largest = max(refusals, key=lambda refusal: refusal.share)
+    return _CRITERIA[largest.criterion].format(share=largest.share)
 
 
 def _advice(cloud: PreparedCloud, proposer_of: ProposerOf, rules: Rules) -> str:
-    """Say what would find a plane where none was found: up to its default, a wider tolerance."""
-    usual_m: float = DetectorParams.model_fields["tolerance_m"].default
-    wider = replace(rules, n_planes_most=1)
-    while wider.find_m < usual_m:
-        wider = replace(wider, find_m=min(2.0 * wider.find_m, usual_m))
+    """Name a wider tolerance with which a plane is found, where one was tried that finds one."""
+    for times in _WIDER:
+        wider = replace(
+            rules,
+            find_m=times * rules.find_m,
+            fit_m=max(rules.fit_m, 0.3 * times * rules.find_m),
+            n_planes_most=1,
+        )
         unassigned = Unassigned.of(cloud)
         proposer = proposer_of(cloud, unassigned, wider)
         if greedy_search(unassigned, proposer, wider, lambda _part, _text: None):
             return _ADVICE_WIDER.format(wider=wider.find_m)
-    return _ADVICE
+    return _ADVICE.format(wider=_WIDER[-1] * rules.find_m)
 
 
 def _said_of_size(cloud: PointCloud) -> dict[str, str]:

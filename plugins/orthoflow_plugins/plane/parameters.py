@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -12,10 +12,12 @@ from orthoflow.sdk import MethodParams, Ports
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Family
+    from orthoflow_plugins.plane.noise import CloudNoise
 
 # What every detector reports.
 DETECTOR_METRICS: Final = (
     *("n_planes", "thinning", "labelled_share", "first_share"),
+    *("tolerance_m", "fit_tolerance_m", "noise_mm"),
     *("detection_s", "first_plane_s", "next_plane_s"),
     *("detection_cpu_s", "first_plane_cpu_s", "next_plane_cpu_s"),
     *("rms_mm", "fit_rms_mm", "omega_deg", "phi_deg", "offset_m", "r_m"),
@@ -41,17 +43,25 @@ class DetectorOut(Ports):
     labels: PointLabels
 
 
+# Tolerances of a clean scan: that of markiewicz2015, and what mouldings of rooms stay outside of.
+_FIND_M: Final = 0.05
+_FIT_M: Final = 0.015
+# Tolerances per standard deviation of the noise.
+_NOISE_TIMES: Final = 4.0
+
+
 class DetectorParams(MethodParams):
     """What every detector takes; the defaults suit rooms and facades scanned at millimetres."""
 
-    tolerance_m: float = Field(
-        0.05, gt=0.0, description="Points this near to a plane belong to it."
+    tolerance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
+        "auto",
+        description="Points this near to a plane belong to it, metres. auto: 0.05, or four times "
+        "the noise that is measured on the cloud where that is more.",
     )
-    fit_tolerance_m: float = Field(
-        0.015,
-        gt=0.0,
-        description="Points this near to a plane take part in its final fit; at most "
-        "`tolerance_m`, which the default follows where that is set below it.",
+    fit_tolerance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
+        "auto",
+        description="Points this near to a plane take part in its final fit, metres; at most "
+        "`tolerance_m`. auto: 0.015, or four times the noise of single points where that is more.",
     )
     constraint: Literal["any", "vertical", "horizontal"] = Field(
         "any", description="Which planes are looked for, within `max_tilt_deg`."
@@ -131,22 +141,33 @@ class DetectorParams(MethodParams):
             before_name, before = name, high
         return materials
 
-    @model_validator(mode="before")
-    @classmethod
-    def _fit_follows_find(cls, given: object) -> object:
-        """A default that is wider than what was set would be refused where it is given back."""
-        if not isinstance(given, dict) or "fit_tolerance_m" in given:
-            return given
-        tolerance_m, fit_m = given.get("tolerance_m"), cls.model_fields["fit_tolerance_m"].default
-        if isinstance(tolerance_m, int | float) and 0 < tolerance_m < fit_m:
-            return {**given, "fit_tolerance_m": float(tolerance_m)}
-        return given
-
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:
-        if self.fit_tolerance_m > self.tolerance_m:
+        if (
+            self.tolerance_m != "auto"
+            and self.fit_tolerance_m != "auto"
+            and self.fit_tolerance_m > self.tolerance_m
+        ):
             raise ValueError(
                 f"fit_tolerance_m must be at most tolerance_m = {self.tolerance_m:g}, "
                 f"got {self.fit_tolerance_m:g}"
             )
         return self
+
+    def tolerances_m(self, noise: CloudNoise | None) -> tuple[float, float]:
+        """Return the tolerances of finding and of fitting, for a cloud with a noise.
+
+        A plane is told from a filled slab by how its points crowd in the inner half of the
+        tolerance: within four standard deviations 95 % do (a normal distribution), within 2.5 no
+        more than 80 %, which is refused. Shared errors bend a surface by as much, so they count
+        for finding; for the fit half of that, since a bend is averaged over the whole plane.
+        """
+        single_m = 0.0 if noise is None else noise.single_m
+        shared_m = 0.0 if noise is None else noise.shared_m
+        if self.fit_tolerance_m == "auto":
+            fit_m = max(_FIT_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
+        else:
+            fit_m = self.fit_tolerance_m
+        if self.tolerance_m == "auto":
+            return max(_FIND_M, _NOISE_TIMES * shared_m, fit_m), fit_m
+        return self.tolerance_m, min(fit_m, self.tolerance_m)

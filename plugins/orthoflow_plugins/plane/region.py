@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field, model_validator
 
@@ -81,8 +81,10 @@ class Region(Method):
             description="From which points a normal is taken: a cube, a sphere, or the nearest "
             "cells that hold `n_neighbours` points.",
         )
-        neighbourhood_m: float = Field(
-            0.1, gt=0.0, le=2.0, description="Side of the cube, radius of the sphere."
+        neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
+            "auto",
+            description="Side of the cube, radius of the sphere, metres. auto: 0.1, or three times "
+            "the tolerance of the fit where that is more: normals need room beyond the noise.",
         )
         n_neighbours: int = Field(
             30, ge=3, le=100_000, description="Points of a neighbourhood for knn."
@@ -102,8 +104,10 @@ class Region(Method):
         angle_deg: float = Field(
             10.0, gt=0.0, le=45.0, description="Largest angle between a normal and the region's."
         )
-        distance_m: float = Field(
-            0.015, gt=0.0, description="Largest distance of a cell's middle from the region."
+        distance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
+            "auto",
+            description="Largest distance of a cell's middle from the region, metres. auto: 0.015, "
+            "or half the tolerance of the fit where that is more.",
         )
         labels: Literal["plane", "region"] = Field(
             "plane",
@@ -143,10 +147,10 @@ class Region(Method):
         ) -> RegionProposer:
             growth = Growth(
                 angle_deg=params.angle_deg,
-                distance_m=None if by_normal else params.distance_m,
+                distance_m=None if by_normal else _distance_m(params, rules),
                 least_points=PART_SHARE * rules.least_share * len(cloud.claims),
             )
-            voxels = surface_voxels(cloud, _neighbourhood(params))
+            voxels = surface_voxels(cloud, _neighbourhood(params, rules))
             ctx.progress(0.1, "growing regions")
             viewer_m = middle_viewpoint_m(inputs.cloud, cloud.sample.offsets_m)
             regions = grow(voxels, growth, viewer_m)
@@ -170,14 +174,20 @@ class Region(Method):
         return DetectorOut(planes=detection.planes, labels=detection.labels)
 
 
-def _neighbourhood(params: Region.Params) -> Neighbourhood:
+def _distance_m(params: Region.Params, rules: Rules) -> float:
+    return max(0.015, 0.5 * rules.fit_m) if params.distance_m == "auto" else params.distance_m
+
+
+def _neighbourhood(params: Region.Params, rules: Rules) -> Neighbourhood:
     from orthoflow_plugins.plane.surface_voxels import Neighbourhood
 
+    given = params.neighbourhood_m
+    size_m = min(2.0, max(0.1, 3.0 * rules.fit_m)) if given == "auto" else given
     share = 0.5 if params.neighbourhood == "radius" else 1.0 / 3.0
-    voxel_m = share * params.neighbourhood_m if params.cell_m is None else params.cell_m
+    voxel_m = share * size_m if params.cell_m is None else params.cell_m
     return Neighbourhood(
         shape=params.neighbourhood,
-        size_m=params.neighbourhood_m,
+        size_m=size_m,
         n_points=params.n_neighbours,
         voxel_m=voxel_m,
     )
