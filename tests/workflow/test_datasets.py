@@ -130,13 +130,6 @@ def test_what_hangs_on_the_data_fans_out_and_all_else_runs_once(catalog: Catalog
 
 
 @pytest.mark.usefixtures("folder")
-def test_without_datasets_nothing_is_said_of_data(catalog: Catalog) -> None:
-    workflow = load(ROOMS, catalog)
-    assert "datasets" not in resolved_json(workflow)
-    assert not any("data" in cell.assignment for cell in expand_cells(workflow, catalog))
-
-
-@pytest.mark.usefixtures("folder")
 def test_a_parameter_of_one_dataset_makes_its_step_hang_on_the_data(catalog: Catalog) -> None:
     text = ROOMS + "datasets: {fine: {set: {wall.gsd_m: 0.5}}, plain: {}}\n"
     found = cells(text, catalog)
@@ -515,18 +508,6 @@ def test_a_step_cannot_be_called_data_beside_datasets(catalog: Catalog) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-def test_files_say_in_which_line_of_a_table_they_are_named(catalog: Catalog) -> None:
-    named = table("# rooms\nname,scan\nhall,hall.e57\nstairs,stairs.e57\n")
-    for workflow, said in (
-        (load(ROOMS, catalog, datasets=named), {"hall": "rooms.csv:3", "stairs": "rooms.csv:4"}),
-        # Those of the workflow itself stand in none.
-        (load(ROOMS + TWO, catalog), {"hall": "", "stairs": ""}),
-    ):
-        found = {name: one.inputs["scan"].table for name, one in workflow.datasets.items()}
-        assert found == said
-
-
-@pytest.mark.usefixtures("folder")
 def test_more_cells_than_anybody_can_run_are_counted_before_they_are_built(
     catalog: Catalog,
 ) -> None:
@@ -621,24 +602,6 @@ def test_the_separator_is_the_first_of_three_that_the_header_has() -> None:
     # A header of one column says nothing of it.
     table, problems = rows_of("name\nhall;attic\n")
     assert plain_of(table) == {"hall;attic": {}}
-
-
-@pytest.mark.parametrize(
-    ("written", "value"),
-    [("7", 7), ("-7", -7), ("0.5", 0.5), ("hall", "hall"), ("true", True), ('"7"', 7)],
-)
-def test_settings_are_read_as_yaml(written: str, value: object) -> None:
-    table, problems = rows_of(f"name;p.q\nhall;{written}\n")
-    assert problems == []
-    found = plain_of(table)["hall"]
-    assert found == {"set": {"p.q": value}}
-    assert type(found["set"]["p.q"]) is type(value)  # type: ignore[index]
-
-
-def test_a_setting_that_is_no_yaml_is_told() -> None:
-    table, problems = rows_of("name;p.q;p.r\nhall;[1;3\n")
-    assert problems == ["2:6 the value cannot be read as YAML; quote it"]
-    assert plain_of(table) == {"hall": {"set": {"p.r": 3}}}
 
 
 # --- seeds ---

@@ -18,7 +18,6 @@ from orthoflow.workflow.model import (
 )
 from orthoflow.workflow.problems import (
     InvalidArgumentsError,
-    InvalidWorkflowError,
     Problem,
     UnusablePluginError,
 )
@@ -125,23 +124,6 @@ def test_a_problem_reads_file_line_column_path_message_and_shows_the_line(
     assert re.match(r"flow\.yaml:3:16: steps\.cloud\.use: unknown method plane\.nothing", first)
     assert line == "    cloud: {use: plane.nothing}"
     assert caret == "    " + " " * 13 + "^"
-
-
-def test_of_a_long_line_only_the_part_around_the_mistake_is_shown(
-    catalog: Catalog, write: Path
-) -> None:
-    padding = "x" * 500
-    write.write_text(f"{{orthoflow: 1, seed: -1, name: a, steps: {{room: {{use: {padding}}}}}}}")
-    with pytest.raises(InvalidWorkflowError) as caught:
-        load_workflow(write, catalog)
-    seed, _ = caught.value.problems
-    head, line, caret = str(seed).splitlines()
-    assert head == (
-        "flow.yaml:1:22: seed: expected a whole number from 0 on, or {sweep: [NUMBER, NUMBER, "
-        "...]}, got -1"
-    )
-    assert len(line) <= 124
-    assert line[caret.index("^") :].startswith("-1")
 
 
 def test_a_file_that_is_not_utf8_is_refused_with_its_line(catalog: Catalog, write: Path) -> None:

@@ -16,7 +16,6 @@ from PIL import Image
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
-from orthoflow.workflow import draft
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.draft import Recognised, draft_workflow, recognised
 from orthoflow.workflow.inputs import resolve_input_files
@@ -316,11 +315,6 @@ def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None
     assert "    files:\n      - wall.tif\n      - wall.json\n" in text
 
 
-def test_a_recipe_of_photos_needs_some() -> None:
-    with pytest.raises(InputError, match="photos-on-scan needs photos, and there are none"):
-        draft_workflow([found("scan", "hall.laz")], Path("flow.yaml"), "photos-on-scan")
-
-
 # --- what files are ---
 
 MORE_TIES = TIES + "b.jpg,1,2,3,4,5\n"
@@ -378,12 +372,6 @@ def test_a_scan_says_how_many_points_it_has_and_what_of_each(tmp_path: Path) -> 
     assert found.fields == {"rgb"}
 
 
-def test_camera_raw_says_what_to_do(tmp_path: Path) -> None:
-    found = one(tmp_path / "a.NEF", b"raw")
-    assert found.kind == "unknown"
-    assert "develop to TIFF of 16 bits or JPEG first" in found.said
-
-
 def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> None:
     alone = one(tmp_path / "wall.tif")
     assert alone.kind == "photos"
@@ -397,20 +385,6 @@ def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) 
     found = one(tmp_path / "cameras.csv", text)
     assert (found.kind, found.said) == ("cameras", "1 cameras")
     assert one(tmp_path / "cameras.txt", text).kind == "unknown"
-
-
-@pytest.mark.parametrize(("n_bytes", "is_told"), [(990_000, True), (1_010_000, False)])
-def test_a_workflow_is_one_by_its_first_megabyte(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int, *, is_told: bool
-) -> None:
-    def refused(_path: Path) -> str:
-        raise InputError("it is no calibration")
-
-    # It would take seconds to read so much YAML.
-    monkeypatch.setattr(draft, "_calibration_said", refused)
-    found = one(tmp_path / "big.yaml", "#".ljust(n_bytes - 1) + "\nsteps:\n")
-    assert found.kind == "unknown"
-    assert (found.said == "big.yaml is a workflow itself") is is_told
 
 
 def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
@@ -470,20 +444,6 @@ def test_folders_are_looked_into_three_deep_and_no_link_is_followed(tmp_path: Pa
     assert names([data / "1", data / "a.jpg"], data)[-1] == "a.jpg"
     with pytest.raises(InputError, match="nowhere does not exist: give scans, photos, and folders"):
         recognised([data, tmp_path / "nowhere"])
-
-
-@pytest.mark.parametrize(("most", "is_too_much"), [(3, False), (2, True)])
-def test_so_many_files_are_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, *, is_too_much: bool
-) -> None:
-    monkeypatch.setattr(draft, "MOST_FILES", most)
-    for name in "abc":
-        (tmp_path / f"{name}.jpg").touch()
-    if is_too_much:
-        with pytest.raises(InputError, match=f"holds more than {most} files: name those that"):
-            recognised([tmp_path])
-    else:
-        assert len(recognised([tmp_path])) == 3
 
 
 def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import json
 import re
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -17,15 +16,7 @@ from orthoflow.workflow import inputs
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.inputs import (
     present_inputs,
-    read_input_options,
     resolve_input_files,
-    some_of,
-)
-from orthoflow.workflow.model import (
-    WorkflowInputSpec,
-)
-from orthoflow.workflow.problems import (
-    ProblemLog,
 )
 
 
@@ -183,61 +174,3 @@ def test_looking_through_the_whole_machine_ends_soon(
     with pytest.raises(InputError, match="has more than 20000 files and folders"):
         names(project, catalog, "{files: '**/*.e57'}")
     assert time.process_time() - started < 4.0
-
-
-# --- limits ---
-
-
-def specs(*names: str, **more: object) -> SimpleNamespace:
-    found = [WorkflowInputSpec(name=name, **more) for name in names]  # type: ignore[arg-type]
-    return SimpleNamespace(input_specs={spec.name: spec for spec in found})
-
-
-@pytest.mark.parametrize(("n_inputs", "more"), [(12, 0), (13, 1), (20, 8)])
-def test_a_dozen_inputs_without_files_are_named(n_inputs: int, more: int) -> None:
-    names_of = [f"scan{k}" for k in range(n_inputs)]
-    with pytest.raises(InputError) as caught:
-        resolve_input_files(specs(*names_of))  # type: ignore[arg-type]
-    *said, last = str(caught.value).split("\n")
-    assert str(caught.value).count("has no files") == 12
-    assert ("scan12" in str(caught.value)) is False
-    assert (last == f"and {more} more have no files") is (more > 0)
-    assert len(said) == 12 - (more == 0)
-
-
-def test_what_there_is_is_named_up_to_a_dozen() -> None:
-    dozen = [f"a{k}" for k in range(12)]
-    assert some_of(dozen) == ", ".join(dozen)
-    assert some_of([*dozen, "b"]) == f"{', '.join(dozen)} and 1 more"
-
-
-@pytest.mark.parametrize(("most", "is_too_much"), [(4, False), (3, True)])
-def test_every_file_and_folder_that_is_looked_at_counts_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, *, is_too_much: bool
-) -> None:
-    monkeypatch.setattr(inputs, "MOST_LOOKED_AT", most)
-    for name in ("a.e57", "b.e57", "c.txt"):
-        (tmp_path / name).touch()
-    (tmp_path / "folder").mkdir()
-    for files in ("", "*.e57"):
-        wanted = specs("scan", files=(files or ".",), folder=tmp_path)
-        if is_too_much:
-            with pytest.raises(InputError, match=f"has more than {most} files and folders"):
-                resolve_input_files(wanted)  # type: ignore[arg-type]
-        else:
-            found = resolve_input_files(wanted)["scan"]  # type: ignore[arg-type]
-            assert found is not None
-            assert len(found.paths) == (2 if files else 3)
-
-
-def test_an_option_is_kept_without_the_folders_of_this_machine() -> None:
-    log = ProblemLog(file="flow.yaml")
-    good, dataset = read_input_options(["scan=/home/me/hall.e57", "scan@hall=b/*.laz"], log)
-    assert (str(good), good.without_folder) == (
-        *("--input scan=/home/me/hall.e57", "--input scan=hall.e57"),
-    )
-    assert dataset.without_folder == "--input scan@hall=*.laz"
-    assert (good.is_of_dataset, dataset.is_of_dataset) == (False, True)
-    assert read_input_options(["scan", "=a", "scan=", "x=1=2"], log) == (
-        inputs.InputOption(name="x", path="1=2"),
-    )

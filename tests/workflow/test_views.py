@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import jsonschema
@@ -139,15 +138,6 @@ steps:
         '    step3 -->|"walls"| step4\n'
         '    step1 -->|"cloud"| step4\n'
     )
-
-
-def test_mermaid_counts_datasets_and_draws_ports_between_two_steps_as_one_edge() -> None:
-    plugins = discover_catalog()
-    drawn = mermaid(load_workflow("quickstart", plugins), plugins)
-    edges = re.findall(r"^    (\w+ (?:-->|-\.->))\|\"([^\"]+)\"\| (\w+)$", drawn, re.MULTILINE)
-    assert len({(source, target) for source, _, target in edges}) == len(edges)
-    assert any(", " in ports for _, ports, _ in edges)
-    assert "datasets" not in drawn
 
 
 def test_mermaid_counts_the_datasets_of_an_input(catalog: Catalog, write: Path) -> None:
