@@ -67,6 +67,7 @@ class MethodFacts(MethodIdentity):
         inputs: port -> product type.
         outputs: port -> product type.
         sources: the files behind `code`.
+        repeatable: input ports whose files may repeat each other's content.
         maps_over: where the items are that it may compute in parts, if it does.
     """
 
@@ -77,6 +78,7 @@ class MethodFacts(MethodIdentity):
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     sources: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+    repeatable: frozenset[str] = frozenset()
     maps_over: MappedPort | None = None
 
     def is_code_unchanged(self) -> bool:
@@ -125,6 +127,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         compiled_digest=compiled_digest(entry),
         inputs={name: port.type_name for name, port in port_specs(cls.In).items()},
         outputs={name: port.type_name for name, port in port_specs(cls.Out).items()},
+        repeatable=frozenset(cls.repeatable),
         maps_over=mapped_port(cls),
     )
 

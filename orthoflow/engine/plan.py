@@ -28,7 +28,14 @@ from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.system import usable_cores
-from orthoflow.workflow.expand import Cell, CellOutput, Selection, check_step_names, select_cells
+from orthoflow.workflow.expand import (
+    Cell,
+    CellOutput,
+    Selection,
+    WorkflowInput,
+    check_step_names,
+    select_cells,
+)
 from orthoflow.workflow.inputs import resolve_input_files
 from orthoflow.workflow.model import (
     Workflow,
@@ -42,6 +49,8 @@ _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
 # Of results that lost their objects so many are passed over.
 _MOST_LOOKED_AT: Final = 5
+# Settings of cameras and of pictures' places, which may well be the same for several.
+_SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
 # To start a process and to read and keep its products.
 _START_S: Final = 1.0
 
@@ -199,6 +208,7 @@ def plan_run(
         for method in dict.fromkeys(cell.method for cell in selected if not cell.skip_reason)
     }
     inputs = _digest_inputs(resolve_input_files(workflow), store)
+    _require_distinct(selected, inputs, methods)
     planner = _Planner(inputs=inputs, methods=methods, store=store, force=options.force)
     for cell in selected:
         planner.add(cell)
@@ -210,6 +220,33 @@ def plan_run(
         products=_product_targets(methods, catalog),
         options=options,
     )
+
+
+def _require_distinct(
+    cells: Sequence[Cell],
+    inputs: Mapping[str, PlannedInput | None],
+    methods: Mapping[str, MethodFacts],
+) -> None:
+    """Refuse files that a step would count twice: a copy, or a link to the same file.
+
+    Raises:
+        InputError: two files of an input have the same content.
+    """
+    for cell in cells:
+        for port, source in cell.inputs.items():
+            given = inputs[source.name] if isinstance(source, WorkflowInput) else None
+            if cell.skip_reason or given is None or port in methods[cell.method].repeatable:
+                continue
+            seen: dict[str, Path] = {}
+            for path, file in zip(given.paths, given.files, strict=True):
+                if path.suffix.lower() in _SIDECARS:
+                    continue
+                first = seen.setdefault(file.sha256, path)
+                if first != path:
+                    raise InputError(
+                        f"the input of {cell.step}.{port}: {first} and {path} have the same "
+                        "content, which would count twice; leave one of them out"
+                    )
 
 
 def needed_addresses(cell: Cell) -> tuple[str, ...]:

@@ -42,6 +42,7 @@ from orthoflow.errors import (
     MethodError,
     OrthoflowError,
     PluginError,
+    ProductError,
     StepFailedError,
 )
 from orthoflow.geometry.kernel_news import heard_by
@@ -272,7 +273,7 @@ class _Call:
         self._check_inputs(inputs)
         result = dataclasses.replace(
             blank_result(self.task),
-            outputs=self._keep_part(outputs) or self._keep(self._products(cls, outputs)),
+            outputs=self._keep_part(outputs) or self._keep(self._products(cls, outputs, inputs)),
             metrics=labelled(cls, self._context.metrics),
             figures=self._keep_figures(),
         )
@@ -338,7 +339,10 @@ class _Call:
                     f"it must work on a copy"
                 )
 
-    def _products(self, cls: type[Method], outputs: object) -> dict[str, Product]:
+    def _products(
+        self, cls: type[Method], outputs: object, inputs: Mapping[str, Product | InputFiles]
+    ) -> dict[str, Product]:
+        given = {port: one for port, one in inputs.items() if isinstance(one, Product)}
         if not isinstance(outputs, cls.Out):
             raise MethodError(f"{self.task.who} must return its Out, got {type(outputs).__name__}")
         products: dict[str, Product] = {}
@@ -350,6 +354,12 @@ class _Call:
                     f"{port}, got {type(product).__name__}"
                 )
             products[port] = product
+        for port, product in products.items():
+            others = {name: other for name, other in products.items() if name != port}
+            try:
+                product.check_against(others | given)
+            except ProductError as error:
+                raise MethodError(f"{self.task.who} gives impossible {port}: {error}") from error
         return products
 
     def _keep(self, products: Mapping[str, Product]) -> dict[str, ProductRef]:

@@ -93,6 +93,16 @@ class PointCloud(Product):
     def __len__(self) -> int:
         return len(self.x)
 
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: a coordinate is not finite.
+        """
+        for name in ("origin", "up", "x", "y", "z"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ProductError(f"cloud.{name} must be finite")
+
     @cached_property
     def boxes_m(self) -> NDArray[np.float32] | None:
         """Boxes (blocks, 2, 3) of the points as they follow each other; None for a few blocks.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from enum import IntEnum
 from typing import ClassVar, Self
@@ -284,6 +284,20 @@ class Ties(Product):
                 "radii, one per photo is expected, or none"
             )
 
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: a tie has no place, no error, or names a photo that is not there.
+        """
+        for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ProductError(f"ties.{name} must be finite")
+        for name in ("sigma_px", "sigma_m"):
+            if (getattr(self, name) < 0.0).any():
+                raise ProductError(f"ties.{name} must be 0 or more")
+        _require_photos("ties", self.photo_names, others)
+
     def number(self, wall: int) -> int:
         """Give the number of a wall for people: the place of its plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
@@ -409,6 +423,39 @@ class Cameras(Product):
     residual_table: tuple[ResidualRow, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
 
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: an orientation is no rotation, is not finite, or is of an unknown photo.
+        """
+        for camera in self.cameras:
+            rotation = camera.rotation_camera_from_world
+            if camera.status != "ok":
+                continue
+            if rotation is None or camera.translation_camera_from_world is None:
+                raise ProductError(f"camera {camera.photo} is ok and lacks its orientation")
+            is_turn = rotation.shape == (3, 3) and np.allclose(
+                rotation @ rotation.T, np.eye(3), atol=1e-6
+            )
+            if not is_turn or np.linalg.det(rotation) < 0.0:
+                raise ProductError(
+                    f"camera {camera.photo}: rotation_camera_from_world must be a rotation "
+                    "(orthonormal, determinant +1)"
+                )
+            if not np.isfinite(camera.translation_camera_from_world).all():
+                raise ProductError(
+                    f"camera {camera.photo}: translation_camera_from_world must be finite"
+                )
+            spread = camera.covariance
+            if spread is not None and not (
+                np.isfinite(spread).all() and (np.diagonal(spread) >= 0.0).all()
+            ):
+                raise ProductError(
+                    f"camera {camera.photo}: covariance must be finite, with variances of 0 or more"
+                )
+        _require_photos("cameras", [camera.photo for camera in self.cameras], others)
+
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:
         """Take the table of residuals out of the details of version 1, and the like of its ties."""
@@ -453,3 +500,12 @@ def _mapping(value: JsonValue) -> dict[str, JsonValue]:
 
 def _without(entries: Mapping[str, JsonValue], name: str) -> dict[str, JsonValue]:
     return {key: value for key, value in entries.items() if key != name}
+
+
+def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
+    """Refuse names of photos that are not among the photos of a step, where it has some."""
+    for product in others.values():
+        known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
+        unknown = [name for name in names if known is not None and name not in known]
+        if unknown:
+            raise ProductError(f"{what} name the photo {unknown[0]}, which the step was not given")

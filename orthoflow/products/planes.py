@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
+from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 SideSource = Literal["stations", "photos", "guess", "given"]
@@ -252,6 +253,24 @@ class Planes(Product):
         largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: a covariance, a support or a deviation is impossible.
+        """
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        if not np.isfinite(self.covariance).all() or (variances < 0.0).any():
+            raise ProductError("planes.covariance must be finite, with variances of 0 or more")
+        if not (np.isfinite(self.rms_m) & (self.rms_m >= 0.0)).all():
+            raise ProductError("planes.rms_m must be finite and 0 or more")
+        n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
+        if (self.n_points < 0).any() or (n_all and (self.n_points > n_all[0]).any()):
+            raise ProductError(
+                f"planes.n_points must be from 0 to the number of points"
+                f"{f', {n_all[0]}' if n_all else ''}, got {self.n_points.tolist()}"
+            )
+
     def sigma_offset_m(self, index: int) -> float:
         """Standard deviation of a plane's position at the middle of its rectangle.
 
@@ -281,3 +300,24 @@ class PointLabels(Product):
                 f"labels.plane_index must be a flat int16 array, got {self.plane_index.dtype} of "
                 f"shape {self.plane_index.shape}"
             )
+
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`: one label per point, and planes that exist.
+
+        Raises:
+            ProductError: the labels contradict the cloud or the planes.
+        """
+        for product in others.values():
+            if isinstance(product, PointCloud) and len(product) != len(self.plane_index):
+                raise ProductError(
+                    f"labels.plane_index must hold one label for each of {len(product)} points, "
+                    f"got {len(self.plane_index)}"
+                )
+            if isinstance(product, Planes) and self.plane_index.size:
+                low, high = int(self.plane_index.min()), int(self.plane_index.max())
+                n_planes = len(product.offset)
+                if low < -1 or high >= n_planes:
+                    raise ProductError(
+                        f"labels.plane_index must be -1 or the index of one of {n_planes} planes "
+                        f"(from 0), got {low if low < -1 else high}"
+                    )

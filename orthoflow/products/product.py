@@ -100,6 +100,18 @@ class Product:
             mapped=self.mapped or sum(array.nbytes for array in arrays.values()) > _LARGE_BYTES,
         )
 
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """Check the product, at the end of its step, against the other products of the step.
+
+        Subclasses that refer to others override it.
+
+        Args:
+            others: inputs and other outputs of the step by port.
+
+        Raises:
+            ProductError: the product contradicts one of them, or holds values that make no sense.
+        """
+
     @classmethod
     def from_payload(cls, payload: Payload) -> Self:
         """Build the product again from `to_payload`'s result; arrays are not copied.

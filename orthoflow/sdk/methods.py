@@ -172,6 +172,8 @@ class Method:
         citations: where the method comes from: DOI, title or URL.
         unaffected_by: distributions whose version does not change results, although the method's
             own distribution requires them; all others are part of a result's key.
+        repeatable: input ports of files of which several may have the same content, such as masks;
+            of all others a second copy would count twice, and is refused.
         Params: parameters.
         In: input ports.
         Out: output ports.
@@ -186,6 +188,7 @@ class Method:
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = ()
     citations: ClassVar[tuple[str, ...]] = ()
     unaffected_by: ClassVar[tuple[str, ...]] = ()
+    repeatable: ClassVar[tuple[str, ...]] = ()
     Params: ClassVar[type[MethodParams]]
     In: ClassVar[type[Ports]]
     Out: ClassVar[type[Ports]]

@@ -30,6 +30,7 @@ from orthoflow.errors import (
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepEvent
 from tests.engine_tasks import bare_task
+from tests.engine_world import World
 from tests.report_runs import environment
 
 REF = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:1")
@@ -228,14 +229,14 @@ def test_a_method_gives_what_its_ports_promise() -> None:
     cls: Any = SimpleNamespace(Out=Out)
     numbers = Numbers(values=np.zeros(3))
     call = a_call(a_task(outputs={"out": TaskOutput(type_name="numbers", target="x:Y")}))
-    assert call._products(cls, Out(out=numbers, more=1)) == {"out": numbers}
+    assert call._products(cls, Out(out=numbers, more=1), {}) == {"out": numbers}
     with pytest.raises(MethodError, match=f"^{WHO} must return its Out, got dict$"):
-        call._products(cls, {"out": numbers})
+        call._products(cls, {"out": numbers}, {})
     with pytest.raises(MethodError, match="must give a numbers on its port out, got int"):
-        call._products(cls, Out(out=3))
+        call._products(cls, Out(out=3), {})
     other = a_call(a_task(outputs={"out": TaskOutput(type_name="heights", target="x:Y")}))
     with pytest.raises(MethodError, match="must give a heights on its port out, got Numbers"):
-        other._products(cls, Out(out=numbers))
+        other._products(cls, Out(out=numbers), {})
 
 
 def test_an_input_or_output_that_a_method_changed_is_told() -> None:
@@ -261,3 +262,28 @@ def test_of_a_long_trace_the_end_is_kept() -> None:
     assert 1_000 < len(kept) < 1_000_000
     assert "\\ud800" in running._trace(ValueError("\ud800"))
     assert isinstance(running._trace(MuteError()), str)
+
+
+def test_a_product_that_contradicts_its_inputs_fails_its_step_and_names_the_method(
+    world: World,
+) -> None:
+    source = world.site / "toy_plugin" / "products.py"
+    source.write_text(
+        f"{source.read_text()}\n\n"
+        "def _check(self, others):\n"
+        "    from orthoflow.errors import ProductError\n"
+        "    if any(len(one.values) == len(self.values) for one in others.values()):\n"
+        "        raise ProductError('numbers.values must be as many as expected')\n\n\n"
+        "Numbers.check_against = _check\n"
+    )
+    outcome = world.run(
+        "steps:\n"
+        "  first: {use: make.range}\n"
+        "  second: {use: work.add, in: {numbers: first.numbers}}\n",
+        executor="inline",
+    )
+    assert outcome.results["first"].status == "ok"
+    failure = outcome.results["second"]
+    assert failure.status == "failed"
+    assert "method work.add" in failure.error_message
+    assert "numbers.values must be as many as expected" in failure.error_message

@@ -118,6 +118,7 @@ class MosaicSeams(Method):
 
     id: ClassVar[str] = "mosaic.seams"
     result_version: ClassVar[int] = 6
+    repeatable: ClassVar[tuple[str, ...]] = ("seams",)
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_orthoimages",

@@ -39,6 +39,7 @@ class ReadCameras(Method):
 
     id = "read.cameras"
     result_version = 4
+    repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (
         "n_photos",

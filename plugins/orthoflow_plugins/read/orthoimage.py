@@ -39,6 +39,7 @@ class ReadOrthoimage(Method):
 
     id: ClassVar[str] = "read.orthoimage"
     result_version: ClassVar[int] = 3
+    repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (
         "n_orthoimages",

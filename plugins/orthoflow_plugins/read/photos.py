@@ -79,6 +79,7 @@ class ReadPhotos(Method):
 
     id = "read.photos"
     result_version = 4
+    repeatable: ClassVar[tuple[str, ...]] = ("calibration", "cameras", "masks")
     determinism = "exact"
     metrics = (
         "n_photos",

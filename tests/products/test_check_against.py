@@ -1,0 +1,103 @@
+"""What a step gives is checked against what it was given, and the message names the value."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ProductError
+from orthoflow.products import Camera, Cameras, Planes, PointCloud, PointLabels, Product
+
+CLOUD = PointCloud(
+    origin=np.zeros(3),
+    up=np.array([0.0, 0.0, 1.0]),
+    x=np.arange(4, dtype=np.float32),
+    y=np.zeros(4, np.float32),
+    z=np.zeros(4, np.float32),
+)
+PLANES = Planes(
+    normal=np.array([[0.0, 0.0, 1.0]]),
+    offset=np.zeros(1),
+    corners=np.zeros((1, 4, 3)),
+    covariance=np.eye(4)[None],
+    n_points=np.array([4]),
+    rms_m=np.zeros(1),
+    up=np.array([0.0, 0.0, 1.0]),
+    names=("floor 0",),
+    viewpoint="given",
+)
+CAMERA = Camera(
+    photo="a.jpg",
+    status="ok",
+    rotation_camera_from_world=np.eye(3),
+    translation_camera_from_world=np.zeros(3),
+    covariance=np.eye(6),
+)
+OTHERS: dict[str, Product] = {"cloud": CLOUD, "planes": PLANES}
+
+
+def labels(*values: int) -> PointLabels:
+    return PointLabels(plane_index=np.array(values, np.int16))
+
+
+@pytest.mark.parametrize("values", [(-1, 0, 0, -1), (0, 0, 0, 0)])
+def test_labels_of_planes_that_exist_are_taken(values: tuple[int, ...]) -> None:
+    labels(*values).check_against(OTHERS)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"), [((0, 0, 0, 5), "5"), ((0, -2, 0, 0), "-2"), ((0, 0, 0), "3"), ((), "0")]
+)
+def test_labels_that_contradict_cloud_or_planes_are_refused(
+    values: tuple[int, ...], named: str
+) -> None:
+    with pytest.raises(ProductError, match=rf"labels\.plane_index.*got {named}"):
+        labels(*values).check_against(OTHERS)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"covariance": -np.eye(4)[None]},
+        {"covariance": np.full((1, 4, 4), np.nan)},
+        {"rms_m": np.array([np.nan])},
+        {"rms_m": np.array([-0.1])},
+        {"n_points": np.array([5])},
+        {"n_points": np.array([-1])},
+    ],
+)
+def test_impossible_planes_are_refused(changed: dict[str, Any]) -> None:
+    PLANES.check_against(OTHERS)
+    (name,) = changed
+    with pytest.raises(ProductError, match=rf"planes\.{name}"):
+        replace(PLANES, **changed).check_against(OTHERS)
+
+
+@pytest.mark.parametrize("name", ["x", "y", "z", "origin"])
+def test_a_cloud_without_a_place_is_refused(name: str) -> None:
+    CLOUD.check_against({})
+    value = np.array(getattr(CLOUD, name))
+    value[1] = np.inf
+    with pytest.raises(ProductError, match=rf"cloud\.{name} must be finite"):
+        replace(CLOUD, **{name: value}).check_against({})
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"rotation_camera_from_world": -np.eye(3)},
+        {"rotation_camera_from_world": 2.0 * np.eye(3)},
+        {"rotation_camera_from_world": None},
+        {"translation_camera_from_world": np.full(3, np.nan)},
+        {"covariance": -np.eye(6)},
+    ],
+)
+def test_an_impossible_orientation_is_refused(changed: dict[str, Any]) -> None:
+    Cameras(cameras=(CAMERA,)).check_against({})
+    with pytest.raises(ProductError, match=r"camera a\.jpg"):
+        Cameras(cameras=(replace(CAMERA, **changed),)).check_against({})
+    refused = replace(CAMERA, status="too few ties", **changed)
+    Cameras(cameras=(refused,)).check_against({})
