@@ -46,6 +46,7 @@ def planned(
     monkeypatch.setattr(room, "_scan", lambda *_: "scan")
     monkeypatch.setattr(room, "calibration_of", lambda shots, *, is_known: is_known)
     monkeypatch.setattr(room, "take_photos", lambda *args: args[:2])
+    monkeypatch.setattr(room, "with_passers_by", lambda *_: ())
     monkeypatch.setattr(room, "calibrated", lambda photos, calibration: (*photos, calibration))
     monkeypatch.setattr(room, "_check_points", lambda delivery, views, most: most)
     monkeypatch.setattr(SimulateRoom, "Out", staticmethod(lambda **out: out))
@@ -81,9 +82,12 @@ def test_records_of_rooms_as_they_always_were_do_not_change(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     _, _, usual, _ = planned(monkeypatch, tmp_path)
-    later = {"decoration", "design_seed", "photo_exposure_share"}
+    later = {"decoration", "design_seed", "photo_exposure_share", "n_passers_by"}
     assert set(usual) == set(Params.model_fields) - later
-    changed = {"decoration": "drawn", "design_seed": 7, "photo_exposure_share": 0.2}
+    changed = {
+        **{"decoration": "drawn", "design_seed": 7},
+        **{"photo_exposure_share": 0.2, "n_passers_by": 3},
+    }
     _, rng, settings, _ = planned(monkeypatch, tmp_path, **changed)
     assert {name: settings[name] for name in later} == changed
     # A design has a seed of its own.
