@@ -365,7 +365,7 @@ def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
     )
     ctx = scenes.context(tmp_path)
     extent = Extent(front_m=0.1, behind_m=0.1)
-    assert list(grid._crops(planes, params, lambda _: extent, ctx)) == [0]
+    assert list(grid._crops(planes, params, lambda _: extent, ctx)[0]) == [0]
     assert any(f"is {away_m:.2f} m away: check the" in said for said in ctx.warnings) == is_told
 
 
