@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, cast
 
@@ -71,8 +71,9 @@ class Announced:
 
     Attributes:
         distribution: who announced it; of a clash, the first.
-        state: `clash` when several announce it, and not alike; `broken` when it cannot be used.
-        problem: one sentence that names the distributions, empty when fine.
+        state: `clash` when several announce it and nobody said which is meant; `broken` when it
+            cannot be used.
+        problem: one sentence that names the distributions; of what is fine, who else claims it.
     """
 
     distribution: DistributionInfo
@@ -102,11 +103,13 @@ class MethodEntry(Announced):
         spec: id, import string, summary.
         kind: ports that the method must keep; None when nobody announces its kind.
         product_types: all product types that ports may carry.
+        contested: of those that several plugins announce, the class that is used.
     """
 
     spec: MethodSpec
     kind: KindSpec | None
     product_types: frozenset[str] = frozenset()
+    contested: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> type[Method]:
         """Import the class and check what the framework relies on.
@@ -119,7 +122,9 @@ class MethodEntry(Announced):
             raise PluginError(self.problem)
         from orthoflow.catalog.loading import load_method  # noqa: PLC0415 - loads pydantic
 
-        return load_method(self.spec, self.kind, self.distribution, self.product_types)
+        return load_method(
+            self.spec, self.kind, self.distribution, self.product_types, self.contested
+        )
 
     def looked_at(self) -> MethodEntry:
         """Give the entry as it is: `broken` where its class is not in its source and does not load.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -21,8 +22,12 @@ from orthoflow.catalog.catalog import (
     MethodEntry,
     ProductEntry,
 )
-from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
-from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.distributions import (
+    DistributionInfo,
+    canonical_name,
+    describe_distribution,
+)
+from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
@@ -42,6 +47,10 @@ NAME_PATTERN: Final = (
 _METHOD_ID: Final = re.compile(rf"{NAME_PATTERN}\.{NAME_PATTERN}")
 _KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+# Whose names nobody else takes away.
+OWN: Final = "orthoflow-tls"
+DISABLED: Final = "ORTHOFLOW_DISABLED_PLUGINS"
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
 
@@ -67,26 +76,35 @@ class _Announcement:
 def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalog:
     """List everything that the installed plugins bring.
 
+    Plugins that `ORTHOFLOW_DISABLED_PLUGINS` names, by distribution or entry point and with `,`
+    between, are left out.
+
     Args:
         entry_points: plugins to look at; None for all installed ones.
     """
     found = _installed_entry_points() if entry_points is None else entry_points
     announcements: list[_Announcement] = []
     broken: list[BrokenPlugin] = []
-    described = [(entry, describe_distribution(entry)) for entry in found]
+    disabled = {canonical_name(name) for name in os.environ.get(DISABLED, "").split(",")}
+    described = [
+        (entry, distribution)
+        for entry in found
+        if canonical_name(entry.name) not in disabled
+        and canonical_name((distribution := describe_distribution(entry)).name) not in disabled
+    ]
     for entry, distribution in sorted(
         described, key=lambda item: (item[1].name, item[0].name, item[0].value)
     ):
         try:
             with foreign_code(f"plugin {entry.name} of {distribution}"):
                 announcements.append(_announce(entry, distribution))
-        except KeyboardInterrupt:
+        except UserInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - foreign code may raise anything, even SystemExit
             broken.append(_describe_failure(entry, distribution, error))
     products = _collect_products(announcements)
     kinds = _collect_kinds(announcements, frozenset(products))
-    methods = _collect_methods(announcements, kinds, frozenset(products))
+    methods = _collect_methods(announcements, kinds, products)
     return Catalog(methods=methods, kinds=kinds, products=products, broken=tuple(broken))
 
 
@@ -204,8 +222,9 @@ def _way_out(entry: EntryPoint, error: BaseException) -> str:
 def _by_name(
     announcements: Iterable[_Announcement], specs_of: Callable[[_Announcement], Iterable[_Spec]]
 ) -> dict[str, list[_Claim[_Spec]]]:
+    """Who claims each name: orthoflow itself first, then by the names of distributions."""
     claims: dict[str, list[_Claim[_Spec]]] = {}
-    for announcement in announcements:
+    for announcement in sorted(announcements, key=lambda item: item.distribution.name != OWN):
         for spec in specs_of(announcement):
             claim = _Claim(spec=spec, distribution=announcement.distribution)
             claims.setdefault(_name(spec), []).append(claim)
@@ -218,9 +237,9 @@ def _name(spec: MethodSpec | KindSpec | ProductSpec) -> str:
     return spec.name if isinstance(spec, KindSpec) else spec.type_name
 
 
-def _clash(what: str, claims: list[_Claim[_Spec]]) -> str:
+def _contested(what: str, claims: list[_Claim[_Spec]], consequence: str) -> str:
     claimants = " and ".join(str(claim.distribution) for claim in claims)
-    return f"{what} is claimed by {claimants}; uninstall all but one of them"
+    return f"{what} is claimed by {claimants}: {consequence}; {DISABLED}=NAME switches a plugin off"
 
 
 def _collect_products(announcements: Iterable[_Announcement]) -> dict[str, ProductEntry]:
@@ -229,12 +248,11 @@ def _collect_products(announcements: Iterable[_Announcement]) -> dict[str, Produ
         first = claims[0]
         problem = ""
         if len({(claim.spec.target, claim.spec.publisher) for claim in claims}) > 1:
-            problem = _clash(f"product type {name}", claims)
+            problem = _contested(
+                f"product type {name}", claims, f"that of {first.distribution.name} is used"
+            )
         entries[name] = ProductEntry(
-            spec=first.spec,
-            distribution=first.distribution,
-            state="clash" if problem else "fine",
-            problem=problem,
+            spec=first.spec, distribution=first.distribution, problem=problem
         )
     return entries
 
@@ -246,19 +264,13 @@ def _collect_kinds(
     for name, claims in _by_name(announcements, lambda item: item.kinds).items():
         first = claims[0]
         state: EntryState = "fine"
-        problem = ""
-        unknown = sorted(
-            ({*first.spec.inputs.values()} - product_types - {FILES})
-            | ({*first.spec.outputs.values()} - product_types)
-        )
-        # The same ports again do no harm: two strangers may both need a kind of their own.
-        if any(_ports(claim.spec) != _ports(first.spec) for claim in claims):
-            state, problem = "clash", _clash(f"kind {name}", claims)
-        elif unknown:
+        problem = _unknown_products(first, product_types)
+        if problem:
             state = "broken"
-            problem = (
-                f"kind {name} of {first.distribution} has ports of product types that no plugin "
-                f"announces: {', '.join(unknown)}"
+        elif any(_ports(claim.spec) != _ports(first.spec) for claim in claims):
+            # The same ports again do no harm: two plugins may both need a kind of their own.
+            problem = _contested(
+                f"kind {name}", claims, "methods have the ports that their own plugin gives it"
             )
         entries[name] = KindEntry(
             spec=first.spec, distribution=first.distribution, state=state, problem=problem
@@ -266,35 +278,70 @@ def _collect_kinds(
     return entries
 
 
+def _unknown_products(claim: _Claim[KindSpec], product_types: frozenset[str]) -> str:
+    spec = claim.spec
+    unknown = sorted(
+        ({*spec.inputs.values()} - product_types - {FILES})
+        | ({*spec.outputs.values()} - product_types)
+    )
+    if not unknown:
+        return ""
+    return (
+        f"kind {spec.name} of {claim.distribution} has ports of product types that no plugin "
+        f"announces: {', '.join(unknown)}"
+    )
+
+
 def _ports(spec: KindSpec) -> tuple[dict[str, str], dict[str, str], bool]:
     return dict(spec.inputs), dict(spec.outputs), spec.is_source
 
 
 def _collect_methods(
-    announcements: Iterable[_Announcement],
+    announcements: list[_Announcement],
     kinds: dict[str, KindEntry],
-    product_types: frozenset[str],
+    products: dict[str, ProductEntry],
 ) -> dict[str, MethodEntry]:
-    entries: dict[str, MethodEntry] = {}
-    for name, claims in _by_name(announcements, lambda item: item.methods).items():
-        first = claims[0]
-        who = f"method {name} of {first.distribution}"
-        kind = kinds.get(first.spec.kind)
-        state: EntryState = "fine"
+    own_kinds = {
+        (item.distribution.name, kind.name): _Claim(spec=kind, distribution=item.distribution)
+        for item in announcements
+        for kind in item.kinds
+    }
+    product_types = frozenset(products)
+    contested = {name: entry.spec.target for name, entry in products.items() if entry.problem}
+
+    def entry_of(claim: _Claim[MethodSpec]) -> MethodEntry:
+        spec, who = claim.spec, f"method {claim.spec.id} of {claim.distribution}"
+        own, shared = own_kinds.get((claim.distribution.name, spec.kind)), kinds.get(spec.kind)
         problem = ""
-        if len(claims) > 1:
-            state, problem = "clash", _clash(f"method {name}", claims)
-        elif kind is None:
-            state = "broken"
-            problem = f"{who} is of kind {first.spec.kind}, which no plugin announces"
-        elif kind.state != "fine":
-            state, problem = "broken", f"{who} cannot be used: {kind.problem}"
-        entries[name] = MethodEntry(
-            spec=first.spec,
-            distribution=first.distribution,
-            kind=kind.spec if kind else None,
+        if shared is None:
+            problem = f"{who} is of kind {spec.kind}, which no plugin announces"
+        elif unusable := (
+            _unknown_products(own, product_types)
+            if own
+            else (shared.problem if shared.state != "fine" else "")
+        ):
+            problem = f"{who} cannot be used: {unusable}"
+        return MethodEntry(
+            spec=spec,
+            distribution=claim.distribution,
+            kind=own.spec if own else shared.spec if shared else None,
             product_types=product_types,
-            state=state,
+            contested=contested,
+            state="broken" if problem else "fine",
             problem=problem,
         )
+
+    entries: dict[str, MethodEntry] = {}
+    for name, claims in _by_name(announcements, lambda item: item.methods).items():
+        first = entry_of(claims[0])
+        if len(claims) == 1:
+            entries[name] = first
+            continue
+        named = [f"{canonical_name(claim.distribution.name)}/{name}" for claim in claims]
+        if claims[0].distribution.name == OWN:
+            entries[name] = first
+        else:
+            problem = _contested(f"method {name}", claims, f"write {' or '.join(named)}")
+            entries[name] = dataclasses.replace(first, state="clash", problem=problem)
+        entries |= dict(zip(named, map(entry_of, claims), strict=True))
     return entries

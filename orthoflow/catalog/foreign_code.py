@@ -7,37 +7,80 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Final, NoReturn
 
+from orthoflow.errors import PluginError
 from orthoflow.system import working_folder_kept
 
 _SLOW_S: Final = 3.0
+
+
+class UserInterrupt(KeyboardInterrupt):
+    """Ctrl-C of the user, not an exception that a plugin raises."""
 
 
 @contextmanager
 def foreign_code(what: str) -> Iterator[None]:
     """Keep what the code inside does from the rest of the program.
 
-    What it prints goes to standard error, the working directory stays, and where it ends the
-    process at once it raises `SystemExit` instead. After 3 s the user is told who is slow.
+    What it prints goes to standard error, the working directory and the limit of recursion stay,
+    and where it ends the process at once it raises `SystemExit` instead. After 3 s the user is told
+    what is slow.
 
     Args:
         what: as the sentence about it begins, e.g. `method plane.mine of mine 1.0`.
+
+    Raises:
+        UserInterrupt: the user pressed Ctrl-C.
+        PluginError: it lowered the limit of recursion.
     """
     watch = threading.Timer(_SLOW_S, _say_slow, [what])
     watch.daemon = True
     watch.start()
+    limit = sys.getrecursionlimit()
     try:
-        with working_folder_kept(), contextlib.redirect_stdout(sys.stderr), _exits_refused():
+        with (
+            working_folder_kept(),
+            contextlib.redirect_stdout(sys.stderr),
+            _exits_refused(),
+            _interrupts_marked(),
+        ):
             yield
     finally:
+        left = sys.getrecursionlimit()
+        sys.setrecursionlimit(limit)
         watch.cancel()
         # Joined, so that nobody forks a process with threads.
         watch.join()
+        if left < limit:
+            # Also in the place of the RecursionError that it leads to.
+            raise PluginError(f"it lowers Python's recursion limit from {limit} to {left}")
+
+
+@contextmanager
+def _interrupts_marked() -> Iterator[None]:
+    """Raise `UserInterrupt` on Ctrl-C, which plain code can tell from its own."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not (
+        threading.main_thread()
+    ):
+        yield
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
+        raise UserInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

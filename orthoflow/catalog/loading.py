@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
-from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Product
@@ -42,7 +42,7 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
         with foreign_code(f"{what} of {distribution}"):
             module = import_module(module_name)
             return typing.cast("object", getattr(module, name))
-    except KeyboardInterrupt:
+    except UserInterrupt:
         raise
     except BaseException as error:
         said, way_out = describe_error(error), _way_out(error, target, distribution)
@@ -70,6 +70,7 @@ def load_method(
     kind: KindSpec,
     distribution: DistributionInfo,
     product_types: frozenset[str],
+    contested: Mapping[str, str],
 ) -> type[Method]:
     """Import a method's class and check it against its spec and its kind.
 
@@ -86,6 +87,7 @@ def load_method(
             complaint = (
                 _port_complaint(method, kind, product_types)
                 or _mapping_complaint(method)
+                or _contested_complaint(method, contested, distribution)
                 or next(filter(None, map(product_complaint, _products_of(*_hints(method.Out)))), "")
             )
         except (PluginError, NameError, TypeError) as error:
@@ -196,6 +198,19 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
         return (
             f"its outputs must be {_join(kind.outputs)} as in kind {kind.name}, got {_join(given)}"
         )
+    return ""
+
+
+def _contested_complaint(
+    method: type[Method], contested: Mapping[str, str], distribution: DistributionInfo
+) -> str:
+    for cls in _products_of(*_hints(method.In), *_hints(method.Out)):
+        target = contested.get(cls.type_name, "")
+        if target and cls is not import_target(target, f"product {cls.type_name}", distribution):
+            return (
+                f"its {cls.type_name} is {cls.__module__}:{cls.__qualname__}, but that name is "
+                f"taken by {target} of another plugin: disable that one, or rename the product"
+            )
     return ""
 
 

@@ -90,4 +90,14 @@ def _diagnose_plugins() -> list[Diagnosis]:
         )
         for broken in catalog.broken
     ]
+    looked_at = [entry.looked_at() for entry in catalog.methods.values()]
+    problems = dict.fromkeys(
+        entry.problem
+        for entry in (*catalog.products.values(), *catalog.kinds.values(), *looked_at)
+        if entry.problem
+    )
+    findings += [
+        Diagnosis(name="plugins", verdict="limited", found="not usable as it is", cost=problem)
+        for problem in problems
+    ]
     return findings

@@ -114,6 +114,7 @@ program: Final = Program(
 
 def main() -> NoReturn:
     """Run the `orthoflow` command."""
+    take_up_streams()
     # Loading makes much that stays and little garbage: looking for it took a tenth of a `plan`.
     gc.set_threshold(50_000, *gc.get_threshold()[1:])
     try:
@@ -121,6 +122,21 @@ def main() -> NoReturn:
     except SystemExit as end:
         _leave_foreign_threads(end.code)
         raise
+
+
+def take_up_streams() -> None:
+    """Put the null device in the place of closed standard streams.
+
+    A file that is opened later would get the number of a closed one, and what is printed with it.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            # The lowest free number is taken, which is this one.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # noqa: FBT003
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
 
 
 def _leave_foreign_threads(code: object) -> None:

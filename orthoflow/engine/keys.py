@@ -20,7 +20,7 @@ from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
 from orthoflow.catalog.distributions import canonical_name, package_path, source_files
-from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.kernels import kernel_sources
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
@@ -193,7 +193,7 @@ def _tools(cls: type[Method]) -> dict[str, str]:
     try:
         with foreign_code(f"method {cls.id}"):
             return {str(name): str(version) for name, version in cls.tools().items()}
-    except KeyboardInterrupt:
+    except UserInterrupt:
         raise
     except BaseException as error:
         raise PluginError(

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.files.yaml_positions import describe_scalar

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from orthoflow.catalog import loading
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.discovery import OWN, discover_catalog
 from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
@@ -92,7 +92,7 @@ def test_listing_plugins_loads_no_heavy_library() -> None:
     program = textwrap.dedent(
         """
         import sys, json
-        from orthoflow.catalog.discovery import discover_catalog
+        from orthoflow.catalog.discovery import OWN, discover_catalog
         catalog = discover_catalog()
         heavy = {"numpy", "pydantic", "networkx", "h5py", "ruamel.yaml"} & set(sys.modules)
         print(json.dumps([sorted(catalog.methods), sorted(heavy)]))
@@ -211,37 +211,67 @@ def test_a_distribution_that_nobody_can_read_harms_nobody(
 def test_ctrl_c_is_not_taken_for_a_broken_plugin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    source = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(5)"
     with pytest.raises(KeyboardInterrupt):
-        with_plugin("stopping", "raise KeyboardInterrupt", tmp_path, monkeypatch)
+        with_plugin("stopping", source, tmp_path, monkeypatch)
 
 
-def test_a_method_claimed_twice_names_both_distributions_and_spoils_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("source", "named"),
+    [
+        ("raise KeyboardInterrupt", "KeyboardInterrupt"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("import sys\nsys.setrecursionlimit(900)", "lowers Python's recursion limit from"),
+    ],
+)
+def test_a_plugin_that_harms_its_process_is_named_and_harms_nothing(
+    source: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = hooks(methods=method("plane.ransac", "zwei:Plane"))
-    catalog = with_plugin("second", text, tmp_path, monkeypatch)
-    message = (
-        "method plane.ransac is claimed by laboratory 1.0 and second 1.0; "
-        "uninstall all but one of them"
-    )
-    assert catalog.methods["plane.ransac"].state == "clash"
-    with pytest.raises(PluginError, match=message):
-        catalog.method("plane.ransac")
-    with pytest.raises(PluginError, match=message):
-        catalog.methods["plane.ransac"].load()
+    limit = sys.getrecursionlimit()
+    catalog = with_plugin("harmful", source, tmp_path, monkeypatch)
+    (broken,) = catalog.broken
+    assert (broken.entry_point, named in broken.error) == ("harmful", True)
+    assert sys.getrecursionlimit() == limit
     assert catalog.method("plane.hough2d").load().id == "plane.hough2d"
 
 
-def test_a_kind_claimed_with_other_ports_spoils_its_methods_only(
+def test_a_method_claimed_twice_is_named_by_its_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kind = "KindSpec(name='plane', summary='-', inputs={'cloud': 'cloud'}, outputs={})"
-    catalog = with_plugin("other", hooks(kinds=kind), tmp_path, monkeypatch)
-    message = "kind plane is claimed by laboratory 1.0 and other 1.0"
-    assert message in catalog.kinds["plane"].problem
-    with pytest.raises(PluginError, match=f"plane.ransac of laboratory 1.0 .* {message}"):
+    text = hooks(methods=method("plane.ransac", "second_class:Mine"))
+    source = CLASS.replace("plane.mine", "plane.ransac")
+    catalog = with_plugin("second", text, tmp_path, monkeypatch, second_class=source)
+    with pytest.raises(
+        PluginError, match=r"write laboratory/plane\.ransac or second/plane\.ransac"
+    ):
         catalog.method("plane.ransac")
-    assert catalog.method("raster.grid").load().id == "raster.grid"
+    assert catalog.method("second/plane.ransac").load().__module__ == "second_class"
+    assert catalog.method("laboratory/plane.ransac").load().id == "plane.ransac"
+    assert catalog.method("plane.hough2d").load().id == "plane.hough2d"
+    monkeypatch.setenv("ORTHOFLOW_DISABLED_PLUGINS", "other,Second")
+    catalog = laboratory_catalog(monkeypatch, tmp_path / "second")
+    assert catalog.method("plane.ransac").distribution.name == "laboratory"
+
+
+def test_orthoflows_own_names_stay_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = hooks(methods=method("plane.hough2d", "a:B"))
+    write_distribution(tmp_path, "impostor", {"impostor_hooks.py": text})
+    monkeypatch.syspath_prepend(tmp_path)
+    catalog = discover_catalog()
+    assert catalog.method("plane.hough2d").distribution.name == OWN
+    assert catalog.methods["impostor/plane.hough2d"].distribution.name == "impostor"
+
+
+def test_methods_of_a_kind_claimed_twice_have_the_ports_of_their_own_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = "KindSpec(name='plane', summary='-', inputs={}, outputs={'planes': 'planes'})"
+    text = hooks(kinds=kind, methods=method("plane.mine", "two_class:Mine"))
+    source = CLASS.replace("cloud: PointCloud", "pass").replace("        labels: PointLabels\n", "")
+    catalog = with_plugin("two", text, tmp_path, monkeypatch, two_class=source)
+    assert "kind plane is claimed by laboratory 1.0 and two 1.0" in catalog.kinds["plane"].problem
+    for name in ("plane.mine", "plane.ransac"):
+        assert catalog.method(name).load().id == name
 
 
 def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
@@ -255,13 +285,19 @@ def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
     assert catalog.method("mosaic.seams").load().id == "mosaic.seams"
 
 
-def test_a_product_type_claimed_twice_cannot_be_used(
+def test_of_a_product_type_claimed_twice_one_is_used_and_methods_of_the_other_are_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    product = "ProductSpec(type_name='planes', target='a:B', summary='-')"
-    catalog = with_plugin("typed", hooks(products=product), tmp_path, monkeypatch)
-    with pytest.raises(PluginError, match=r"product type planes is claimed by .* and typed 1\.0"):
-        catalog.product_class("planes")
+    product = "ProductSpec(type_name='planes', target='typed_class:Own', summary='-')"
+    text = hooks(products=product, methods=method("plane.mine", "typed_class:Mine"))
+    source = CLASS.replace("class Mine", "class Own(Planes):\n    pass\n\nclass Mine").replace(
+        "planes: Planes", "planes: Own"
+    )
+    catalog = with_plugin("typed", text, tmp_path, monkeypatch, typed_class=source)
+    assert catalog.product_class("planes").__name__ == "Planes"
+    assert catalog.method("plane.hough2d").load()
+    with pytest.raises(PluginError, match="typed_class:Own, but that name is taken by"):
+        catalog.method("plane.mine").load()
 
 
 @pytest.mark.parametrize(
