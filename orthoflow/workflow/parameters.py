@@ -380,7 +380,7 @@ def _resolved(
         )
         reporter.report_all(error.errors())
         return {}
-    except KeyboardInterrupt:
+    except UserInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001 - a third party's validator may raise anything
         message = f"checking the parameters of {info.id} failed: {describe_error(error)}"
