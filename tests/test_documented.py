@@ -361,6 +361,7 @@ def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:
         "Path": Path,
         "Mine": Hough2d,
         "my_inputs": {},
+        "ctx": sdk.StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path),
         "__file__": str(tmp_path / "test_mine.py"),
     }
     for block in blocks(ROOT / "docs" / "plugin-authors.md", "python"):
