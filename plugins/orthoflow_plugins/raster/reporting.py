@@ -42,6 +42,13 @@ FRONT_LEFT_OUT: Final = DiagnosticSpec(
     remedy="{step}.buffer_front_m={buffer_front_m} shows it",
     rank_by="share",
 )
+STOOD_ON: Final = DiagnosticSpec(
+    code="floor-stood-on",
+    severity="note",
+    text="{subject}: {share:.1%} of its cells are empty under what stands or hangs up to {before_m} "
+    "m before it",
+    rank_by="share",
+)
 BEHIND_BUFFER: Final = DiagnosticSpec(
     code="wall-behind-buffer",
     severity="warning",
@@ -212,6 +219,8 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         for cause, share in shares_of.items():
             if share >= least:
                 spec = SPARSE_DENSE if cause == "sparse" and is_dense else _CAUSES[cause]
+                if cause == "before" and wall.frame.raster_axes in {"level", "map"}:
+                    spec = STOOD_ON
                 ctx.report(
                     spec,
                     subject=wall.name,

@@ -226,6 +226,19 @@ def test_what_is_left_out_is_grave_and_names_the_setting(listener: Listener) -> 
     assert "buffer_front_m=2.8" in one.remedy
 
 
+def test_what_stands_on_a_floor_is_not_left_out_of_it(listener: Listener) -> None:
+    floor = wall([[1, 1]], name="floor 1")
+    flat = replace(
+        floor.frame,
+        v_world=np.array([0.0, -1.0, 0.0]),
+        normal_world=UP.copy(),
+        up=(0.0, 0.0, 1.0),
+    )
+    reporting.report_empty(listener.context, [replace(floor, frame=flat)], [emptiness(before=0.12)])
+    (one,) = listener.context.diagnostics
+    assert (one.code, one.severity, one.remedy) == ("floor-stood-on", "note", "")
+
+
 @pytest.mark.parametrize(
     ("counts", "is_dense"), [([[8, 0, 0, 1]], True), ([[7, 0, 0, 0.9]], False)]
 )
