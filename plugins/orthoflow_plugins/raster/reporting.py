@@ -45,8 +45,7 @@ FRONT_LEFT_OUT: Final = DiagnosticSpec(
 STOOD_ON: Final = DiagnosticSpec(
     code="floor-stood-on",
     severity="note",
-    text="{subject}: {share:.1%} of its cells are empty under what stands or hangs up to {before_m} "
-    "m before it",
+    text="{subject}: {share:.1%} of its cells are empty under what stands up to {before_m} m on it",
     rank_by="share",
 )
 BEHIND_BUFFER: Final = DiagnosticSpec(
