@@ -15,6 +15,7 @@ from typing import Any, Final, Literal, Protocol
 
 from orthoflow_provenance.document import RecordedDiagnostic as Diagnostic
 
+from orthoflow.alike import first_few
 from orthoflow.errors import ProductError
 from orthoflow.foreign_text import shown
 
@@ -23,7 +24,6 @@ __all__ = [
     "Diagnostic",
     "DiagnosticGroup",
     "DiagnosticSpec",
-    "first_few",
     "grouped",
     "placed",
     "standing",
@@ -188,17 +188,6 @@ def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
             if one.severity != "note"
         )
     )
-
-
-def first_few(names: Sequence[str], most: int = 3) -> str:
-    """Name the first few, and count the others.
-
-    >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
-    ('a, b, c and 2 more', 'a and 1 more')
-    """
-    n_more = len(names) - most
-    named = ", ".join(names[:most])
-    return f"{named} and {n_more} more" if n_more > 0 else named
 
 
 class Ref(Protocol):
