@@ -160,7 +160,7 @@ def tree() -> mutate.Tree:
         ("orthoflow/engine/store.py", "tests/engine"),
         ("orthoflow/files/points/e57.py", "tests/files/points"),
         ("plugins/orthoflow_plugins/plane/ransac.py", "tests/plugins/plane"),
-        ("provenance/orthoflow_provenance/safe.py", "tests/provenance"),
+        ("provenance/orthoflow_provenance/verify.py", "tests/provenance"),
         ("orthoflow/geometry/planes.py", "tests/geometry"),
         ("orthoflow/errors.py", "tests/cli"),
     ],
@@ -177,7 +177,7 @@ def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.
     folders = ("tests/plugins/plane", "tests/plugins")
     there = [file for folder in folders for file in (mutate.ROOT / folder).glob("test_*.py")]
     assert sorted(near + others) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
-    assert "tests/test_alike.py" in mutate.files_of(tree, "orthoflow/alike.py")[0][:2]
+    assert "tests/test_diagnostics.py" in mutate.files_of(tree, "orthoflow/diagnostics.py")[0][:2]
     folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
     assert folders[0] == "tests/geometry"
     assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)
