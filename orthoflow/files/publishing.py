@@ -51,6 +51,7 @@ from orthoflow.products import (
     Orthoimages,
     OrthoMask,
     Planes,
+    PointCloud,
     ResidualRow,
     TieRole,
     Ties,
@@ -81,6 +82,16 @@ TIE_COLUMNS: Final = (
     # A comment line would break plain CSV readers, so the header says it in a column of its own.
     "opencv_pixel_convention",
 )
+
+
+def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
+    """Write `scans.json`: what each scan of the files has, what was used of it and left out."""
+    scans = product.source.get("scans")
+    if isinstance(scans, list):
+        write_json(
+            folder / "scans.json",
+            {"scans": scans, "n_points": len(product), "product_digest": digest},
+        )
 
 
 def publish_planes(product: Planes, folder: Path, digest: str) -> None:

@@ -30,8 +30,9 @@ class PointCloud(Product):
         x: (n,) float32 metres from the origin; y and z alike. Three contiguous arrays, because
             hot passes read them at memory speed.
         up: (3,) float64 unit vector in world axes.
-        intensity: (n,) float32, 0..1, or None.
+        intensity: (n,) float32, 0..1, NaN for points without intensity; None where none has.
         rgb: (n, 3) uint8 sRGB, or None.
+        has_rgb: (n,) bool, which points have a colour; None where all have (or none, with `rgb`).
         scan: (n,) uint16 index of the scan the point is from, or None.
         row: (n,) uint32 position in the scan's grid, or None; column alike.
         stations: (s, 3) float64 metres, where the scanner (or the viewer) stood, or None.
@@ -59,6 +60,7 @@ class PointCloud(Product):
     up: NDArray[np.float64]
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
+    has_rgb: NDArray[np.bool_] | None = None
     scan: NDArray[np.uint16] | None = None
     row: NDArray[np.uint32] | None = None
     column: NDArray[np.uint32] | None = None
@@ -76,6 +78,7 @@ class PointCloud(Product):
             "z": (self.z, (n_points,), "f4"),
             "intensity": (self.intensity, (n_points,), "f4"),
             "rgb": (self.rgb, (n_points, 3), "u1"),
+            "has_rgb": (self.has_rgb, (n_points,), "b1"),
             "scan": (self.scan, (n_points,), "u2"),
             "row": (self.row, (n_points,), "u4"),
             "column": (self.column, (n_points,), "u4"),

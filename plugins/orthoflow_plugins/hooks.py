@@ -145,7 +145,12 @@ def _ports(named_as_their_products: str, **others: str) -> dict[str, str]:
 def orthoflow_products() -> list[ProductSpec]:
     """Give the built-in product types with what publishes their files."""
     return [
-        _product("cloud", "cloud:PointCloud", "points with intensity and colour"),
+        _product(
+            "cloud",
+            "cloud:PointCloud",
+            "points with intensity and colour",
+            publisher="publishing",
+        ),
         _product("photos", "photographs:Photos", "photographs as they were taken"),
         _product("calibration", "photographs:Calibration", "calibrated cameras"),
         _product("checkpoints", "inspections:CheckPoints", "surveyed check points"),

@@ -79,10 +79,11 @@ def round_scale_m(largest_m: float) -> float:
 def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
     """Brightness (n,) of points: root of the intensity, else mean of the colours, else 1."""
     if cloud.intensity is not None:
-        return np.sqrt(np.maximum(np.asarray(cloud.intensity[part], dtype=np.float64), 0.0))
+        intensity = np.nan_to_num(np.asarray(cloud.intensity[part], dtype=np.float64))
+        return np.sqrt(np.maximum(intensity, 0.0))
     if cloud.rgb is not None:
         grey: NDArray[np.float64] = np.asarray(cloud.rgb[part], dtype=np.float64).mean(axis=1)
-        return grey
+        return grey / 255.0
     return np.ones(len(cloud.x[part]))
 
 

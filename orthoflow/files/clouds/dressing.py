@@ -210,7 +210,7 @@ class DressedCloud:
             normal=normal * self._signs(world, normal, scan, plane)[:, None],
             intensity=None
             if cloud.intensity is None
-            else np.clip(np.asarray(cloud.intensity[part]), 0.0, 1.0)[chosen],
+            else np.clip(np.nan_to_num(cloud.intensity[part]), 0.0, 1.0)[chosen],
             scan=scan,
             plane=plane,
             deviation_m=None if deviation_m is None else deviation_m[chosen],
@@ -239,7 +239,12 @@ class DressedCloud:
         if self.photo_colours is not None:
             return np.asarray(self.photo_colours.rgb[part])
         if self.colouring == "rgb" and cloud.rgb is not None:
-            return np.asarray(cloud.rgb[part])
+            rgb = np.array(cloud.rgb[part])
+            if cloud.has_rgb is not None:
+                # Grey, where a scan took no colours.
+                is_grey = ~np.asarray(cloud.has_rgb[part])
+                rgb[is_grey] = np.rint(255.0 * np.clip(greys(cloud, part)[is_grey], 0, 1))[:, None]
+            return rgb
         if self.colouring == "deviation":
             deviation_m = self._deviations(part)
             if deviation_m is not None:

@@ -24,11 +24,19 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
     PointBlock,
+    PointField,
+    Scan,
     ScanFile,
-    point_fields,
     short_file_error,
 )
+from orthoflow.files.points.fields import columns_of_names
 from orthoflow.files.points.libraries import load_library, reading
+from orthoflow.files.points.units import (
+    StatedUnit,
+    unit_of_comments,
+    unit_of_crs,
+    unit_of_name,
+)
 
 FORMAT: Final = "E57"
 
@@ -36,6 +44,13 @@ _CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _GRID: Final = ("rowIndex", "columnIndex")
+# Not zero where the value is invalid.
+_STATES: Final = (
+    "cartesianInvalidState",
+    "sphericalInvalidState",
+    "isIntensityInvalid",
+    "isColorInvalid",
+)
 # Scans of large buildings, a thousand scans with pictures, have a few million bytes.
 MOST_XML_BYTES: Final = 1 << 25
 MOST_XML_ELEMENTS: Final = 200_000
@@ -57,21 +72,19 @@ class ScanHeader:
         index: position in the file's data3D.
         n_points: stated number of points, invalid ones included.
         names: fields of each point.
+        intensity: name of the field that is the intensity, or None.
         rotation: (3, 3) world from scan.
         translation: (3,) position of the scanner in the file's world.
-        is_posed: the pose is not the identity.
-        intensity_limits: stated smallest and largest value, or None.
-        rgb_limit: stated value of full brightness, or None.
+        scan: what it states of itself.
     """
 
     index: int
     n_points: int
     names: frozenset[str]
+    intensity: str | None
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    is_posed: bool
-    intensity_limits: tuple[float, float] | None
-    rgb_limit: float | None
+    scan: Scan
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -84,60 +97,84 @@ class ScanHeader:
         return "cartesianInvalidState" if self.axes is _CARTESIAN else "sphericalInvalidState"
 
 
-def open_e57(path: Path) -> ScanFile:
+def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     """Open an E57 file; every scan with points is read, in the order of the file."""
     check_xml(path)
     pye57 = load_library("pye57", path)
     with reading(path, FORMAT), pye57.E57(str(path)) as file:
+        unit = _unit(file.image_file.root())
         headers = [
-            _read_header(path, file, index)
+            _read_header(path, file, index, intensity_field, unit)
             for index in range(file.scan_count)
             if file.data3d[index].isDefined("points")
         ]
     headers = [header for header in headers if header.n_points > 0]
-    limits = [header.intensity_limits for header in headers]
-    stated = [item for item in limits if item is not None]
-    rgb_limits = {header.rgb_limit for header in headers if header.names.issuperset(_COLOURS)}
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=sum(header.n_points for header in headers),
-        fields=point_fields(
-            has_intensity=all("intensity" in header.names for header in headers),
-            has_rgb=all(header.names.issuperset(_COLOURS) for header in headers),
-            has_grid=all(header.names.issuperset(_GRID) for header in headers),
-        ),
+        scans=[header.scan for header in headers],
         read=lambda: _blocks(path, pye57, headers),
-        # One scale for all scans of a file, else equal surfaces would differ between them.
-        intensity_limits=(min(low for low, _ in stated), max(high for _, high in stated))
-        if stated and len(stated) == len(limits)
-        else None,
-        rgb_limit=rgb_limits.pop() if len(rgb_limits) == 1 else None,
         details={"scans": len(headers)},
     )
 
 
-def _read_header(path: Path, file: Any, index: int) -> ScanHeader:
+def _unit(root: Any) -> StatedUnit:
+    """Metres, as the standard says, unless the coordinate metadata state another unit."""
+    metres = unit_of_name("m", "the E57 standard")
+    if not root.isDefined("coordinateMetadata"):
+        return metres
+    text = str(root["coordinateMetadata"].value())
+    found = unit_of_crs(text, "coordinate metadata")
+    return found or unit_of_comments([text], "coordinate metadata") or metres
+
+
+def _read_header(
+    path: Path, file: Any, index: int, intensity_field: str | None, unit: StatedUnit
+) -> ScanHeader:
     node = file.data3d[index]
     points = node["points"]
-    prototype = file.get_header(index).point_fields
-    names = frozenset(str(name) for name in prototype)
-    if not (names.issuperset(_CARTESIAN) or names.issuperset(_SPHERICAL)):
+    names = tuple(str(name) for name in file.get_header(index).point_fields)
+    axes = next((axes for axes in (_CARTESIAN, _SPHERICAL) if set(names) >= set(axes)), None)
+    if axes is None:
         raise InputError(
             f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}, expected "
             "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
         )
+    renamed = [dict(zip(axes, _CARTESIAN, strict=True)).get(name, name) for name in names]
+    columns = columns_of_names(renamed, intensity_field=intensity_field)
+    intensity = None
+    if columns is not None and "intensity" in columns.names:
+        intensity = names[columns.names.index("intensity")]
+    fields: list[PointField] = [] if intensity is None else ["intensity"]
+    fields += ["rgb"] if set(names) >= set(_COLOURS) else []
+    fields += ["grid"] if set(names) >= set(_GRID) else []
+    used = {*axes, intensity, *_STATES} | {
+        name for name in (*_COLOURS, *_GRID) if ("rgb" if name in _COLOURS else "grid") in fields
+    }
     rotation, translation = pose_of(node)
     is_posed = not (np.allclose(rotation, np.eye(3), atol=1e-12) and not translation.any())
+    scan = Scan(
+        name=str(node["name"].value()) if node.isDefined("name") else "",
+        fields=frozenset(fields),
+        fields_used=tuple(name for name in names if name in used),
+        fields_not_used=tuple(name for name in names if name not in used),
+        intensity_limits=_limits(node, "intensityLimits", "intensityMinimum", "intensityMaximum")
+        if intensity == "intensity"
+        else None,
+        rgb_limit=_rgb_limit(node),
+        unit=unit,
+        station=translation,
+        station_is_posed=is_posed,
+    )
     return ScanHeader(
         index=index,
         n_points=int(points.childCount()),
-        names=names,
+        names=frozenset(names),
+        intensity=intensity,
         rotation=rotation,
         translation=translation,
-        is_posed=is_posed,
-        intensity_limits=_limits(node, "intensityLimits", "intensityMinimum", "intensityMaximum"),
-        rgb_limit=_rgb_limit(node),
+        scan=scan,
     )
 
 
@@ -205,7 +242,9 @@ def _blocks(path: Path, pye57: Any, headers: list[ScanHeader]) -> Iterator[Point
 def _scan_blocks(
     path: Path, libe57: Any, file: Any, header: ScanHeader, scan: int
 ) -> Iterator[PointBlock]:
-    wanted = {*header.axes, header.invalid_state, "intensity", *_COLOURS, *_GRID} & header.names
+    wanted = {*header.axes, header.invalid_state, *_COLOURS, *_GRID, *_STATES} & header.names
+    if header.intensity is not None:
+        wanted.add(header.intensity)
     capacity = min(BLOCK_POINTS, header.n_points)
     with reading(path, FORMAT):
         arrays, buffers = _buffers(libe57, file, sorted(wanted), capacity)
@@ -227,8 +266,8 @@ def _scan_blocks(
 
 def _buffers(
     libe57: Any, file: Any, names: list[str], capacity: int
-) -> tuple[dict[str, NDArray[np.generic]], Any]:
-    arrays: dict[str, NDArray[np.generic]] = {}
+) -> tuple[dict[str, NDArray[np.float64]], Any]:
+    arrays: dict[str, NDArray[np.float64]] = {}
     buffers = libe57.VectorSourceDestBuffer()
     for name in names:
         # float64 for all: pye57 takes numpy's 64-bit integers for 32-bit ones and leaves rubbish,
@@ -242,28 +281,42 @@ def _buffers(
     return arrays, buffers
 
 
-def _block(arrays: dict[str, NDArray[np.generic]], header: ScanHeader, scan: int) -> PointBlock:
+def _block(arrays: dict[str, NDArray[np.float64]], header: ScanHeader, scan: int) -> PointBlock:
     n_read = len(next(iter(arrays.values())))
+    left_out: dict[str, int] = {}
     state = arrays.get(header.invalid_state)
     if state is not None and state.any():
         arrays = {name: array[state == 0] for name, array in arrays.items()}
-    local = np.column_stack([arrays[name] for name in header.axes]).astype(np.float64)
+        left_out["invalid"] = int(np.count_nonzero(state))
+    # No return: the origin of the scanner, or of the file's world, without a flag.
+    is_void = arrays[header.axes[0]] == 0.0
+    if is_void.any():
+        if header.axes is _CARTESIAN:
+            is_void &= (arrays[header.axes[1]] == 0.0) & (arrays[header.axes[2]] == 0.0)
+        if n_void := int(np.count_nonzero(is_void)):
+            arrays = {name: array[~is_void] for name, array in arrays.items()}
+            left_out["no_return"] = n_void
+    local = np.column_stack([arrays[name] for name in header.axes])
     if header.axes is _SPHERICAL:
         local = _cartesian(local)
-    points = local @ header.rotation.T + header.translation if header.is_posed else local
-    has_rgb = all(name in arrays for name in _COLOURS)
-    has_grid = all(name in arrays for name in _GRID)
+    is_posed = header.scan.station_is_posed
+    has_rgb, has_grid = ("rgb" in header.scan.fields, "grid" in header.scan.fields)
+    intensity = None
+    if header.intensity is not None:
+        intensity = arrays[header.intensity].astype(np.float32)
+        if (invalid := arrays.get("isIntensityInvalid")) is not None:
+            intensity[invalid != 0] = np.nan
+    colour_invalid = arrays.get("isColorInvalid") if has_rgb else None
     return PointBlock(
-        points=points,
+        points=local @ header.rotation.T + header.translation if is_posed else local,
         scan=scan,
         n_read=n_read,
-        n_invalid=n_read - len(points),
-        intensity=arrays["intensity"].astype(np.float32) if "intensity" in arrays else None,
+        left_out=left_out,
+        intensity=intensity,
         rgb=np.column_stack([arrays[name] for name in _COLOURS]) if has_rgb else None,
+        has_rgb=None if colour_invalid is None else colour_invalid == 0,
         row=arrays["rowIndex"].astype(np.int64) if has_grid else None,
         column=arrays["columnIndex"].astype(np.int64) if has_grid else None,
-        station=header.translation,
-        station_is_posed=header.is_posed,
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import re
+from collections.abc import Collection
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import MOST_POINTS_PER_BYTE, ScanFile
-from orthoflow.files.points.columns import Columns
 from orthoflow.files.points.copc import Wish
+from orthoflow.files.points.fields import Columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +32,12 @@ class Format:
 
 E57: Final = Format(name="E57", suffixes=(".e57",), signatures=(b"ASTM-E57",))
 LAS: Final = Format(name="LAS/LAZ", suffixes=(".las", ".laz"), signatures=(b"LASF",))
-PLY: Final = Format(name="PLY", suffixes=(".ply",), signatures=(b"ply\n", b"ply\r"))
-PCD: Final = Format(name="PCD", suffixes=(".pcd",), signatures=(b"# .PCD", b"VERSION", b"FIELDS "))
+PLY: Final = Format(name="PLY", suffixes=(".ply",), signatures=(b"ply\n", b"ply\r", b"ply "))
+PCD: Final = Format(name="PCD", suffixes=(".pcd",), signatures=(b"# .PCD",))
 PTX: Final = Format(name="PTX", suffixes=(".ptx",))
 TEXT: Final = Format(name="text", suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts"))
+_SNIFFED_BYTES: Final = 4096
+_PCD_HEADER: Final = re.compile(rb"(?im)^[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]")
 FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)
 
 
@@ -48,14 +52,17 @@ def find_format(path: Path) -> Format:
         raise InputError(f"{path.name} must be a point file, but there is {found} at that place")
     try:
         with path.open("rb") as file:
-            start = file.read(16)
+            start = file.read(_SNIFFED_BYTES)
     except OSError as error:
         raise InputError(f"{path.name} cannot be opened: {error.strerror}") from error
     if not start:
         raise InputError(f"{path.name} is empty (0 bytes): expected a scan; copy it again")
     for item in FORMATS:
-        if start.startswith(item.signatures) and item.signatures:
+        if start.lower().startswith(tuple(s.lower() for s in item.signatures)) and item.signatures:
             return item
+    # Programs write first lines of their own, or none.
+    if _PCD_HEADER.search(start):
+        return PCD
     suffix = path.suffix.lower()
     named = next((item for item in FORMATS if suffix in item.suffixes), None)
     if named is None:
@@ -64,6 +71,8 @@ def find_format(path: Path) -> Format:
             f"{path.name} is no point file that orthoflow reads: expected one of {known}"
         )
     if named.signatures:
+        if named is PCD and b"\0" not in start[:64]:
+            return named
         expected = named.signatures[0].decode("ascii").strip()
         raise InputError(
             f"{path.name} is named as {named.name} but does not begin with {expected!r}: the file "
@@ -77,8 +86,8 @@ def open_scan(
     columns: Columns | None = None,
     *,
     classes: Collection[int] = (),
-    cores: int = 1,
     wish: Wish | None = None,
+    intensity_field: str | None = None,
 ) -> ScanFile:
     """Open a point file as far as its header.
 
@@ -86,14 +95,25 @@ def open_scan(
         path: the file.
         columns: what the columns of a text file are, if the user says so.
         classes: of a LAS or LAZ file only points of these classes are given; all when empty.
-        cores: processes that may decode points; only large LAZ files use more than one.
         wish: of a COPC file only parts are read that hold such points; others are read whole.
+        intensity_field: name of the field that is the intensity; None for the usual one.
 
     Raises:
-        InputError: the file cannot be read, says what and why in one sentence.
+        InputError: the file cannot be read, with the reason in one sentence.
         PluginError: the library for this format is missing.
     """
-    scan = _opened(path, columns, classes=classes, cores=cores, wish=wish)
+    found = find_format(path)
+    if found is TEXT:
+        from orthoflow.files.points.text import open_text
+
+        scan = open_text(path, columns, intensity_field=intensity_field)
+    elif found is LAS:
+        from orthoflow.files.points.las import open_las
+
+        scan = open_las(path, classes=classes, wish=wish, intensity_field=intensity_field)
+    else:
+        module = import_module(f"orthoflow.files.points.{found.name.lower()}")
+        scan = getattr(module, f"open_{found.name.lower()}")(path, intensity_field=intensity_field)
     n_bytes = path.stat().st_size
     if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
         raise InputError(
@@ -101,37 +121,3 @@ def open_scan(
             "them: the file is damaged or cut off, copy or export it again"
         )
     return scan
-
-
-def _opened(
-    path: Path,
-    columns: Columns | None,
-    *,
-    classes: Collection[int],
-    cores: int,
-    wish: Wish | None,
-) -> ScanFile:
-    found = find_format(path)
-    if found is TEXT:
-        from orthoflow.files.points.text import open_text
-
-        return open_text(path, columns)
-    if found is LAS:
-        from orthoflow.files.points.las import open_las
-
-        return open_las(path, classes=classes, cores=cores, wish=wish)
-    return _openers()[found.name](path)
-
-
-def _openers() -> Mapping[str, Callable[[Path], ScanFile]]:
-    from orthoflow.files.points.e57 import open_e57
-    from orthoflow.files.points.pcd import open_pcd
-    from orthoflow.files.points.ply import open_ply
-    from orthoflow.files.points.ptx import open_ptx
-
-    return {
-        E57.name: open_e57,
-        PLY.name: open_ply,
-        PCD.name: open_pcd,
-        PTX.name: open_ptx,
-    }

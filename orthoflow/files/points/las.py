@@ -4,9 +4,7 @@ Header and chunk table are checked before the libraries believe them: a damaged 
 keeps laspy busy for hours, and a damaged chunk table makes the decompressor ask for any amount of
 memory, which ends the process without a word that Python could catch.
 
-The decompressor keeps Python's lock while it decodes, so that in one process nothing else gets on
-meanwhile. Of a large file other processes decode blocks of whole chunks, in turns, into memory that
-they share with this one, which converts and stores a block while the next ones are decoded.
+lazrs decodes the chunks of a block in threads of its own.
 
 Of point formats 6 and up, whose fields are compressed apart, only the fields are decoded that make
 a cloud. Of a COPC file only those nodes of the octree are decoded that hold points asked for.
@@ -14,7 +12,6 @@ a cloud. Of a COPC file only those nodes of the octree are decoded that hold poi
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import struct
 from collections.abc import Collection, Iterator, Sequence
@@ -29,13 +26,14 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
     PointBlock,
+    Scan,
     ScanFile,
-    point_fields,
     short_file_error,
 )
 from orthoflow.files.points.copc import Node, Wish, read_octree
-from orthoflow.files.points.decoders import Decoder, can_share_memory
+from orthoflow.files.points.fields import columns_of_names, without_returns
 from orthoflow.files.points.libraries import guarded, load_library, reading
+from orthoflow.files.points.units import StatedUnit, unit_of_crs, unit_of_geo_keys
 
 FORMAT: Final = "LAS/LAZ"
 _COLOURS: Final = ("red", "green", "blue")
@@ -53,41 +51,44 @@ _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES: Final = 14
 MOST_FIXED_CHUNK: Final = 50_000_000
-_WORKER: Final = Path(__file__).with_name("las_worker.py")
-# Files with fewer blocks are read before other processes would be up.
-_BLOCKS_LEAST: Final = 8
-# Chunks much larger than a block would be decoded again for each block that begins within.
-_LARGEST_CHUNK: Final = 2 * BLOCK_POINTS
-_PROCESSES_MOST: Final = 16
+_WKT_RECORD: Final = 2112
+_GEO_KEYS: Final = 34735
+_LONGEST_WKT: Final = 100_000
+_MOST_EVLRS: Final = 1000
+_SAMPLE_POINTS: Final = 50_000
 
 
 def open_las(
-    path: Path, *, classes: Collection[int] = (), cores: int = 1, wish: Wish | None = None
+    path: Path,
+    *,
+    classes: Collection[int] = (),
+    wish: Wish | None = None,
+    intensity_field: str | None = None,
 ) -> ScanFile:
     """Open a LAS, LAZ or COPC file.
 
     Args:
         path: the file.
         classes: only points of these classes are given; all when empty.
-        cores: processes that may decode its points.
         wish: of a COPC file only the nodes are read that hold such points.
+        intensity_field: name of the field that is the intensity; None for the usual one.
     """
     laspy = load_library("laspy", path)
     _check_header(path)
-    # Records behind the points are of no use here, and may claim any size.
+    notes: list[str] = []
+    # Records behind the points may claim any size: only that of the coordinate system is read.
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
-        names = set(header.point_format.dimension_names)
-        bounds = np.vstack([header.mins, header.maxs]).astype(np.float64)
-        n_points = int(header.point_count)
-        details: dict[str, str | int | float] = {
-            "version": str(header.version),
-            "point_format": int(header.point_format.id),
-            "scale": float(np.max(header.scales)),
-        }
+        n_points = _n_points(path, header, notes)
         chunks = _checked_chunks(path, header) if n_points > 0 else []
+        unit = _unit(path, header)
     nodes: tuple[Node, ...] | None = None
     octree = read_octree(path, chunks) if wish and chunks else None
+    details: dict[str, str | int | float] = {
+        "version": str(header.version),
+        "point_format": int(header.point_format.id),
+        "scale": float(np.max(header.scales)),
+    }
     if octree is not None and wish:
         nodes = octree.chosen(wish)
         n_points = sum(node.n_points for node in nodes)
@@ -95,15 +96,32 @@ def open_las(
             f"{len(nodes)} of {len(octree.nodes)} nodes, levels 0 to "
             f"{max(node.level for node in nodes)} of 0 to {octree.deepest}"
         )
-    notes: list[str] = []
-    wanted = _Wanted(n_points=n_points, classes=frozenset(classes), cores=cores, nodes=nodes)
+    names = tuple(header.point_format.dimension_names)
+    extra = tuple(header.point_format.extra_dimension_names)
+    columns = columns_of_names(names, intensity_field=intensity_field)
+    intensity = "intensity" if columns is None else names[columns.names.index("intensity")]
+    if intensity == "intensity" and intensity_field is None and n_points:
+        intensity = _in_place_of_zeros(path, laspy, extra)
+    has_rgb = set(names) >= set(_COLOURS)
+    used = ("X", "Y", "Z", intensity, *(_COLOURS if has_rgb else ()))
+    wanted = _Wanted(
+        n_points=n_points, classes=frozenset(classes), intensity=intensity, nodes=nodes
+    )
+    scan = Scan(
+        # Points of every format have an intensity.
+        fields=frozenset({"intensity", "rgb"} if has_rgb else {"intensity"}),
+        fields_used=used,
+        fields_not_used=tuple(
+            name for name in (*extra, "intensity", "nir") if name in names and name not in used
+        ),
+        unit=unit,
+    )
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=n_points,
-        # Points of every format have an intensity.
-        fields=point_fields(has_intensity=True, has_rgb=names.issuperset(_COLOURS)),
-        read=lambda: _blocks(path, laspy, bounds, notes, wanted),
+        scans=[scan],
+        read=lambda: _blocks(path, laspy, notes, wanted),
         details=details,
         notes=notes,
         is_chosen=nodes is not None,
@@ -117,67 +135,137 @@ class _Wanted:
     Attributes:
         n_points: that its header states, or its octree for the nodes.
         classes: of the points; empty for all.
-        cores: processes that may decode at the same time.
+        intensity: name of the field that is the intensity.
         nodes: of the octree, in the order of the file; None for all points of the file.
     """
 
     n_points: int
     classes: frozenset[int]
-    cores: int
+    intensity: str
     nodes: tuple[Node, ...] | None = None
 
 
-def _blocks(
-    path: Path, laspy: Any, bounds: NDArray[np.float64], notes: list[str], wanted: _Wanted
-) -> Iterator[PointBlock]:
+def _n_points(path: Path, header: Any, notes: list[str]) -> int:
+    """Number of points; of an uncompressed file whose header states fewer than it holds, these."""
+    stated = int(header.point_count)
+    if header.are_points_compressed:
+        return stated
+    start, n_bytes = int(header.offset_to_point_data), int(header.point_format.size)
+    ends = [path.stat().st_size]
+    if header.version.minor >= 4 and header.number_of_evlrs:
+        ends.append(int(header.start_of_first_evlr))
+    if header.version.minor >= 3 and header.start_of_waveform_data_packet_record > start:
+        ends.append(int(header.start_of_waveform_data_packet_record))
+    present, rest = divmod(min(ends) - start, n_bytes)
+    if present > stated and rest == 0:
+        notes.append(
+            f"{path.name}: its header states {stated} points, but it holds {present}: all are read"
+        )
+        return int(present)
+    return stated
+
+
+def _unit(path: Path, header: Any) -> StatedUnit | None:
+    """Unit of the coordinate system, from WKT if the file has it, else from its GeoTIFF keys."""
+    texts = [getattr(vlr, "string", "") for vlr in header.vlrs if vlr.record_id == _WKT_RECORD]
+    texts += _wkt_behind_points(path)
+    for text in texts:
+        found = unit_of_crs(str(text), "WKT")
+        if found is not None:
+            return found
+    keys = {}
+    for vlr in header.vlrs:
+        if vlr.user_id.strip("\0") == "LASF_Projection" and vlr.record_id == _GEO_KEYS:
+            raw = vlr.record_data_bytes()
+            words = struct.unpack(f"<{len(raw) // 2}H", raw[: len(raw) // 2 * 2])
+            for place in range(4, len(words) - 3, 4):
+                key, location, _, value = words[place : place + 4]
+                if location == 0:
+                    keys[key] = value
+    return unit_of_geo_keys(keys)
+
+
+def _wkt_behind_points(path: Path) -> list[str]:
+    """Coordinate systems in the records behind the points, of at most so many and so large."""
+    found = []
+    with path.open("rb") as file:
+        header = file.read(_HEADER_BYTES)
+        if header[25] < 4 or len(header) < _HEADER_BYTES:
+            return []
+        start, n_records = struct.unpack_from("<QI", header, 235)
+        for _ in range(min(n_records, _MOST_EVLRS)):
+            file.seek(start)
+            head = file.read(_EVLR_BYTES)
+            if len(head) < _EVLR_BYTES:
+                break
+            _, _, record, n_bytes = struct.unpack_from("<H16sHQ", head)
+            if record == _WKT_RECORD and n_bytes < _LONGEST_WKT:
+                found.append(file.read(n_bytes).decode("utf-8", "replace"))
+            start += _EVLR_BYTES + n_bytes
+            if start > path.stat().st_size:
+                break
+    return found
+
+
+def _in_place_of_zeros(path: Path, laspy: Any, extra: tuple[str, ...]) -> str:
+    """Name of the extra field that is the intensity, where the usual one holds zeros only."""
+    columns = columns_of_names(("x", "y", "z", *extra))
+    if columns is None or "intensity" not in columns.names:
+        return "intensity"
+    with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
+        sample = next(reader.chunk_iterator(_SAMPLE_POINTS))
+    if np.asarray(sample.intensity).any():
+        return "intensity"
+    return extra[columns.names.index("intensity") - 3]
+
+
+def _blocks(path: Path, laspy: Any, notes: list[str], wanted: _Wanted) -> Iterator[PointBlock]:
     n_read = 0
-    n_outside = 0
-    for chunk in guarded(_records(path, laspy, wanted), path, FORMAT):
+    with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
+        header = reader.header
+    check = _BoundsCheck(path, header)
+    for chunk in guarded(_records(path, laspy, header, wanted), path, FORMAT):
         with reading(path, FORMAT):
-            block = _block(chunk, wanted.classes)
+            block = _block(chunk, wanted)
         n_read += block.n_read
-        n_outside += _outside(path, block, bounds)
+        check.add(block)
         yield block
     if n_read != wanted.n_points:
         raise short_file_error(path, "data", f"{n_read} points", f"{wanted.n_points}")
-    if n_outside:
-        notes.append(
-            f"{path.name}: {n_outside} points lie outside the bounds its header states; they are "
-            "kept, but check that the file is whole"
-        )
+    notes.extend(check.notes())
 
 
-def _block(chunk: Any, classes: frozenset[int]) -> PointBlock:
+def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
     axes = _coordinates(chunk)
-    points = axes.T
-    intensity = np.asarray(chunk.intensity, dtype=np.float32)
+    n_read = axes.shape[1]
+    intensity = np.asarray(chunk[wanted.intensity], dtype=np.float32)
     rgb = None
-    if set(chunk.point_format.dimension_names).issuperset(_COLOURS):
+    if set(chunk.point_format.dimension_names) >= set(_COLOURS):
         rgb = np.column_stack([np.asarray(chunk[name]) for name in _COLOURS])
-    block = PointBlock(
-        points=points,
-        scan=0,
-        n_read=len(points),
-        intensity=intensity,
-        rgb=rgb,
-        bounds=_bounds(axes),
-    )
-    flags = chunk.withheld
-    if not (classes or np.bitwise_or.reduce(flags.array) & flags.bit_mask):
-        return block
-    withheld = np.asarray(flags, dtype=np.bool_)
-    kept = ~withheld
-    if classes:
-        kept &= np.isin(np.asarray(chunk.classification), list(classes))
-    axes = axes[:, kept]
+    causes: dict[str, NDArray[np.bool_]] = {}
+    for cause in ("withheld", "synthetic"):
+        flags = getattr(chunk, cause)
+        if np.bitwise_or.reduce(flags.array) & flags.bit_mask:
+            causes[cause] = np.asarray(flags, dtype=np.bool_)
+    if wanted.classes:
+        causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(wanted.classes))
+    is_void = without_returns(axes.T)
+    if is_void.any():
+        causes["no_return"] = is_void
+    left_out: dict[str, int] = {}
+    if causes:
+        kept = np.ones(n_read, dtype=np.bool_)
+        for cause, is_out in causes.items():
+            left_out[cause] = int(np.count_nonzero(kept & is_out))
+            kept &= ~is_out
+        axes, intensity = axes[:, kept], intensity[kept]
+        rgb = None if rgb is None else rgb[kept]
     return PointBlock(
         points=axes.T,
-        scan=0,
-        n_read=len(points),
-        n_withheld=int(withheld.sum()),
-        n_unwanted=int((~kept & ~withheld).sum()),
-        intensity=intensity[kept],
-        rgb=None if rgb is None else rgb[kept],
+        n_read=n_read,
+        left_out={cause: count for cause, count in left_out.items() if count},
+        intensity=intensity,
+        rgb=rgb,
         bounds=_bounds(axes),
     )
 
@@ -203,32 +291,65 @@ def _bounds(axes: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return bounds if np.isfinite(bounds).all() else None
 
 
-def _outside(path: Path, block: PointBlock, bounds: NDArray[np.float64]) -> int:
-    """Count points outside the header's bounds; far outside is what damaged bytes decode to.
+class _BoundsCheck:
+    """Compares points with the bounds that the header states.
 
-    Compressed points carry no checksum, so the bounds are the only witness of a changed byte.
+    Compressed points carry no checksum, so that the bounds are the only witness of a changed byte:
+    some points far outside are damage. Bounds of another place (the points were moved, or others
+    appended) are stale, and only reported.
     """
-    low, high = bounds
-    points = block.points
-    # Bounds that no scan has say nothing; NaN compares as False.
-    if not (np.all(np.abs(bounds) < _FARTHEST) and np.all(high >= low)) or not len(points):
-        return 0
-    extent = float((high - low).max())
-    if extent == 0.0:
-        return 0
-    # Headers are often rounded to the last digit.
-    slack = 1e-3 * max(extent, 1.0)
-    found = block.bounds
-    if found is not None and np.all(found[0] >= low - slack) and np.all(found[1] <= high + slack):
-        return 0
-    beyond = np.maximum(low - points, points - high).max(axis=1)
-    far = float(beyond.max())
-    if far > max(extent, 1.0):
-        raise InputError(
-            f"{path.name} is damaged: points lie {far:.0f} units outside the bounds its header "
-            f"states ({low.tolist()} to {high.tolist()}); copy or export it again"
+
+    def __init__(self, path: Path, header: Any) -> None:
+        self._path = path
+        self._is_compressed = bool(header.are_points_compressed)
+        self._low, self._high = (np.asarray(b, np.float64) for b in (header.mins, header.maxs))
+        self._extent = float((self._high - self._low).max())
+        bounds = np.stack([self._low, self._high])
+        # Bounds that no scan has state nothing; NaN compares as False.
+        self._is_usable = bool(
+            np.all(np.abs(bounds) < _FARTHEST)
+            and np.all(self._high >= self._low)
+            and self._extent > 0.0
         )
-    return int(np.count_nonzero(beyond > slack))
+        self._n_outside = 0
+
+    def add(self, block: PointBlock) -> None:
+        """Compare a block.
+
+        Raises:
+            InputError: a compressed file is damaged.
+        """
+        if not self._is_usable or not len(block.points):
+            return
+        # Headers are often rounded to the last digit.
+        slack = 1e-3 * max(self._extent, 1.0)
+        found = block.bounds
+        if (
+            found is not None
+            and np.all(found[0] >= self._low - slack)
+            and np.all(found[1] <= self._high + slack)
+        ):
+            return
+        beyond = np.maximum(self._low - block.points, block.points - self._high).max(axis=1)
+        is_outside = beyond > slack
+        far = float(beyond.max())
+        if self._is_compressed and far > max(self._extent, 1.0):
+            low, high = np.percentile(block.points, (5, 95), axis=0)
+            is_moved = is_outside.mean() > 0.5 and (high - low).max() < 2.0 * self._extent
+            if not is_moved:
+                raise InputError(
+                    f"{self._path.name} is damaged: points lie {far:.0f} units outside the bounds "
+                    f"its header states ({self._low.tolist()} to {self._high.tolist()}); copy or "
+                    "export it again"
+                )
+        self._n_outside += int(np.count_nonzero(is_outside))
+
+    def notes(self) -> list[str]:
+        """What is to be reported."""
+        if not self._n_outside:
+            return []
+        text = f"{self._path.name}: {self._n_outside} points lie outside the bounds its header "
+        return [text + "states; they are kept, but check that the file is whole"]
 
 
 def _check_header(path: Path) -> None:
@@ -353,54 +474,40 @@ def _damaged(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name} cannot be read as LAS/LAZ: {reason}; copy or export it again")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """What other processes must know of a compressed file.
-
-    Attributes:
-        step: points of a block; whole chunks.
-        start: of the compressed points in the file, bytes.
-        has_classes: whether the classes of the points are decoded, too.
-        record: description of the compression, as the file has it.
-        point_bytes: of a point that is not compressed.
-    """
-
-    step: int
-    start: int
-    has_classes: bool
-    record: bytes
-    point_bytes: int
-
-
-def _records(path: Path, laspy: Any, wanted: _Wanted) -> Iterator[Any]:
-    """Give laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
-
-    A record is to be done with before the next one is asked for.
+def _records(path: Path, laspy: Any, header: Any, wanted: _Wanted) -> Iterator[Any]:
+    """Yield laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
 
     Args:
         path: the file; its header and chunk table have been checked.
         laspy: the library.
+        header: laspy's header of it.
         wanted: what is read of it.
 
     Raises:
-        BaseException: whatever the library throws at a damaged file.
+        BaseException: whatever the library raises for a damaged file.
     """
+    if not header.are_points_compressed:
+        # Mapped, so that also a file can be read whose header states too few points.
+        start, dtype = int(header.offset_to_point_data), header.point_format.dtype()
+        n_present = min(wanted.n_points, (path.stat().st_size - start) // dtype.itemsize)
+        points = np.memmap(path, dtype=dtype, mode="r", offset=start, shape=(n_present,))
+        for first in range(0, n_present, BLOCK_POINTS):
+            part = np.array(points[first : first + BLOCK_POINTS])
+            yield laspy.ScaleAwarePointRecord(
+                part, header.point_format, header.scales, header.offsets
+            )
+        return
     fields = laspy.DecompressionSelection.base().decompress_z().decompress_flags()
     fields = fields.decompress_intensity().decompress_rgb()
     if wanted.classes:
         fields = fields.decompress_classification()
+    if wanted.intensity != "intensity":
+        fields = fields.decompress_all_extra_bytes()
+    if wanted.nodes is not None:
+        yield from _nodes_decoded(path, laspy, header, wanted.nodes, fields.to_lazrs())
+        return
     with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
-        if wanted.nodes is not None:
-            yield from _nodes_decoded(path, laspy, reader.header, wanted.nodes, fields.to_lazrs())
-            return
-        # Where memory cannot be shared without a name, this process decodes all by itself.
-        is_shared_out = wanted.cores > 1 and can_share_memory()
-        layout = _layout(path, reader.header, wanted) if is_shared_out else None
-        if layout is None:
-            yield from reader.chunk_iterator(BLOCK_POINTS)
-        else:
-            n_processes = min(wanted.cores, _PROCESSES_MOST)
-            yield from _decoded_elsewhere(path, laspy, reader.header, layout, n_processes)
+        yield from reader.chunk_iterator(BLOCK_POINTS)
 
 
 def _nodes_decoded(
@@ -428,50 +535,3 @@ def _nodes_decoded(
                 header.scales,
                 header.offsets,
             )
-
-
-def _layout(path: Path, header: Any, wanted: _Wanted) -> _Layout | None:
-    """How to share a file out; None for small files, and where blocks cannot begin at a chunk."""
-    if not header.are_points_compressed or header.point_count < _BLOCKS_LEAST * BLOCK_POINTS:
-        return None
-    record = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
-    compression = load_library("lazrs", path).LazVlr(record)
-    size = int(compression.chunk_size())
-    if compression.uses_variable_size_chunks() or not 0 < size <= _LARGEST_CHUNK:
-        return None
-    return _Layout(
-        step=size * max(1, BLOCK_POINTS // size),
-        start=int(header.offset_to_point_data),
-        has_classes=bool(wanted.classes),
-        record=record,
-        point_bytes=int(header.point_format.size),
-    )
-
-
-def _decoded_elsewhere(
-    path: Path, laspy: Any, header: Any, layout: _Layout, n_processes: int
-) -> Iterator[Any]:
-    slot_bytes = layout.step * layout.point_bytes
-    with contextlib.ExitStack() as stack:
-        decoders = []
-        for first in range(n_processes):
-            told = [str(path), str(layout.start), str(int(layout.has_classes))]
-            told += [layout.record.hex(), str(layout.step), str(layout.point_bytes)]
-            told += [str(first), str(n_processes), str(header.point_count)]
-            decoder = Decoder(_WORKER, told, slot_bytes=slot_bytes)
-            stack.callback(decoder.close)
-            decoders.append(decoder)
-        for block, start in enumerate(range(0, header.point_count, layout.step)):
-            decoder = decoders[block % n_processes]
-            said = decoder.line()
-            if said != "decoded":
-                raise ValueError(said or f"its decoder ended with {decoder.ended_with()}")
-            count = min(layout.step, header.point_count - start)
-            decoded = decoder.slot()[: count * layout.point_bytes]
-            yield laspy.ScaleAwarePointRecord(
-                np.frombuffer(decoded, dtype=header.point_format.dtype()),
-                header.point_format,
-                header.scales,
-                header.offsets,
-            )
-            decoder.allow()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -16,17 +16,22 @@ from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
     MOST_FIELDS,
     PointBlock,
+    Scan,
     ScanFile,
-    point_fields,
     short_file_error,
 )
+from orthoflow.files.points.fields import (
+    Columns,
+    columns_of_names,
+    unpacked,
+    without_returns,
+)
 from orthoflow.files.points.tables import Layout, read_stated
+from orthoflow.files.points.units import StatedUnit, unit_of_comments
 
 FORMAT: Final = "PCD"
 _HEADER_BYTES: Final = 1 << 16
 _KINDS: Final = {"I": "i", "U": "u", "F": "f"}
-_COLOURS: Final = ("rgb", "rgba")
-_READ: Final = ("x", "y", "z", "intensity", *_COLOURS)
 _KEYS: Final = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 
 
@@ -43,6 +48,8 @@ class PcdHeader:
         data: `ascii`, `binary` or `binary_compressed`.
         viewpoint: (3,) where the sensor stood, or None when the header states nothing.
         n_bytes: length of the header.
+        columns: what the fields are.
+        unit: of the coordinates, where a comment states it.
     """
 
     fields: tuple[str, ...]
@@ -54,27 +61,30 @@ class PcdHeader:
     viewpoint: NDArray[np.float64] | None
     n_bytes: int
 
-    @property
-    def colour(self) -> str | None:
-        """Name of the packed colour field."""
-        found = [name for name in _COLOURS if name in self.fields]
-        return found[0] if found else None
+    columns: Columns
+    unit: StatedUnit | None
 
 
-def open_pcd(path: Path) -> ScanFile:
+def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     """Open a PCD file."""
-    header = _read_header(path)
+    header = _read_header(path, intensity_field)
+    fields = header.columns.fields - {"grid"}
+    scan = Scan(
+        fields=fields | {"grid"} if header.height > 1 else fields,
+        fields_used=header.columns.labels_of(used=True),
+        fields_not_used=tuple(
+            name for name in header.columns.labels_of(used=False) if not name.startswith("_")
+        ),
+        rgb_limit=255.0 if "rgb" in header.columns.used else None,
+        unit=header.unit,
+        station=header.viewpoint,
+    )
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=header.n_points,
-        fields=point_fields(
-            has_intensity="intensity" in header.fields,
-            has_rgb=header.colour is not None,
-            has_grid=header.height > 1,
-        ),
+        scans=[scan],
         read=lambda: _blocks(path, header),
-        rgb_limit=255.0 if header.colour is not None else None,
         details={"encoding": header.data},
     )
 
@@ -95,29 +105,33 @@ def _blocks(path: Path, header: PcdHeader) -> Iterator[PointBlock]:
 
 
 def _block(values: Mapping[str, NDArray[np.generic]], header: PcdHeader, start: int) -> PointBlock:
-    points = np.column_stack([values[axis].astype(np.float64) for axis in "xyz"])
-    index = np.arange(start, start + len(points), dtype=np.int64)
+    columns = header.columns
+    named = {name: values[columns.labels[columns.names.index(name)]] for name in columns.used}
+    points = np.column_stack([named[axis].astype(np.float64) for axis in "xyz"])
+    n_read = len(points)
+    index = np.arange(start, start + n_read, dtype=np.int64)
+    rgb: NDArray[np.generic] | None = None
+    if "rgb" in named:
+        rgb = unpacked(named["rgb"])
+    elif "r" in named:
+        rgb = np.column_stack([named[name] for name in "rgb"])
+    intensity = named["intensity"].astype(np.float32) if "intensity" in named else None
+    is_void = without_returns(points)
+    n_void = int(np.count_nonzero(is_void))
+    if n_void:
+        points, index = points[~is_void], index[~is_void]
+        rgb = None if rgb is None else rgb[~is_void]
+        intensity = None if intensity is None else intensity[~is_void]
     is_grid = header.height > 1
     return PointBlock(
         points=points,
-        scan=0,
-        n_read=len(points),
-        intensity=values["intensity"].astype(np.float32) if "intensity" in values else None,
-        rgb=None if header.colour is None else _unpacked(values[header.colour]),
+        n_read=n_read,
+        left_out={"no_return": n_void} if n_void else {},
+        intensity=intensity,
+        rgb=rgb,
         row=index // header.width if is_grid else None,
         column=index % header.width if is_grid else None,
-        station=header.viewpoint,
     )
-
-
-def _unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0x00RRGGBB, which PCD keeps in an integer or in the bits of a float."""
-    if packed.dtype.kind == "f":
-        bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
-    else:
-        bits = packed.astype(np.uint32)
-    channels = [(bits >> shift) & 255 for shift in (16, 8, 0)]
-    return np.column_stack(channels).astype(np.uint8)
 
 
 def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
@@ -125,6 +139,9 @@ def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[
     starts = np.concatenate([[0], np.cumsum(widths)])
     positions = {name: int(starts[index]) for index, name in enumerate(header.fields)}
     wanted = _wanted(header)
+    packed = None
+    if "rgb" in header.columns.used:
+        packed = header.columns.labels[header.columns.names.index("rgb")]
     layout = Layout(separator=r"\s+", decimal=".", n_columns=int(starts[-1]))
     columns = [positions[name] for name in wanted]
     with path.open("rb") as file:
@@ -134,7 +151,7 @@ def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[
         ):
             yield {
                 name: table[:, index].astype(_base(header, name))
-                if name == header.colour
+                if name == packed
                 else table[:, index]
                 for index, name in enumerate(wanted)
             }
@@ -189,8 +206,7 @@ def _field_arrays(plain: NDArray[np.uint8], header: PcdHeader) -> dict[str, NDAr
 
 
 def _wanted(header: PcdHeader) -> list[str]:
-    names = [name for name in _READ if name not in _COLOURS or name == header.colour]
-    return [name for name in names if name in header.fields]
+    return [header.columns.labels[position] for position in header.columns.positions]
 
 
 def _base(header: PcdHeader, name: str) -> np.dtype[np.generic]:
@@ -202,20 +218,24 @@ def _count(header: PcdHeader, name: str) -> int:
     return shape[0] if shape else 1
 
 
-def _read_header(path: Path) -> PcdHeader:
+def _read_header(path: Path, intensity_field: str | None) -> PcdHeader:
     with path.open("rb") as file:
         start = file.read(_HEADER_BYTES)
     entries: dict[str, list[str]] = {}
+    comments: list[str] = []
     n_bytes = 0
     for line in start.splitlines(keepends=True):
         n_bytes += len(line)
-        words = line.decode("ascii", "replace").split()
-        if words:
-            entries[words[0].upper()] = words[1:]
+        words = line.decode("utf-8", "replace").split()
+        if words and words[0].startswith("#"):
+            comments.append(" ".join(words).lstrip("# "))
+        elif words:
+            # PCD 0.5 and before call the fields COLUMNS.
+            entries[words[0].upper().replace("COLUMNS", "FIELDS")] = words[1:]
         if "DATA" in entries:
             break
     try:
-        return _parse_header(entries, n_bytes)
+        return _parse_header(entries, n_bytes, comments, intensity_field)
     except (ValueError, KeyError, IndexError, TypeError) as error:
         missing = [key for key in _KEYS if key not in entries]
         reason = f"without {', '.join(missing)}" if missing else str(error)
@@ -224,7 +244,12 @@ def _read_header(path: Path) -> PcdHeader:
         ) from error
 
 
-def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
+def _parse_header(
+    entries: Mapping[str, list[str]],
+    n_bytes: int,
+    comments: list[str],
+    intensity_field: str | None,
+) -> PcdHeader:
     fields = entries["FIELDS"]
     counts = [int(item) for item in entries.get("COUNT", ["1"] * len(fields))]
     if sum(max(count, 1) for count in counts) > MOST_FIELDS:
@@ -234,16 +259,20 @@ def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
         for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)
     ]
     # Padding fields are all called `_`; numpy wants names to differ.
-    names = [name if name != "_" else f"_{index}" for index, name in enumerate(fields)]
+    names = [
+        name if name not in ("_", *fields[:index]) else f"_{index}"
+        for index, name in enumerate(fields)
+    ]
     members = [
         (name, kind, (count,)) if count != 1 else (name, kind)
         for name, kind, count in zip(names, kinds, counts, strict=True)
     ]
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"its fields are {' '.join(fields)}, expected x, y and z")
-    for name, count in zip(names, counts, strict=True):
-        if count != 1 and name in _READ:
-            raise ValueError(f"field {name} has {count} values in a point, expected one")
+    # Fields of several values, as descriptors are, mean nothing here.
+    single = [name if count == 1 else "" for name, count in zip(names, counts, strict=True)]
+    columns = columns_of_names(single, intensity_field=intensity_field)
+    if columns is None:
+        raise ValueError(f"its fields are {' '.join(fields)[:300]}, expected x, y and z")
+    columns = replace(columns, labels=tuple(names))
     data = entries["DATA"][0].lower()
     if data not in {"ascii", "binary", "binary_compressed"}:
         raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
@@ -264,4 +293,6 @@ def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
         # The default, 0 0 0 and no rotation, says nothing.
         viewpoint=np.array(pose[:3]) if any(pose[:3]) else None,
         n_bytes=n_bytes,
+        columns=columns,
+        unit=unit_of_comments(comments),
     )

@@ -1,13 +1,19 @@
-"""PLY: ASCII and binary of both byte orders, memory-mapped."""
+"""PLY: ASCII and binary of both byte orders, memory-mapped.
+
+plyfile is not used: it holds ASCII files as a whole in memory, and reads elements with lists row by
+row and property by property.
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
@@ -15,12 +21,19 @@ from orthoflow.files.points.blocks import (
     MOST_FIELDS,
     MOST_POINTS,
     PointBlock,
+    Scan,
     ScanFile,
-    point_fields,
     short_file_error,
 )
-from orthoflow.files.points.columns import Columns, columns_of_header, point_block
+from orthoflow.files.points.fields import (
+    Columns,
+    columns_of_names,
+    point_block,
+    unpacked,
+    without_returns,
+)
 from orthoflow.files.points.tables import Layout, read_stated, take_lines
+from orthoflow.files.points.units import unit_of_comments
 
 FORMAT: Final = "PLY"
 _TYPES: Final = {
@@ -33,6 +46,18 @@ _TYPES: Final = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_STRUCT_CODES: Final = {
+    "i1": "b",
+    "u1": "B",
+    "i2": "h",
+    "u2": "H",
+    "i4": "i",
+    "u4": "I",
+    "f4": "f",
+    "f8": "d",
+}
+_VERTEX_NAMES: Final = ("vertex", "vertices", "point", "points")
+_COMMENTS: Final = (["comment"], ["obj_info"])
 _BYTE_ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_BYTES: Final = 1 << 20
 
@@ -67,90 +92,206 @@ class PlyHeader:
     elements: tuple[Element, ...]
     n_bytes: int
 
-    @property
-    def vertex_position(self) -> int | None:
-        """Position of the vertex element; None without one."""
-        names = [element.name for element in self.elements]
-        return names.index("vertex") if "vertex" in names else None
+    comments: tuple[str, ...] = ()
 
 
-def open_ply(path: Path) -> ScanFile:
+def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     """Open a PLY file; only its vertices are read."""
     header = _read_header(path)
-    position = header.vertex_position
+    names = [element.name.lower() for element in header.elements]
+    position = next((names.index(name) for name in _VERTEX_NAMES if name in names), None)
     vertex = None if position is None else header.elements[position]
-    columns = columns_of_header(vertex.properties) if vertex else None
-    if vertex is None or columns is None or vertex.has_list:
+    columns = None
+    if vertex is not None:
+        labels = [
+            "" if isinstance(kind, tuple) else name
+            for name, kind in zip(vertex.properties, vertex.types, strict=True)
+        ]
+        columns = columns_of_names(labels, intensity_field=intensity_field)
+    if vertex is None or position is None or columns is None:
+        found = "; ".join(f"{e.name}: {' '.join(e.properties)}" for e in header.elements)
         raise InputError(
-            f"{path.name} has no element vertex with single x, y and z: expected a point cloud; "
-            "export it as points"
+            f"{path.name} has no element vertex with single x, y and z, but {found[:300]}: "
+            "expected a point cloud; export it as points"
         )
-    colour_types = {
-        vertex.types[columns.names.index(name)] for name in "rgb" if name in columns.names
-    }
-    limits = {"u1": 255.0, "u2": 65535.0}
+    types = {str(vertex.types[columns.names.index(name)]) for name in "rgb" if "r" in columns.used}
+    before = header.elements[:position]
+    columns = replace(columns, labels=vertex.properties)
+    scan = Scan(
+        fields=columns.fields,
+        fields_used=columns.labels_of(used=True),
+        fields_not_used=columns.labels_of(used=False),
+        rgb_limit=255.0 if types == {"u1"} else None,
+        unit=unit_of_comments(header.comments),
+    )
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=vertex.count,
-        fields=point_fields(
-            has_intensity="intensity" in columns.names,
-            has_rgb=bool(columns.index_of(["r", "g", "b"])),
-        ),
+        scans=[scan],
         read=lambda: (
-            _binary_blocks(path, header, vertex, columns)
+            _binary_blocks(path, header, before, vertex, columns)
             if header.byte_order
-            else _text_blocks(path, header, vertex, columns)
+            else _text_blocks(path, header, before, vertex, columns)
         ),
-        rgb_limit=limits.get(str(colour_types.pop())) if len(colour_types) == 1 else None,
         details={"encoding": "binary" if header.byte_order else "ascii"},
     )
 
 
 def _binary_blocks(
-    path: Path, header: PlyHeader, vertex: Element, columns: Columns
+    path: Path, header: PlyHeader, before: tuple[Element, ...], vertex: Element, columns: Columns
 ) -> Iterator[PointBlock]:
+    with path.open("rb") as file:
+        file.seek(header.n_bytes)
+        for element in before:
+            _skip_binary(path, file, element, header.byte_order)
+        offset = file.tell()
+    if vertex.has_list:
+        rows = _rows_with_lists(path, header, vertex, offset)
+    else:
+        rows = _rows(path, header, vertex, offset)
+    for part in rows:
+        # Axis by axis in memory: later passes go along the axes.
+        table = np.empty((len(columns.positions), len(part)))
+        for values, position in zip(table, columns.positions, strict=True):
+            values[:] = part[f"p{position}"]
+        block = point_block(table.T, columns)
+        if "rgb" in columns.used:
+            packed = unpacked(part[f"p{columns.names.index('rgb')}"])
+            block = replace(block, rgb=packed[~without_returns(table.T[:, :3])])
+        yield block
+
+
+def _rows(
+    path: Path, header: PlyHeader, vertex: Element, offset: int
+) -> Iterator[NDArray[np.void]]:
     dtype = np.dtype(
         [(f"p{index}", header.byte_order + str(kind)) for index, kind in enumerate(vertex.types)]
     )
-    with path.open("rb") as file:
-        file.seek(header.n_bytes)
-        for element in header.elements[: header.vertex_position]:
-            _skip_binary(path, file, element, header.byte_order)
-        offset = file.tell()
     n_present = (path.stat().st_size - offset) // dtype.itemsize
     if n_present < vertex.count:
         found = f"{max(n_present, 0)} points"
         raise short_file_error(path, "vertex element", found, str(vertex.count))
     vertices = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(vertex.count,))
     for start in range(0, vertex.count, BLOCK_POINTS):
-        part = vertices[start : start + BLOCK_POINTS]
-        table = np.column_stack(
-            [part[f"p{position}"].astype(np.float64) for position in columns.positions]
-        )
-        yield point_block(table, columns)
+        yield vertices[start : start + BLOCK_POINTS]
+
+
+def _rows_with_lists(
+    path: Path, header: PlyHeader, vertex: Element, offset: int
+) -> Iterator[NDArray[np.void]]:
+    """Rows without their lists, whose lengths differ from row to row.
+
+    Where a row's parts begin is found one by one, what they hold for a block of rows at once.
+    """
+    # Single values between lists are one part; each list is a length and the bytes of an item.
+    parts: list[list[tuple[str, str]]] = [[]]
+    lists: list[tuple[struct.Struct, int]] = []
+    for k, kind in enumerate(vertex.types):
+        if isinstance(kind, tuple):
+            length = struct.Struct((header.byte_order or "<") + _STRUCT_CODES[kind[0]])
+            lists.append((length, np.dtype(kind[1]).itemsize))
+            parts.append([])
+        else:
+            parts[-1].append((f"p{k}", header.byte_order + kind))
+    dtypes = [np.dtype(part) for part in parts]
+    sizes = [dtype.itemsize for dtype in dtypes]
+    whole = np.dtype([member for part in parts for member in part])
+    data = np.memmap(path, dtype=np.uint8, mode="r")
+    n_bytes = len(data)
+    place = offset
+    for start in range(0, vertex.count, BLOCK_POINTS):
+        count = min(BLOCK_POINTS, vertex.count - start)
+        begins = np.empty((count, len(parts)), dtype=np.int64)
+        for row in range(count):
+            place = _find_parts(data, place, sizes, lists, begins[row])
+            if place > n_bytes:
+                found = f"{start + row} points"
+                raise short_file_error(path, "vertex element", found, str(vertex.count))
+        rows = np.empty(count, dtype=whole)
+        for k, dtype in enumerate(dtypes):
+            if dtype.names:
+                raw = data[begins[:, k, np.newaxis] + np.arange(dtype.itemsize)]
+                values = np.ascontiguousarray(raw).view(dtype)[:, 0]
+                for name in dtype.names:
+                    rows[name] = values[name]
+        yield rows
+
+
+def _find_parts(
+    data: NDArray[np.uint8],
+    place: int,
+    sizes: list[int],
+    lists: list[tuple[struct.Struct, int]],
+    begins: NDArray[np.int64],
+) -> int:
+    """Find where the parts of a row begin, and return where it ends; beyond the file if cut off."""
+    begins[0] = place
+    place += sizes[0]
+    for k, (length, item_bytes) in enumerate(lists, start=1):
+        if place + length.size > len(data):
+            return len(data) + 1
+        (n_items,) = length.unpack(data[place : place + length.size].tobytes())
+        if n_items < 0:
+            return len(data) + 1
+        place += length.size + int(n_items) * item_bytes
+        begins[k] = place
+        place += sizes[k]
+    return place
 
 
 def _text_blocks(
-    path: Path, header: PlyHeader, vertex: Element, columns: Columns
+    path: Path, header: PlyHeader, before: tuple[Element, ...], vertex: Element, columns: Columns
 ) -> Iterator[PointBlock]:
-    layout = Layout(separator=r"\s+", decimal=".", n_columns=len(vertex.properties))
-    n_skipped = sum(element.count for element in header.elements[: header.vertex_position])
+    n_skipped = sum(element.count for element in before)
+    what = "vertex element"
     with path.open("rb") as file:
         line = file.read(header.n_bytes).count(b"\n") + n_skipped + 1
         for start in range(0, n_skipped, BLOCK_POINTS):
             count = min(BLOCK_POINTS, n_skipped - start)
             if len(take_lines(file, count, first_line=line - n_skipped + start)) != count:
                 raise short_file_error(path, "elements", "fewer lines", str(n_skipped))
-        for table in read_stated(
-            file,
-            layout,
-            columns.positions,
-            n_points=vertex.count,
-            first_line=line,
-            what="vertex element",
-        ):
+        if vertex.has_list:
+            tables = _tables_with_lists(path, file, vertex, columns, line)
+        else:
+            layout = Layout(separator=r"\s+", decimal=".", n_columns=len(vertex.properties))
+            tables = read_stated(
+                file,
+                layout,
+                columns.positions,
+                n_points=vertex.count,
+                first_line=line,
+                what=what,
+            )
+        for table in tables:
             yield point_block(table, columns)
+
+
+def _tables_with_lists(
+    path: Path, file: BinaryIO, vertex: Element, columns: Columns, first_line: int
+) -> Iterator[NDArray[np.float64]]:
+    """Columns of lines that hold lists, whose lengths differ from line to line."""
+    for start in range(0, vertex.count, BLOCK_POINTS):
+        count = min(BLOCK_POINTS, vertex.count - start)
+        lines = take_lines(file, count, first_line=first_line + start)
+        table = np.full((count, len(columns.positions)), np.nan)
+        for row, line in enumerate(lines):
+            words, places, at = line.split(), [], 0
+            try:
+                for kind in vertex.types:
+                    places.append(at)
+                    at += 1 + (int(words[at]) if isinstance(kind, tuple) else 0)
+                table[row] = [float(words[places[position]]) for position in columns.positions]
+            except (IndexError, ValueError) as error:
+                raise InputError(
+                    f"{path.name}, line {first_line + start + row}: expected "
+                    f"{' '.join(vertex.properties)}, got {line[:60].decode('ascii', 'replace')!r}; "
+                    "correct the line or export the file again"
+                ) from error
+        if len(lines) < count:
+            found = f"{start + len(lines)} points"
+            raise short_file_error(path, "vertex element", found, str(vertex.count))
+        yield table
 
 
 def _skip_binary(path: Path, file: BinaryIO, element: Element, byte_order: str) -> None:
@@ -190,13 +331,19 @@ def _read_header(path: Path) -> PlyHeader:
             f"{path.name} has no PLY header that can be read (no end_header); export it again"
         )
     try:
-        lines = start[:end].decode("ascii", "replace").splitlines()
+        lines = start[:end].decode("utf-8", "replace").splitlines()
         byte_order, elements = _parse_header([line.split() for line in lines[1:] if line.strip()])
+        comments = [line.split(None, 1) for line in lines if line.split()[:1] in _COMMENTS]
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(
             f"{path.name} has no PLY header that can be read ({error}); export it again"
         ) from error
-    return PlyHeader(byte_order=byte_order, elements=elements, n_bytes=end_of_line + 1)
+    return PlyHeader(
+        byte_order=byte_order,
+        elements=elements,
+        n_bytes=end_of_line + 1,
+        comments=tuple(words[1] for words in comments if len(words) > 1),
+    )
 
 
 def _parse_header(lines: list[list[str]]) -> tuple[str, tuple[Element, ...]]:

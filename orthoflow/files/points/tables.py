@@ -20,7 +20,12 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import BLOCK_POINTS, MOST_LINE_BYTES, short_file_error
 
 _NUMBER: Final = re.compile(
-    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
+    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)",
+    re.IGNORECASE,
+)
+# How C libraries print what is not finite: `nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`.
+_NOT_A_NUMBER: Final = re.compile(
+    rb"[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)(?![\w(])", re.IGNORECASE
 )
 _COMMENTS: Final = (b"#", b"//")
 _SCAN_BYTES: Final = 1 << 24
@@ -56,6 +61,24 @@ def split_fields(line: str) -> tuple[list[str], str]:
     return words, r"\s+"
 
 
+def find_data(line: str) -> Layout | None:
+    """Layout of a line with at least three numbers, and more numbers than texts; None for others.
+
+    Numbers may be quoted, as in CSV files.
+    """
+    fields, separator = split_fields(line)
+    numbers = [field for field in map(unquoted, fields) if _NUMBER.fullmatch(field)]
+    if len(numbers) < 3 or 2 * len(numbers) < len(fields):
+        return None
+    has_comma = separator != "," and any("," in number for number in numbers)
+    return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
+
+
+def unquoted(field: str) -> str:
+    """Field of a CSV line without the quotes around it."""
+    return field[1:-1].strip() if len(field) > 1 and field[0] == field[-1] == '"' else field
+
+
 def find_layout(line: str) -> Layout | None:
     """Layout of a line that begins with three numbers, or None when it does not."""
     fields, separator = split_fields(line)
@@ -69,7 +92,7 @@ def numbers_of(line: str, layout: Layout) -> list[float]:
     """Numbers of a line; NaN for a field that is none."""
     return [
         _number(field.replace(layout.decimal, ".")) if _NUMBER.fullmatch(field) else math.nan
-        for field in _fields(line, layout)
+        for field in map(unquoted, _fields(line, layout))
     ]
 
 
@@ -128,7 +151,11 @@ def read_table(
     try:
         return _parse(lines, layout, columns)
     except ValueError as error:
-        kept = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+        kept = [
+            _NOT_A_NUMBER.sub(b"nan", line)
+            for line in lines
+            if not line.lstrip().startswith(_COMMENTS)
+        ]
         try:
             return _parse(kept, layout, columns)
         except ValueError:
@@ -191,7 +218,7 @@ def _parse(lines: list[bytes], layout: Layout, columns: Sequence[int]) -> NDArra
                 low_memory=False,
                 dtype=dict.fromkeys(columns, np.float64),
                 skipinitialspace=True,
-                quoting=3,
+                quoting=0 if b'"' in lines[0] else 3,
             )
         except pd.errors.ParserWarning as warning:
             raise ValueError(str(warning)) from warning
@@ -218,12 +245,14 @@ def _bad_line(
 def _fits(text: str, layout: Layout, columns: Sequence[int]) -> bool:
     fields = _fields(text, layout)
     wanted = [fields[column] for column in columns if column < len(fields)]
-    return len(fields) <= layout.n_columns and _are_numbers([item for item in wanted if item])
+    return len(fields) <= layout.n_columns and _are_numbers(
+        [unquoted(item) for item in wanted if item]
+    )
 
 
 def _number(text: str) -> float:
     """Number of a text; NaN where it has a decimal comma that the first lines do not have."""
-    return math.nan if "," in text else float(text)
+    return math.nan if "," in text or _NOT_A_NUMBER.fullmatch(text.encode()) else float(text)
 
 
 def _fields(line: str, layout: Layout) -> list[str]:

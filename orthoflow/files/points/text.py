@@ -3,77 +3,96 @@
 from __future__ import annotations
 
 import codecs
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
     PointBlock,
+    Scan,
     ScanFile,
-    point_fields,
     short_file_error,
 )
-from orthoflow.files.points.columns import (
+from orthoflow.files.points.fields import (
+    IGNORED,
     Columns,
-    columns_of_count,
-    columns_of_header,
+    columns_of_names,
+    columns_of_values,
+    meaning_of,
     point_block,
 )
 from orthoflow.files.points.tables import (
     Layout,
     count_lines,
-    find_layout,
+    find_data,
     numbers_of,
     read_tables,
     split_fields,
     take_lines,
+    unquoted,
 )
+from orthoflow.files.points.units import StatedUnit, unit_of_comments, unit_of_name
 
 FORMAT: Final = "text"
 HEADER_LINES: Final = 200
+SAMPLE_LINES: Final = 1000
 # Of the number of points; a number that is longer counts nothing.
 _MOST_DIGITS: Final = 20
-SAMPLE_LINES: Final = 1000
+_COMMENT: Final = "#/ \t;!%"
+# `Points:0`, `P_x`: what no sentence holds, but the names of columns may be.
+_NO_WORD: Final = re.compile(r"[A-Za-z]+[:_.\[(]?[0-2xyzXYZ][\])]?|//?X|[PL][xyz]|[A-Za-z]+Time")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TextHead:
-    """What the first lines of a text scan say.
+    """What the first lines of a text scan state.
 
     Attributes:
         n_header_lines: lines before the first point.
         n_stated: number of points that a leading line states, or None.
         layout: how numbers are told apart.
         columns: what they are.
+        unit: of the coordinates, where comments or names of columns state it.
     """
 
     n_header_lines: int
     n_stated: int | None
     layout: Layout
     columns: Columns
+    unit: StatedUnit | None
 
 
-def open_text(path: Path, columns: Columns | None = None) -> ScanFile:
+def open_text(
+    path: Path, columns: Columns | None = None, *, intensity_field: str | None = None
+) -> ScanFile:
     """Open a text scan (.xyz, .txt, .csv, .asc, .pts).
 
     Args:
         path: the file.
         columns: what the columns are, if the user says so.
+        intensity_field: name of the column that is the intensity; None for the usual one.
+
+    Raises:
+        InputError: it is not known what the columns are.
     """
-    head = _read_head(path, columns)
-    has = head.columns.index_of
+    head = _read_head(path, columns, intensity_field)
+    scan = Scan(
+        fields=head.columns.fields,
+        fields_used=head.columns.labels_of(used=True),
+        fields_not_used=head.columns.labels_of(used=False),
+        unit=head.unit,
+    )
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
         n_most=count_lines(path) - head.n_header_lines,
-        fields=point_fields(
-            has_intensity=bool(has(["intensity"])),
-            has_rgb=bool(has(["r", "g", "b"])),
-            has_grid=bool(has(["row", "column"])),
-        ),
+        scans=[scan],
         read=lambda: _blocks(path, head),
         details={"columns": " ".join(head.columns.names), "columns_from": head.columns.rule},
     )
@@ -97,29 +116,91 @@ def _blocks(path: Path, head: TextHead) -> Iterator[PointBlock]:
         raise short_file_error(path, "list", f"{n_read} points", str(head.n_stated))
 
 
-def _read_head(path: Path, columns: Columns | None) -> TextHead:
+def _read_head(path: Path, columns: Columns | None, intensity_field: str | None) -> TextHead:
     lines = _first_lines(path)
-    header: Columns | None = None
     n_stated: int | None = None
+    comments: list[str] = []
+    headers: list[str] = []
     for index, line in enumerate(lines[:HEADER_LINES]):
-        layout = find_layout(line)
-        if layout is not None:
-            chosen = columns or _fitting(header, layout)
-            if chosen is None:
-                sample = [numbers_of(item, layout) for item in lines[index:] if item]
-                whole = [item for item in sample if len(item) == layout.n_columns]
-                is_pts = path.suffix.lower() == ".pts"
-                chosen = columns_of_count(path.name, whole, is_pts=is_pts)
-            _check_count(path, chosen, layout)
-            return TextHead(n_header_lines=index, n_stated=n_stated, layout=layout, columns=chosen)
-        bare = line.lstrip("#/ \t")
-        header = columns_of_header(split_fields(bare)[0]) or header
-        if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
-            n_stated = int(line)
+        layout = None if line.startswith(("#", "//")) else find_data(line)
+        if layout is None:
+            if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
+                n_stated = int(line)
+            elif line:
+                comments.append(line.lstrip(_COMMENT))
+                headers.append(line)
+            continue
+        chosen = _chosen_columns(path, columns, headers, lines[index:], layout, intensity_field)
+        unit = unit_of_comments(comments)
+        if unit is None and chosen.unit is not None:
+            unit = unit_of_name(chosen.unit, "names of the columns")
+        return TextHead(
+            n_header_lines=index, n_stated=n_stated, layout=layout, columns=chosen, unit=unit
+        )
     raise InputError(
-        f"{path.name} has no line that begins with three numbers among its first "
-        f"{min(len(lines), HEADER_LINES)}: expected a point per line, x y z first"
+        f"{path.name} has no line with three numbers among its first "
+        f"{min(len(lines), HEADER_LINES)}: expected a point per line, e.g. x y z"
     )
+
+
+def _chosen_columns(
+    path: Path,
+    columns: Columns | None,
+    headers: list[str],
+    lines: list[str],
+    layout: Layout,
+    intensity_field: str | None,
+) -> Columns:
+    """Columns as the user names them, else a header, else their values (in `lines`)."""
+    if columns is None:
+        found = _columns_of_header(path, headers, lines[0], layout, intensity_field)
+        if found is not None:
+            return found
+        sample = [numbers_of(item, layout) for item in lines if item]
+        whole = [item for item in sample if len(item) == layout.n_columns]
+        is_pts = path.suffix.lower() == ".pts"
+        return columns_of_values(path.name, np.array(whole), lines[0], is_pts=is_pts)
+    if len(columns.names) > layout.n_columns:
+        raise InputError(
+            f"{path.name} has {layout.n_columns} columns, but cloud.columns names "
+            f"{len(columns.names)}: {' '.join(columns.names)}; its first line is {lines[0][:80]!r}"
+        )
+    labels = _labels(headers[-1]) if headers else []
+    return replace(columns, labels=tuple(labels)) if len(labels) == len(columns.names) else columns
+
+
+def _columns_of_header(
+    path: Path, headers: list[str], line: str, layout: Layout, intensity_field: str | None
+) -> Columns | None:
+    """Columns as the last header line names them; None where there is no such line.
+
+    Raises:
+        InputError: there is one, and it names no x, y and z for the columns there are.
+    """
+    for header in reversed(headers):
+        labels = _labels(header)
+        found = columns_of_names(labels, intensity_field=intensity_field)
+        fits = len(labels) == layout.n_columns
+        if found is not None and fits:
+            return found
+        is_comment = header != header.lstrip(_COMMENT)
+        known = [label for label in labels if meaning_of(label) != IGNORED]
+        names_something = bool(known) or any(_NO_WORD.fullmatch(label) for label in labels)
+        if found is not None or (fits and (not is_comment or names_something)):
+            raise InputError(
+                f"{path.name} has the header {header[:120]!r}, which does not name x, y and z for "
+                f"the {layout.n_columns} columns below it (first line {line[:80]!r}): name them "
+                "with cloud.columns, e.g. --set 'cloud.columns="
+                f"[{', '.join(('x', 'y', 'z', 'intensity', *'_' * 96)[: layout.n_columns])}]', "
+                "with _ for one to skip"
+            )
+        if not is_comment and not fits:
+            continue
+    return None
+
+
+def _labels(header: str) -> list[str]:
+    return [unquoted(field) for field in split_fields(header.lstrip(_COMMENT))[0]]
 
 
 def _first_lines(path: Path) -> list[str]:
@@ -135,16 +216,3 @@ def _first_lines(path: Path) -> list[str]:
     if raw:
         raw[0] = raw[0].removeprefix(codecs.BOM_UTF8)
     return [line.decode("utf-8", "replace").strip() for line in raw]
-
-
-def _fitting(header: Columns | None, layout: Layout) -> Columns | None:
-    """The header's columns if there are as many as in the data."""
-    return header if header is not None and len(header.names) == layout.n_columns else None
-
-
-def _check_count(path: Path, columns: Columns, layout: Layout) -> None:
-    if len(columns.names) > layout.n_columns:
-        raise InputError(
-            f"{path.name} has {layout.n_columns} columns, but columns names "
-            f"{len(columns.names)}: {' '.join(columns.names)}"
-        )

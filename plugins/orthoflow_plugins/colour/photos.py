@@ -111,7 +111,7 @@ class ColourPhotos(Method):
                 "no photo sees any point of the cloud: cloud and cameras must have one coordinate "
                 "system (colour.photos)"
             )
-        coloured = replace(cloud, rgb=colours.rgb)
+        coloured = replace(cloud, rgb=colours.rgb, has_rgb=None)
         return self.Out(cloud=_only(coloured, seen) if params.unseen == "drop" else coloured)
 
 

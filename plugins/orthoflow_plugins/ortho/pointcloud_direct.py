@@ -185,7 +185,7 @@ def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepConte
     """The points with their colours, or their intensity as grey."""
     if cloud.rgb is not None:
         rgb = np.asarray(cloud.rgb)
-        return Painters(cloud=cloud, values=rgb, is_left_out=_dark_points(rgb, params, ctx))
+        return Painters(cloud=cloud, values=rgb, is_left_out=_left_out(cloud, rgb, params, ctx))
     if cloud.intensity is None:
         raise MethodError(
             "the cloud has neither colours nor intensity, so no orthoimage can be painted from it: "
@@ -194,30 +194,43 @@ def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepConte
     ctx.warn("the cloud has no colours: its intensity is painted as grey")
     n_points = len(cloud)
     grey = np.asarray(ctx.allocate("layers", "grey", (n_points, 1), np.uint8), np.uint8)
+    is_left_out: NDArray[np.bool_] | None = None
     for first in range(0, n_points, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
-        grey[part, 0] = np.rint(255.0 * np.clip(cloud.intensity[part], 0, 1))
-    return Painters(cloud=cloud, values=grey)
+        grey[part, 0] = np.rint(255.0 * np.clip(np.nan_to_num(cloud.intensity[part]), 0, 1))
+        if (is_unknown := np.isnan(cloud.intensity[part])).any():
+            if is_left_out is None:
+                is_left_out = _mask(ctx, n_points)
+            is_left_out[part] = is_unknown
+    return Painters(cloud=cloud, values=grey, is_left_out=is_left_out)
 
 
-def _dark_points(
-    rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
+def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
+    return np.asarray(ctx.allocate("layers", "left_out", (n_points,), np.bool_), np.bool_)
+
+
+def _left_out(
+    cloud: PointCloud, rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Which points (n,) are too dark to have a colour; None where none is. Black ones are told."""
-    n_points, least = len(rgb), params.skip_below_grey
-    is_dark = None
-    if least > 0:
-        is_dark = np.asarray(ctx.allocate("layers", "dark", (n_points,), np.bool_), np.bool_)
+    """Find the points (n,) without a colour, or too dark to have one; None where there are none.
+
+    They paint no cell, and keep their depth. Black points that are painted are reported.
+    """
+    n_points, least, has_rgb = len(rgb), params.skip_below_grey, cloud.has_rgb
+    is_dark = _mask(ctx, n_points) if least > 0 or has_rgb is not None else None
     counts = np.zeros(256, dtype=np.int64)
     for first in range(0, n_points, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         brightest = rgb[part].max(axis=1)
-        counts += np.bincount(brightest, minlength=256)
+        valid = slice(None) if has_rgb is None else np.asarray(has_rgb[part])
+        counts += np.bincount(brightest[valid], minlength=256)
         if is_dark is not None:
             is_dark[part] = brightest < least
+            if has_rgb is not None:
+                is_dark[part] |= ~np.asarray(has_rgb[part])
     n_black, n_dark = counts[0], counts[:least].sum()
     n_almost = counts[1:_ALMOST_BLACK_GREY].sum()
-    if is_dark is not None:
+    if least > 0:
         ctx.log(
             f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
             f"skip_below_grey = {least}; they paint no cell"

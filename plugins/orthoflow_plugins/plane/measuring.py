@@ -307,7 +307,9 @@ def row_points(
     along_m = points @ wall_axes(normal, planes.up)[0]
     order = np.argsort(along_m, kind="stable")
     distance_m = points @ normal - (planes.offset[0] - float(normal @ cloud.origin))
-    intensity = None if cloud.intensity is None else cloud.intensity[chosen].astype(np.float64)
+    intensity = None
+    if cloud.intensity is not None:
+        intensity = np.nan_to_num(cloud.intensity[chosen].astype(np.float64))
     return RowPoints(
         row=row,
         scan=scan,
@@ -389,11 +391,14 @@ def _by_class(
         )
     if cloud.intensity is not None:
         intensity = cloud.intensity[in_cloud].astype(np.float64)
-        whole = replace(
-            whole,
-            intensity=_spreads(intensity, _even_edges(intensity), deviation_m),
-            material=_by_material(intensity, seen.materials, deviation_m),
-        )
+        known = np.isfinite(intensity)
+        intensity, of_known_m = intensity[known], deviation_m[known]
+        if len(intensity):
+            whole = replace(
+                whole,
+                intensity=_spreads(intensity, _even_edges(intensity), of_known_m),
+                material=_by_material(intensity, seen.materials, of_known_m),
+            )
     return whole
 
 

@@ -103,6 +103,8 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
     size = frame.gsd_m * np.array([frame.width, frame.height])
     inside = (u >= 0) & (u < size[0]) & (v >= 0) & (v < size[1])
     inside &= (depth >= -slab.behind_m) & (depth <= slab.front_m)
+    if cloud.intensity is not None:
+        inside &= np.isfinite(cloud.intensity[points])
     scan = cloud.scan[points[inside]].astype(np.int64)
     rays = (cloud.stations - frame.origin_world)[scan] - world[inside]
     range_m = np.maximum(np.linalg.norm(rays, axis=1), 1e-3)

@@ -209,7 +209,10 @@ class _Surface:
         if cloud.intensity is not None:
             values.append(np.asarray(cloud.intensity)[taken, np.newaxis])
         if cloud.rgb is not None:
-            values.append(np.asarray(cloud.rgb)[taken])
+            rgb = np.asarray(cloud.rgb)[taken].astype(np.float64)
+            if cloud.has_rgb is not None:
+                rgb[~np.asarray(cloud.has_rgb)[taken]] = np.nan
+            values.append(rgb)
         return _Triangles(
             window=window,
             shape=self.slab.frame.shape,

@@ -204,9 +204,10 @@ def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
 
 
 @compiled
-def add_values(
+def add_values(  # noqa: PLR0913, PLR0917
     entries: Entries,
     values: NDArray[np.generic],
+    has_value: NDArray[np.bool_],
     depths_m: NDArray[np.float32],
     layer_m: float,
     sums: NDArray[np.generic],
@@ -217,7 +218,8 @@ def add_values(
 
     Args:
         entries: one chunk.
-        values: (points of the cloud, channels).
+        values: (points of the cloud, channels); points whose first channel is NaN do not count.
+        has_value: (points of the cloud,) which of them count, or without points: all.
         depths_m: (cells,) the surface.
         layer_m: a point farther than this from the surface belongs to another layer.
         sums: (cells, channels + 1); the last channel counts the points.
@@ -233,8 +235,13 @@ def add_values(
                 continue
             if abs(entries.depths_m[k] - depths_m[cell]) > layer_m:
                 continue
+            point = entries.points[k]
+            if has_value.size and not has_value[point]:
+                continue
+            if values[point, 0] != values[point, 0]:
+                continue
             for channel in range(channels):
-                sums[cell, channel] += values[entries.points[k], channel]
+                sums[cell, channel] += values[point, channel]
             sums[cell, channels] += 1
 
 

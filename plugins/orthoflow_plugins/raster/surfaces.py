@@ -45,6 +45,7 @@ class CellSurface:
         count: uint32.
         intensity: float32, NaN where void, or None.
         rgb: (cells, 3) uint8, 0 where void, or None.
+        has_rgb: (cells,) which have a colour; None where all with points have.
         percentiles_m: (cells, k) float32, NaN in cells without points, or None.
         places: (cells, 2) float32, where the points of a cell lie to the right of and below its
             centre, in cells; (0, 0) where many do, NaN where none does.
@@ -57,6 +58,7 @@ class CellSurface:
     rgb: NDArray[np.uint8] | None
     places: NDArray[np.float32]
     percentiles_m: NDArray[np.float32] | None = None
+    has_rgb: NDArray[np.bool_] | None = None
 
 
 def surface_of(
@@ -99,6 +101,12 @@ def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> C
         reach_cells=0.0,
         threads=rule.threads,
     )
+    if intensity is not None and surface.intensity is not None:
+        # Beside cells without intensity a cell keeps its own.
+        is_lost = few[~np.isfinite(intensity[few])]
+        intensity[is_lost] = surface.intensity[is_lost]
+    if surface.has_rgb is not None:
+        rgb = surface.rgb
     return replace(surface, intensity=intensity, rgb=rgb)
 
 
@@ -124,6 +132,9 @@ def _surface_of_winners(
         count=winners["n_points"].copy(),
         intensity=None if intensity is None else taken(intensity[:, np.newaxis], np.nan)[:, 0],
         rgb=None if rgb is None else taken(rgb, 0),
+        has_rgb=None
+        if cloud.has_rgb is None
+        else taken(cloud.has_rgb.view(np.uint8)[:, np.newaxis], 0)[:, 0] > 0,
         places=places_of_winners(cloud, slab, winners, threads=rule.threads),
     )
     if rule.surface != "tin":
@@ -207,7 +218,7 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         n_summed=np.zeros(slab.n_cells, dtype=np.uint8),
         places=np.zeros((slab.n_cells, 2), dtype=np.float32),
     )
-    intensity, rgb = _averaged_values(cloud, slab, few, threads=rule.threads)
+    intensity, rgb, has_rgb = _averaged_values(cloud, slab, few, threads=rule.threads)
     in_parts(partial(kernels.find_mean_places, few), slab.n_cells, threads=rule.threads)
     return CellSurface(
         depth_m=depth_m,
@@ -215,6 +226,7 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         count=count,
         intensity=intensity,
         rgb=rgb,
+        has_rgb=has_rgb,
         places=few.places,
     )
 
@@ -326,7 +338,7 @@ def _averaged_values(
     few: kernels.FewPoints,
     *,
     threads: int,
-) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None]:
+) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
     channels = _channels(cloud)
     # Whole numbers for colours: half the memory, and exact.
     sums = [
@@ -334,7 +346,7 @@ def _averaged_values(
             (slab.n_cells, values.shape[1] + 1),
             dtype=np.uint32 if values.dtype == np.uint8 else np.float64,
         )
-        for values in channels
+        for values, _ in channels
     ]
     offsets, matrix = (
         read_only(cloud.x, cloud.y, cloud.z),
@@ -342,18 +354,28 @@ def _averaged_values(
     )
     for entries in entries_inside(cloud, slab, threads=threads):
         passes = [
-            partial(kernels.add_values, entries, values, few.depths_m, few.layer_m, sum_of_values)
-            for values, sum_of_values in zip(channels, sums, strict=True)
+            partial(
+                kernels.add_values,
+                entries,
+                values,
+                has_value,
+                few.depths_m,
+                few.layer_m,
+                sum_of_values,
+            )
+            for (values, has_value), sum_of_values in zip(channels, sums, strict=True)
         ]
         passes.append(partial(kernels.add_places, entries, offsets, matrix, few))
         share_cells(threads, *passes)
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
+    has_rgb: NDArray[np.bool_] | None = None
     for sum_of_values in sums:
         if sum_of_values.shape[1] == 2:
             intensity = np.empty(slab.n_cells, dtype=np.float32)
         else:
             rgb = np.empty((slab.n_cells, 3), dtype=np.uint8)
+            has_rgb = None if cloud.has_rgb is None else sum_of_values[:, -1] > 0
         # Means take several times the memory of what is kept of them.
         for first in range(0, slab.n_cells, CELLS_AT_ONCE):
             part = slice(first, first + CELLS_AT_ONCE)
@@ -363,13 +385,16 @@ def _averaged_values(
                 intensity[part] = means[:, 0]
             elif rgb is not None:
                 rgb[part] = np.rint(np.nan_to_num(means))
-    return intensity, rgb
+    return intensity, rgb, has_rgb
 
 
-def _channels(cloud: PointCloud) -> list[NDArray[np.generic]]:
-    channels: list[NDArray[np.generic]] = []
+def _channels(cloud: PointCloud) -> list[tuple[NDArray[np.generic], NDArray[np.bool_]]]:
+    """Values of the points, and which have some; without points where all have, or NaN tells."""
+    channels: list[tuple[NDArray[np.generic], NDArray[np.bool_]]] = []
+    of_all = np.empty(0, dtype=np.bool_)
     if cloud.intensity is not None:
-        channels.append(np.asarray(cloud.intensity)[:, np.newaxis])
+        channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all))
     if cloud.rgb is not None:
-        channels.append(np.asarray(cloud.rgb))
+        has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
+        channels.append((np.asarray(cloud.rgb), has_rgb))
     return channels

@@ -97,7 +97,7 @@ def rastered_wall(
         mask=raster.mask.reshape(shape),
         intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
         rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
-        rgb_mask=None if surface.rgb is None else _where_known(raster.mask, shape, allocate),
+        rgb_mask=None if surface.rgb is None else _where_known(raster, shape, allocate),
         percentiles_m=None
         if surface.percentiles_m is None
         else surface.percentiles_m.reshape(*shape, -1),
@@ -126,7 +126,7 @@ def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule, net: Net | None =
     mask = close_gaps(cloud, slab, surface, rule.gaps)
     surface = carried_to_centres(surface, slab, rule.surface)
     if surface.intensity is None:
-        surface = replace(surface, intensity=_grey(surface.rgb, mask))
+        surface = replace(surface, intensity=_grey(surface, mask))
     return _Raster(surface=surface, mask=mask)
 
 
@@ -152,7 +152,7 @@ def _rastered_in_bands(
                 whole[name] = allocate(name, shape, values.dtype)
             whole[name][cells] = values[inner]
     mask = whole.pop("mask")
-    absent = dict.fromkeys(("intensity", "rgb", "percentiles_m", "places"))
+    absent = dict.fromkeys(("intensity", "rgb", "has_rgb", "percentiles_m", "places"))
     # The arrays have the types of the bands' own.
     surface = CellSurface(**cast("dict[str, Any]", absent | whole))
     return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))
@@ -193,20 +193,25 @@ def _fields_of(surface: CellSurface) -> dict[str, NDArray[np.generic]]:
     }
 
 
-def _where_known(
-    mask: NDArray[np.uint8], shape: tuple[int, int], allocate: Allocate
-) -> NDArray[np.uint8]:
-    """1 where a `SurfaceMask` (cells,) is not void, else 0; of a large wall in a file."""
+def _where_known(raster: _Raster, shape: tuple[int, int], allocate: Allocate) -> NDArray[np.uint8]:
+    """1 where a cell has a colour, else 0; of a large wall in a file."""
+    mask = raster.mask.reshape(shape)
     if mask.size <= _BAND_CELLS:
-        return (mask > 0).astype(np.uint8).reshape(shape)
-    known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
-    np.minimum(mask.reshape(shape), 1, out=known)
+        known = (mask > 0).astype(np.uint8)
+    else:
+        known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
+        np.minimum(mask, 1, out=known)
+    if raster.surface.has_rgb is not None:
+        known &= raster.surface.has_rgb.reshape(shape).view(np.uint8)
     return known
 
 
-def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+def _grey(surface: CellSurface, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    rgb = surface.rgb
     if rgb is None:
         return None
     grey = rgb.astype(np.float32) @ REC_601.astype(np.float32) / np.float32(255.0)
     grey[mask == SurfaceMask.VOID] = np.nan
+    if surface.has_rgb is not None:
+        grey[~surface.has_rgb] = np.nan
     return grey.astype(np.float32)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import mmap
 import shutil
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -13,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, StoreError
-from orthoflow.files.points import PointBlock, ScanFile
+from orthoflow.files.points import PointBlock, Scan, ScanFile
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.read.scales import ColourScale
-from orthoflow_plugins.read.stations import ScanSummary
 
 # Coordinates rounded more coarsely than this limit what an orthoimage can show.
 COARSE_M: Final = 0.005
@@ -38,47 +38,56 @@ _ROUNDING_STEPS: Final = sorted(
 
 
 @dataclass(kw_only=True)
-class FileCount:
-    """What became of the points of one file.
+class ScanCount:
+    """What became of the points of one scan.
 
     Attributes:
-        name: of the file.
+        file: name of its file.
+        index: place in the file.
         format_name: of the file.
+        scan: what the file states of it.
+        unit_m: metres per unit along x, y and z.
+        start: of its points in the cloud; `stop` is behind the last one.
         n_read: points that the file holds.
-        n_kept: those of them that are in the cloud.
-        n_invalid: those marked as invalid.
-        n_withheld: those marked as deleted.
-        n_unwanted: those of a class that nobody asked for.
-        n_outside: those outside the box that was asked for.
-        n_not_finite: those whose coordinates are not finite, or beyond any survey frame.
+        left_out: those that are not in the cloud, by cause.
+        n_without_rgb: points in the cloud that have no valid colour.
         rounding_m: step to which coordinates are rounded, 0 where it is fine.
-        rgb_scale: what the file's colours range to, or None without colours.
-        n_far: those of `n_not_finite` that are finite.
-        first_far_m: the first of them.
-        header: what else the file says of itself, for people.
+        colours: how they were scaled, or None without colours.
+        first_far_m: the first of the points that lie too far away.
     """
 
-    name: str
+    file: str
+    index: int
     format_name: str
+    scan: Scan
+    unit_m: NDArray[np.float64]
+    start: int = 0
+    stop: int = 0
     n_read: int = 0
-    n_kept: int = 0
-    n_invalid: int = 0
-    n_withheld: int = 0
-    n_unwanted: int = 0
-    n_outside: int = 0
-    n_not_finite: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    n_without_rgb: int = 0
     rounding_m: float = 0.0
-    rgb_scale: str | None = None
-    n_far: int = 0
+    colours: ColourScale | None = None
     first_far_m: tuple[float, ...] = ()
-    header: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    @property
+    def n_kept(self) -> int:
+        """Points in the cloud."""
+        return self.stop - self.start
+
+    @property
+    def title(self) -> str:
+        """How messages call it."""
+        name = f" ({self.scan.name})" if self.scan.name else ""
+        return f"{self.file}, scan {self.index}{name}"
 
     def note_far(self, lost: NDArray[np.float64]) -> None:
-        """Count points (n, 3), metres, that were left out though their coordinates are finite."""
+        """Count points (n, 3), metres, that are left out though their coordinates are finite."""
         far = lost[np.isfinite(lost).all(axis=1)]
-        if len(far) and not self.n_far:
+        if len(far) and not self.left_out["too_far"]:
             self.first_far_m = tuple(far[0].tolist())
-        self.n_far += len(far)
+        self.left_out["too_far"] += len(far)
+        self.left_out["not_finite"] += len(lost) - len(far)
 
 
 class CloudAssembly:
@@ -87,9 +96,7 @@ class CloudAssembly:
     Attributes:
         origin: (3,) whole metres near the data; set by the first points.
         n_points: points so far.
-        files: counts per file.
-        intensity_range: smallest and largest finite intensity.
-        n_intensity_lost: intensities that are not finite.
+        counts: of each scan, in the order of the files.
     """
 
     origin: NDArray[np.float64]
@@ -98,7 +105,7 @@ class CloudAssembly:
         self,
         ctx: StepContext,
         files: list[ScanFile],
-        unit_m: float,
+        unit_m: Callable[[Scan], NDArray[np.float64]],
         box_m: NDArray[np.float64] | None = None,
     ) -> None:
         """Allocate for the most points that may come; what is not filled is cut off later.
@@ -106,7 +113,7 @@ class CloudAssembly:
         Args:
             ctx: of the step.
             files: what will be read.
-            unit_m: metres per unit of the files.
+            unit_m: gives metres per unit of a scan, along x, y and z.
             box_m: (2, 3) lowest and highest coordinates of the points to keep; None for all.
         """
         self._ctx = ctx
@@ -115,18 +122,16 @@ class CloudAssembly:
         self._unit_m = unit_m
         self._capacity = sum(file.n_most for file in files)
         _require_space(ctx, self._capacity)
-        self.fields = frozenset.intersection(*(file.fields for file in files))
+        self.fields = frozenset().union(*(file.fields for file in files))
         self._axes = [self._new(name, np.float32) for name in "xyz"]
         self._intensity = self._new("intensity", np.float32) if "intensity" in self.fields else None
         self._rgb = self._new("rgb", np.uint8, 3) if "rgb" in self.fields else None
-        grid = "grid" in self.fields
+        grid = all("grid" in scan.fields for file in files for scan in file.scans)
         self._grid = [self._new(name, np.uint32) for name in ("row", "column")] if grid else []
         self._scan: NDArray[Any] | None = None
-        self._scans: list[ScanSummary] = []
+        self._has_rgb: NDArray[Any] | None = None
         self.n_points = 0
-        self.files: list[FileCount] = []
-        self.intensity_range = (np.inf, -np.inf)
-        self.n_intensity_lost = 0
+        self.counts: list[ScanCount] = []
 
     def add_file(self, file: ScanFile) -> None:
         """Read all blocks of a file.
@@ -134,31 +139,31 @@ class CloudAssembly:
         Raises:
             InputError: the file is damaged, or none of its points can be used.
         """
-        count = FileCount(name=file.name, format_name=file.format_name, header=file.details)
-        self.files.append(count)
-        first_scan = len(self._scans)
-        colours = (
-            None if self._rgb is None else ColourScale(self._rgb[self.n_points :], file.rgb_limit)
-        )
-        for block in file.read():
-            if count.n_read == 0:
-                count.rounding_m = rounding_m(block.points, self._unit_m)
-            self._add(block, first_scan + block.scan, count, colours)
-            done = sum(item.n_read for item in self.files) / self._capacity
-            self._ctx.progress(min(done, 1.0), f"{file.name}: {count.n_read} points")
-        if colours is not None:
-            count.rgb_scale = colours.scale
-        if count.n_far:
-            place = " ".join(f"{value:g}" for value in count.first_far_m)
-            self._ctx.warn(
-                f"{count.name}: {count.n_far} points lie farther than {FARTHEST_M:g} m from the "
-                f"origin, the first at {place}, and were left out: check the file and unit"
+        counts = [
+            ScanCount(
+                file=file.name,
+                index=index,
+                format_name=file.format_name,
+                scan=scan,
+                unit_m=self._unit_m(scan),
             )
-        if count.n_kept + count.n_unwanted + count.n_outside == 0:
+            for index, scan in enumerate(file.scans)
+        ]
+        first_scan = len(self.counts)
+        self.counts += counts
+        n_done = sum(count.n_read for count in self.counts)
+        for block in file.read():
+            self._add(block, first_scan + block.scan)
+            n_done += block.n_read
+            share = min(n_done / self._capacity, 1.0)
+            self._ctx.progress(share, f"{file.name}: {n_done} points")
+        left_out = sum((count.left_out for count in counts), Counter())
+        is_choice = left_out["outside_box"] or left_out["other_class"]
+        if not is_choice and not any(count.n_kept for count in counts):
+            causes = ", ".join(f"{n} {cause}" for cause, n in left_out.items() if n)
             raise InputError(
-                f"{file.name} holds no usable points: of {count.n_read}, {count.n_invalid} are "
-                f"marked as invalid, {count.n_withheld} as deleted and {count.n_not_finite} are "
-                "not finite; export it again"
+                f"{file.name} holds no usable points: of {sum(c.n_read for c in counts)}, left out "
+                f"are {causes}; export it again"
             )
 
     def require_points(self) -> None:
@@ -170,8 +175,8 @@ class CloudAssembly:
         if self.n_points:
             return
         n_unwanted, n_outside = (
-            sum(getattr(count, name) for count in self.files)
-            for name in ("n_unwanted", "n_outside")
+            sum(count.left_out[cause] for count in self.counts)
+            for cause in ("other_class", "outside_box")
         )
         text = f"no point is left: {n_unwanted} are of other classes than those asked for"
         if n_outside:
@@ -190,64 +195,60 @@ class CloudAssembly:
             "intensity": self._intensity,
             "rgb": self._rgb,
             "scan": self._scan,
+            "has_rgb": self._has_rgb,
             **dict(zip(("row", "column"), self._grid, strict=False)),
         }
         array = found.get(name)
         return None if array is None else array[: self.n_points]
 
-    @property
-    def scans(self) -> list[ScanSummary]:
-        """The scans so far, in the order of the files."""
-        return self._scans
+    def with_all_colours(self) -> NDArray[Any]:
+        """Allocate the mask of valid colours, all True, and return it cut to the points."""
+        self._has_rgb = self._new("has_rgb", np.bool_)
+        self._has_rgb[:] = True
+        return self._has_rgb[: self.n_points]
 
-    def _add(
-        self, block: PointBlock, scan: int, count: FileCount, colours: ColourScale | None
-    ) -> None:
+    def _add(self, block: PointBlock, scan: int) -> None:
+        count = self.counts[scan]
+        if count.n_read == 0:
+            count.rounding_m = rounding_m(block.points, float(count.unit_m.max()))
+            count.start = count.stop = self.n_points
         count.n_read += block.n_read
-        count.n_invalid += block.n_invalid
-        count.n_withheld += block.n_withheld
-        count.n_unwanted += block.n_unwanted
+        count.left_out.update(block.left_out)
         points, bounds = block.points, block.bounds
-        if self._unit_m != 1.0:
-            points = points * self._unit_m
-            bounds = None if bounds is None else bounds * self._unit_m
+        if np.any(count.unit_m != 1.0):
+            points = points * count.unit_m
+            bounds = None if bounds is None else bounds * count.unit_m
         if bounds is None:
             bounds = _bounds(points)
         kept = self._kept(points, bounds, count)
         usable = points[kept]
-        if not isinstance(kept, slice):
-            bounds = _bounds(usable)
         n_kept = len(usable)
-        self._summarise(block, scan, bounds)
         if n_kept == 0:
             return
         if self.n_points + n_kept > self._capacity:
-            raise InputError(f"{count.name} holds more points than its header states")
+            raise InputError(f"{count.file} holds more points than its header states")
         part = slice(self.n_points, self.n_points + n_kept)
         for array in (*self._axes, *self._grid, self._intensity, self._rgb):
             if array is not None:
                 _make_ready(array, part)
         self._store_points(usable, part)
-        self._store_fields(block, kept, part)
-        if colours is not None and block.rgb is not None:
-            colours.add(block.rgb[kept])
+        self._store_fields(block, kept, part, count)
         if scan > 0:
             self._store_scan(scan, part)
-        self.n_points = part.stop
+        self.n_points = count.stop = part.stop
 
     def _kept(
-        self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: FileCount
+        self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
         """Which points (n, 3) are usable and lie in the box, counted."""
         usable = _usable(points, bounds)
+        n_usable = len(points)
         if not isinstance(usable, slice):
-            count.note_far(points[~usable])
-        n_usable = len(points[usable])
-        count.n_not_finite += len(points) - n_usable
+            lost = points[~usable]
+            n_usable -= len(lost)
+            count.note_far(lost)
         kept = self._in_box(points, usable)
-        n_kept = len(points[kept])
-        count.n_outside += n_usable - n_kept
-        count.n_kept += n_kept
+        count.left_out["outside_box"] += n_usable - len(points[kept])
         return kept
 
     def _in_box(
@@ -273,25 +274,41 @@ class CloudAssembly:
             np.subtract(points[:, axis], self.origin[axis], out=array[part], casting="same_kind")
 
     def _store_fields(
-        self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice
+        self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice, count: ScanCount
     ) -> None:
-        if self._intensity is not None and block.intensity is not None:
-            self._store_intensity(self._intensity[part], block.intensity[kept])
+        if self._intensity is not None:
+            values = np.float32(np.nan) if block.intensity is None else block.intensity[kept]
+            self._intensity[part] = values
+        if self._rgb is not None:
+            self._store_colours(self._rgb, block, kept, part, count)
         if self._grid and block.row is not None and block.column is not None:
             for array, values_of in zip(self._grid, (block.row, block.column), strict=True):
                 array[part] = np.clip(values_of[kept], 0, 2**32 - 1)
 
-    def _store_intensity(self, place: NDArray[Any], values: NDArray[np.float32]) -> None:
-        place[:] = values
-        lowest, highest = float(values.min()), float(values.max())
-        if not np.isfinite(lowest + highest):
-            finite = values[np.isfinite(values)]
-            self.n_intensity_lost += len(values) - len(finite)
-            if not len(finite):
-                return
-            lowest, highest = float(finite.min()), float(finite.max())
-        low, high = self.intensity_range
-        self.intensity_range = (min(low, lowest), max(high, highest))
+    def _store_colours(
+        self,
+        stored: NDArray[Any],
+        block: PointBlock,
+        kept: NDArray[np.bool_] | slice,
+        part: slice,
+        count: ScanCount,
+    ) -> None:
+        n_points = part.stop - part.start
+        valid = np.zeros(n_points, dtype=np.bool_)
+        if block.rgb is not None:
+            rgb = block.rgb[kept]
+            valid[:] = True if block.has_rgb is None else block.has_rgb[kept]
+            if rgb.dtype.kind == "f":
+                valid &= np.isfinite(rgb).all(axis=1)
+            if count.colours is None:
+                count.colours = ColourScale(stored[part.start :], count.scan.rgb_limit)
+            count.colours.add(rgb, None if valid.all() else valid)
+        count.n_without_rgb += n_points - int(np.count_nonzero(valid))
+        if self._has_rgb is None and not valid.all():
+            self._has_rgb = self._new("has_rgb", np.bool_)
+            self._has_rgb[: part.start] = True
+        if self._has_rgb is not None:
+            self._has_rgb[part] = valid
 
     def _store_scan(self, scan: int, part: slice) -> None:
         if scan >= _MOST_SCANS:
@@ -302,19 +319,6 @@ class CloudAssembly:
             # Zeros are right for everything that came before.
             self._scan = self._new("scan", np.uint16)
         self._scan[part] = scan
-
-    def _summarise(self, block: PointBlock, scan: int, bounds: NDArray[np.float64]) -> None:
-        low, high = bounds
-        if scan < len(self._scans):
-            before = self._scans[scan]
-            low, high = np.minimum(low, before.low), np.maximum(high, before.high)
-        summary = ScanSummary(
-            station=None if block.station is None else block.station * self._unit_m,
-            is_posed=block.station_is_posed,
-            low=low,
-            high=high,
-        )
-        self._scans[scan:] = [summary]
 
     def _new(self, name: str, dtype: type[np.generic], width: int = 1) -> NDArray[Any]:
         shape = (self._capacity,) if width == 1 else (self._capacity, width)

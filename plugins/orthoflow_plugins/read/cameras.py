@@ -15,10 +15,11 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reason
 from orthoflow.files.panoramas import face_in
+from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.scan import UNITS_M, Unit
+from orthoflow_plugins.read.scan import Unit
 
 _NAMED = 3
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"

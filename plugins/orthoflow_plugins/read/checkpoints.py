@@ -8,10 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import InputError
+from orthoflow.files.points.units import UNITS_M
 from orthoflow.files.survey_points import SurveyPoint, read_survey_points
 from orthoflow.products import CheckPoints, InputFiles
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.scan import UNITS_M, Unit
+from orthoflow_plugins.read.scan import Unit
 
 
 class ReadCheckpoints(Method):

@@ -68,6 +68,9 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
         return None
     scan, index = _largest_scan(cloud)
+    index = index[np.isfinite(cloud.intensity[index])]
+    if not len(index):
+        return None
     row, column = (array[index].astype(np.int64) for array in (cloud.row, cloud.column))
     row, column = row - row.min(), column - column.min()
     size = np.array([row.max() + 1, column.max() + 1])
@@ -114,7 +117,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     scale = _POLAR_SIDE_PX / max(float((high - low).max()), 1e-6)
     size = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
     pixels = np.floor((places - low) * scale).astype(np.int64)
-    shade = 1.0 if cloud.intensity is None else cloud.intensity[index][on_wall]
+    shade = 1.0 if cloud.intensity is None else np.nan_to_num(cloud.intensity[index][on_wall])
     picture = np.zeros((size[1], size[0], 3), dtype=np.uint8)
     is_inside = np.all((pixels >= 0) & (pixels < size), axis=1)
     grey = np.rint(40.0 + 120.0 * np.broadcast_to(shade, len(pixels))).astype(np.uint8)

@@ -1,7 +1,7 @@
 """Intensities and colours of unknown scale: intensity to 0..1, colours to 8 bits.
 
-One linear scale serves the intensities of a whole cloud, and whether they are the laser's at all
-is asked. Colours, 0..1, 0..255 or 16 bits, are scaled in the pass that reads them.
+Each scan is scaled by itself: by the limits that it states where its data keep to them, else by
+what its data are. Few extreme values, as of a reflector, never set a scale.
 """
 
 from __future__ import annotations
@@ -25,84 +25,145 @@ _SAMPLE: Final = 200_000
 # lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
 # 532..1550 nm stays far below.
 LUMINANCE_CORRELATION: Final = 0.999
+# Values are extreme that lie farther beyond these percentiles than these are apart.
+_PERCENTILES: Final = (2.0, 98.0)
+# Stated limits of which the data take a smaller part are the sensor's: the picture would be black.
+_SMALLEST_PART: Final = 0.1
+# Scans whose ranges overlap by more of both share one scale, so that equal surfaces stay equal.
+_COMMON_PART: Final = 0.4
+# A smaller share of colours beyond a scale does not change it.
+_STRAY_SHARE: Final = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntensityScale:
-    """The linear scale from a file's intensities to 0..1.
+    """The linear scale from a scan's intensities to 0..1.
 
     Attributes:
         low: what becomes 0.
         high: what becomes 1.
-        rule: where the two come from.
+        rule: where the two come from: `intensity_max`, `stated`, `data`.
+        stated: limits that the scan states and that are not used, since its data do not fit them.
     """
 
     low: float
     high: float
-    rule: str
+    rule: Literal["intensity_max", "stated", "data"]
+    stated: tuple[float, float] | None = None
 
 
-def choose_scale(
-    seen: tuple[float, float],
+def robust_range(values: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Smallest and largest finite value that is not extreme; None where none is finite."""
+    sample = values[:: max(1, len(values) // _SAMPLE)]
+    sample = sample[np.isfinite(sample)]
+    if not len(sample):
+        return None
+    low, high = (float(value) for value in np.percentile(sample, _PERCENTILES))
+    if high > low:
+        sample = sample[(sample >= 2.0 * low - high) & (sample <= 2.0 * high - low)]
+    return float(sample.min()), float(sample.max())
+
+
+def choose_scales(
+    ranges: Sequence[tuple[float, float] | None],
     stated: Sequence[tuple[float, float] | None],
     intensity_max: float | None,
-) -> IntensityScale:
-    """Choose one scale for all scans, so that equal surfaces stay equal.
+) -> list[IntensityScale | None]:
+    """Choose the scale of each scan.
 
     Args:
-        seen: smallest and largest value of the data.
-        stated: limits that each file states.
+        ranges: `robust_range` of each scan's data; None without intensity.
+        stated: limits that each states.
         intensity_max: what the user says is full intensity, or None.
 
     Returns:
-        The user's; else the limits that all files state, when the data keep to them; else the
-        range of the data.
+        The user's; else the stated limits, where the data keep to them and take more than a small
+        part; else the range of the data, common to those scans whose ranges are similar.
     """
-    if intensity_max is not None:
-        return IntensityScale(low=0.0, high=intensity_max, rule="0 to intensity_max")
-    low, high = seen
-    known = [item for item in stated if item is not None]
-    if known and len(known) == len(stated):
-        bottom, top = min(item[0] for item in known), max(item[1] for item in known)
-        slack = 1e-6 * (top - bottom)
-        if bottom - slack <= low and high <= top + slack:
-            return IntensityScale(low=bottom, high=top, rule="limits that the files state")
-    if high > low:
-        return IntensityScale(low=low, high=high, rule="range of the data")
-    return IntensityScale(low=min(0.0, low), high=max(high, 0.0), rule="0 to the only value")
+    scales: list[IntensityScale | None] = [None] * len(ranges)
+    groups: list[tuple[list[int], tuple[float, float]]] = []
+    for k, (seen, limits) in enumerate(zip(ranges, stated, strict=True)):
+        if seen is None:
+            continue
+        if intensity_max is not None:
+            scales[k] = IntensityScale(low=0.0, high=intensity_max, rule="intensity_max")
+        elif limits is not None and _fits(seen, limits):
+            scales[k] = IntensityScale(low=limits[0], high=limits[1], rule="stated")
+        else:
+            _join(groups, k, seen)
+    for members, (lowest, highest) in groups:
+        has_range = highest > lowest
+        for k in members:
+            scales[k] = IntensityScale(
+                low=lowest if has_range else min(0.0, lowest),
+                high=highest if has_range else max(highest, 0.0),
+                rule="data",
+                stated=stated[k],
+            )
+    return scales
 
 
-def normalise(
-    intensity: NDArray[np.float32], scale: IntensityScale, *, may_exceed: bool = True
-) -> int:
-    """Scale in place to 0..1, what is not finite to 0.
+def _fits(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
+    low, high = limits
+    slack = 1e-6 * (high - low)
+    is_within = low - slack <= seen[0] and seen[1] <= high + slack
+    return is_within and seen[1] - low >= _SMALLEST_PART * (high - low)
+
+
+def _join(
+    groups: list[tuple[list[int], tuple[float, float]]], k: int, seen: tuple[float, float]
+) -> None:
+    """Add a scan to the first group whose range is similar, or begin another."""
+    for place, (members, (low, high)) in enumerate(groups):
+        common = min(high, seen[1]) - max(low, seen[0])
+        together = max(high, seen[1]) - min(low, seen[0])
+        if together <= 0.0 or common >= _COMMON_PART * together:
+            groups[place] = ([*members, k], (min(low, seen[0]), max(high, seen[1])))
+            return
+    groups.append(([k], seen))
+
+
+def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
+    """Scale in place to 0..1; what is not finite becomes NaN.
 
     Args:
         intensity: (n,) as read.
         scale: what becomes 0 and 1.
-        may_exceed: whether there may be values beyond the scale, or that are not finite.
 
     Returns:
         How many values lay beyond the scale and were clipped.
     """
     n_clipped = 0
+    width = scale.high - scale.low
     for start in range(0, len(intensity), _BLOCK):
         part = intensity[start : start + _BLOCK]
         scaled = part.astype(np.float64)
         scaled -= scale.low
-        scaled /= scale.high - scale.low
-        if may_exceed:
-            n_clipped += int(np.count_nonzero((scaled < -1e-6) | (scaled > 1.0 + 1e-6)))
-            scaled = np.clip(np.nan_to_num(scaled, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
-        part[:] = scaled
+        if width != 0.0:
+            scaled /= width
+        lowest, highest = scaled.min(), scaled.max()
+        # NaN compares as False.
+        if not (lowest >= -1e-6 and highest <= 1.0 + 1e-6):
+            is_finite = np.isfinite(scaled)
+            n_clipped += int(
+                np.count_nonzero(is_finite & ((scaled < -1e-6) | (scaled > 1.0 + 1e-6)))
+            )
+            scaled[~is_finite] = np.nan
+        part[:] = np.clip(scaled, 0.0, 1.0)
     return n_clipped
 
 
-def correlation_with_grey(intensity: NDArray[np.float32], rgb: NDArray[np.uint8]) -> float:
+def correlation_with_grey(
+    intensity: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    has_rgb: NDArray[np.bool_] | None = None,
+) -> float:
     """Correlation of intensity with the grey of the colours, on a sample; 0 where undefined."""
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
     colours = rgb[::step].astype(np.float64)
+    has_both = np.isfinite(values) if has_rgb is None else np.isfinite(values) & has_rgb[::step]
+    values, colours = values[has_both], colours[has_both]
     greys = (colours @ REC_601, colours.mean(axis=1))
     return max(_correlation(values, grey) for grey in greys)
 
@@ -114,46 +175,62 @@ def is_grey(rgb: NDArray[np.uint8]) -> bool:
 
 
 class ColourScale:
-    """Finds the scale of one file's colours while they come.
+    """Finds the scale of one scan's colours while they come.
 
     LAS keeps 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY keep 0..1 or
     0..255. A block that goes beyond the scale believed so far corrects what was stored before.
+    A stated limit is used where the data reach more than a 255th of it and none goes beyond.
 
     Attributes:
-        scale: what the values seen so far say.
+        scale: what the values seen so far are.
+        misfit: the stated limit, where the data do not fit it.
+        largest: of the values seen, but for a few.
     """
 
     def __init__(self, stored: NDArray[np.uint8], limit: float | None) -> None:
-        """Start a file.
+        """Start a scan.
 
         Args:
-            stored: (n, 3) where the file's colours go, from its first point on.
+            stored: (n, 3) where the scan's colours go, from its first point on.
             limit: the value of full brightness, if the file states it.
         """
         self._stored = stored
         self._limit = limit
         self._count = 0
-        self.scale: RgbScale | None = None if limit is None else "stated limit"
+        self.scale: RgbScale | None = None
+        self.misfit: float | None = None
+        self.largest = 0.0
 
-    def add(self, rgb: NDArray[np.generic]) -> None:
-        """Store the next colours (n, 3)."""
+    def add(self, rgb: NDArray[np.generic], has_rgb: NDArray[np.bool_] | None = None) -> None:
+        """Store the next colours (n, 3), of which those of `has_rgb` (n,) are valid."""
         values = rgb.astype(np.float32)
-        if self._limit is None:
-            self._widen(_scale_of(rgb))
+        valid = values if has_rgb is None else values[has_rgb]
+        if valid.size:
+            self._widen(_largest(valid), is_whole=rgb.dtype.kind in "iu")
         target = self._stored[self._count : self._count + len(values)]
         target[:] = _to_bytes(values, self.scale, self._limit)
         self._count += len(values)
 
-    def _widen(self, seen: RgbScale) -> None:
-        if self.scale is not None and _WIDTHS[seen] <= _WIDTHS[self.scale]:
-            return
-        before = self._stored[: self._count]
-        if self.scale == "0..1" and seen == "8 bit":
-            # What looked like full brightness was 0 or 1 of 255.
-            before[:] = np.rint(before / np.float32(255.0)).astype(np.uint8)
-        elif seen == "16 bit":
-            before[:] = 0
-        self.scale = seen
+    def _widen(self, largest: float, *, is_whole: bool) -> None:
+        self.largest = max(self.largest, largest)
+        limit = self._limit
+        seen: RgbScale = "16 bit" if largest > 255.0 else "8 bit"
+        if largest <= 1.0 and (limit == 1.0 or (limit is None and not is_whole)):
+            seen = "0..1"
+        if limit is not None and 255.0 < largest <= limit < 65535.0:
+            seen = "stated limit"
+        if self.scale is None or _WIDTHS[seen] > _WIDTHS[self.scale]:
+            before = self._stored[: self._count]
+            if self.scale == "0..1":
+                # What looked like full brightness was 0 or 1 of 255.
+                before[:] = np.rint(before / np.float32(255.0)).astype(np.uint8)
+            if seen in ("16 bit", "stated limit"):
+                before[:] = 0
+            self.scale = seen
+        full = {"0..1": 1.0, "8 bit": 255.0, "16 bit": 65535.0, "stated limit": limit}
+        fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
+        # 16 bits are stated by files of any 16-bit data.
+        self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
 
 
 def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
@@ -162,21 +239,24 @@ def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
     return float(np.corrcoef(first, second)[0, 1])
 
 
-def _scale_of(rgb: NDArray[np.generic]) -> RgbScale:
-    largest = float(np.nanmax(rgb.astype(np.float32), initial=0.0))
+def _largest(rgb: NDArray[np.float32]) -> float:
+    """Largest value (n, 3), but for a few stray ones."""
+    largest = float(np.nanmax(rgb, initial=0.0))
     if largest > 255.0:
-        return "16 bit"
-    return "8 bit" if rgb.dtype.kind in "iu" or largest > 1.0 else "0..1"
+        n_beyond = int(np.count_nonzero(rgb > np.float32(255.0)))
+        if n_beyond < _STRAY_SHARE * rgb.size:
+            return float(rgb[rgb <= np.float32(255.0)].max())
+    return largest
 
 
 def _to_bytes(
     values: NDArray[np.float32], scale: RgbScale | None, limit: float | None
 ) -> NDArray[np.uint8]:
     scaled = values
-    if limit is not None:
+    if scale == "stated limit" and limit is not None:
         scaled = values * np.float32(255.0 / limit)
     elif scale == "16 bit":
-        # Exact for 8-bit values times 256 and times 257 alike.
+        # Exact for 8-bit values times 256 and times 257.
         scaled = np.floor(values / np.float32(256.0))
     elif scale == "0..1":
         scaled = values * np.float32(255.0)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSummary:
-    """One scan as it was read, in metres.
+    """One scan as it was read, in metres; a few stray points do not count.
 
     Attributes:
         station: (3,) where the file says the scanner stood, or None.
         is_posed: the file states a pose other than the identity.
-        low: (3,) smallest coordinates.
-        high: (3,) largest coordinates.
+        low: (3,) smallest coordinates, but for a few.
+        high: (3,) largest coordinates, but for a few.
     """
 
     station: NDArray[np.float64] | None

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import InputError
+from orthoflow.files.points.units import UNITS_M
 from orthoflow.files.survey_points import MeasuredTie, read_measured_ties
 from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.products import InputFiles, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.scan import UNITS_M, Unit
+from orthoflow_plugins.read.scan import Unit
 
 _MOST_PROBLEMS = 20
 

@@ -1,0 +1,302 @@
+"""What the fields of a point are: one table of names for all formats, and columns without names."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points.blocks import PointBlock, PointField
+from orthoflow.files.points.units import unit_of_word
+
+IGNORED: Final = "_"
+COLOURS: Final = ("r", "g", "b")
+GRID: Final = ("row", "column")
+NORMALS: Final = ("nx", "ny", "nz")
+READ: Final = ("x", "y", "z", *COLOURS, "rgb", "intensity", *GRID)
+_ALIASES: Final = {
+    "x": "x easting east e xcoord xcoordinate cartesianx pointx coordx posx positionx",
+    "y": "y northing north n ycoord ycoordinate cartesiany pointy coordy posy positiony",
+    "z": "z height elevation alt altitude h zcoord zcoordinate cartesianz pointz coordz posz "
+    "positionz",
+    "r": "r red rf colorred colourred diffusered colorr",
+    "g": "g green gf colorgreen colourgreen diffusegreen colorg",
+    "b": "b blue bf colorblue colourblue diffuseblue colorb",
+    "rgb": "rgb rgba packedrgb",
+    "intensity": "intensity i int intensities scalarintensity scalarfield scalarscalarfield",
+    "row": "row rowindex",
+    "column": "column columnindex col",
+    "nx": "nx normalx xnormal normals0 n0",
+    "ny": "ny normaly ynormal normals1 n1",
+    "nz": "nz normalz znormal normals2 n2",
+    "number": "number no nr id index pointid objectid fid name pointname point pt",
+    "scan": "scan scanid scannumber scanindex scanname source sourceid pointsourceid",
+}
+# What may stand in for an intensity, the best first.
+_STAND_INS: Final = (
+    *("reflectance", "reflectivity", "scalarreflectance", "amplitude", "scalaramplitude"),
+    *("remission", "scalarremission", "intensity16", "returnintensity", "signalstrength"),
+    "laserintensity",
+)
+_MEANINGS: Final = {alias: name for name, text in _ALIASES.items() for alias in text.split()}
+# Looking for brackets takes time with the square of it.
+_LONGEST_NAME: Final = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """What the columns of a table, or the fields of a point, are.
+
+    Attributes:
+        names: meaning of each, `_` for one that is not used.
+        rule: how they were found: `parameter`, `header`, `values`.
+        labels: what the file calls them.
+        unit: of the coordinates, where their names state it (`X [ft]`).
+    """
+
+    names: tuple[str, ...]
+    rule: str
+    labels: tuple[str, ...] = field(default=())
+    unit: str | None = None
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the columns that are read, coordinates first."""
+        present = [name for name in READ if name in self.names]
+        has_rgb = set(COLOURS) <= set(present)
+        has_grid = set(GRID) <= set(present)
+        return tuple(
+            name
+            for name in present
+            if (name not in COLOURS or has_rgb)
+            and (name not in GRID or has_grid)
+            and (name != "rgb" or not has_rgb)
+        )
+
+    @property
+    def positions(self) -> tuple[int, ...]:
+        """Position of each of `used`."""
+        return tuple(self.names.index(name) for name in self.used)
+
+    @property
+    def fields(self) -> frozenset[PointField]:
+        """What the points have besides coordinates."""
+        used = self.used
+        found: list[PointField] = ["intensity"] if "intensity" in used else []
+        found += ["rgb"] if "r" in used or "rgb" in used else []
+        found += ["grid"] if "row" in used else []
+        return frozenset(found)
+
+    def labels_of(self, *, used: bool) -> tuple[str, ...]:
+        """What the file calls the fields that are read, or those that are not."""
+        labels = self.labels or self.names
+        positions = set(self.positions)
+        return tuple(
+            label for k, label in enumerate(labels) if (k in positions) == used and label != IGNORED
+        )
+
+
+def plain_name(name: str) -> str:
+    """Reduce a field's name to its lower-case letters and digits, without what brackets hold."""
+    if len(name) > _LONGEST_NAME:
+        return ""
+    return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+
+
+def meaning_of(name: str) -> str:
+    """Meaning of a field's name in any format, `_` when it has none."""
+    plain = plain_name(name)
+    if plain in _MEANINGS:
+        return _MEANINGS[plain]
+    base, unit = _split_unit(name)
+    return _MEANINGS.get(plain_name(base), IGNORED) if unit else IGNORED
+
+
+def columns_of_names(
+    labels: Sequence[str], *, intensity_field: str | None = None, rule: str = "header"
+) -> Columns | None:
+    """Sort out fields by their names.
+
+    Args:
+        labels: names of the fields, in their order.
+        intensity_field: name of the field that is to be the intensity; None for the usual names,
+            else those of reflectance, amplitude and remission.
+        rule: for `Columns`.
+
+    Returns:
+        None when they name no x, y and z.
+    """
+    names = [meaning_of(label) for label in labels]
+    # A meaning met twice (`I` and `Intensity`) is that of its first field.
+    names = [IGNORED if name in names[:index] else name for index, name in enumerate(names)]
+    if not {"x", "y", "z"} <= set(names):
+        return None
+    chosen = None
+    plain = [plain_name(label) for label in labels]
+    if intensity_field is not None and plain_name(intensity_field) in plain:
+        chosen = plain.index(plain_name(intensity_field))
+    elif "intensity" not in names:
+        chosen = next((plain.index(name) for name in _STAND_INS if name in plain), None)
+    if chosen is not None:
+        names = [IGNORED if name == "intensity" else name for name in names]
+        names[chosen] = "intensity"
+    units = {_split_unit(labels[names.index(axis)])[1] for axis in "xyz"}
+    return Columns(
+        names=tuple(names),
+        rule=rule,
+        labels=tuple(labels),
+        unit=units.pop() if len(units) == 1 else None,
+    )
+
+
+def columns_of_user(text: str | Sequence[str]) -> Columns:
+    """Columns that the user names, e.g. `x y z r g b intensity`; `_` skips one.
+
+    Raises:
+        InputError: a name is unknown or given twice, or x, y, z are not all there.
+    """
+    words = text.replace(",", " ").split() if isinstance(text, str) else [str(w) for w in text]
+    names = [IGNORED if word.lower() in ("_", "-", "skip", "") else word for word in words]
+    known = [IGNORED if name == IGNORED else meaning_of(name) for name in names]
+    known = [
+        "intensity" if name == IGNORED and plain_name(word) in _STAND_INS else name
+        for name, word in zip(known, names, strict=True)
+    ]
+    unknown = [word for word, name in zip(names, known, strict=True) if word != name == IGNORED]
+    used = [name for name in known if name in READ]
+    if unknown or len(set(used)) != len(used) or not {"x", "y", "z"} <= set(used):
+        raise InputError(
+            "cloud.columns must name x, y and z once each, and may name r, g, b, intensity, row, "
+            f"column, nx, ny, nz or skip a column with {IGNORED}, got {' '.join(words)!r}"
+        )
+    return Columns(names=tuple(known), rule="parameter")
+
+
+def columns_of_values(
+    file_name: str, samples: NDArray[np.float64], first_line: str, *, is_pts: bool
+) -> Columns:
+    """Find out by their values what columns without a header are, where that leaves no doubt.
+
+    Args:
+        file_name: for messages.
+        samples: (n, columns) numbers of the first lines.
+        first_line: for messages.
+        is_pts: the file is a PTS file, which puts the intensity before the colours.
+
+    Raises:
+        InputError: the columns can mean several things.
+    """
+    n_columns = samples.shape[1]
+    lead: tuple[str, ...] = ()
+    if n_columns > 3 and len(samples) >= 5 and np.all(np.diff(samples[:, 0]) == 1.0):
+        lead = ("number",)
+    rest = samples[:, len(lead) + 3 :]
+    readings = [
+        reading
+        for reading in _readings(rest.shape[1])
+        if all(
+            _fits(name, rest[:, k : k + 3]) for k, name in enumerate(reading) if name in ("r", "nx")
+        )
+    ]
+    if len(readings) > 1 and rest.shape[1] == 4 and is_pts:
+        readings = [("intensity", *COLOURS)]
+    if len(readings) != 1:
+        raise InputError(
+            f"{file_name} has {n_columns} columns and no header that names them; its first line is "
+            f"{first_line[:80]!r}: name them with cloud.columns, e.g. "
+            "--set 'cloud.columns=[x, y, z, r, g, b, intensity]', with _ for one to skip"
+        )
+    return Columns(names=(*lead, "x", "y", "z", *readings[0]), rule="values")
+
+
+def point_block(table: NDArray[np.float64], columns: Columns) -> PointBlock:
+    """Turn a table (n, used columns) into a block of points; those without return are left out."""
+    is_void = without_returns(table[:, :3])
+    n_read, n_void = len(table), int(np.count_nonzero(is_void))
+    if n_void:
+        table = table[~is_void]
+    used = columns.used
+    place = {name: used.index(name) for name in used}
+    grid = "row" in place
+    rgb: NDArray[np.generic] | None = (
+        table[:, place["r"] : place["r"] + 3] if "r" in place else None
+    )
+    if "rgb" in place:
+        rgb = unpacked(_whole(table[:, place["rgb"]]))
+    return PointBlock(
+        points=table[:, :3],
+        n_read=n_read,
+        left_out={"no_return": n_void} if n_void else {},
+        intensity=table[:, place["intensity"]].astype(np.float32) if "intensity" in place else None,
+        rgb=rgb,
+        row=_whole(table[:, place["row"]]) if grid else None,
+        column=_whole(table[:, place["column"]]) if grid else None,
+    )
+
+
+def without_returns(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Find points without a return: (n,) True where all three coordinates are exactly zero."""
+    found: NDArray[np.bool_] = (points[:, 0] == 0.0) & (points[:, 1] == 0.0)
+    if found.any():
+        found &= points[:, 2] == 0.0
+    return found
+
+
+def unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours (n, 3) from 0x00RRGGBB, which is kept in an integer or in the bits of a float."""
+    if packed.dtype.kind == "f":
+        bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
+    else:
+        bits = packed.astype(np.int64).astype(np.uint32)
+    return np.column_stack([(bits >> shift) & 255 for shift in (16, 8, 0)]).astype(np.uint8)
+
+
+def _whole(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.nan_to_num(values, posinf=0.0, neginf=0.0).astype(np.int64)
+
+
+def _split_unit(label: str) -> tuple[str, str | None]:
+    """Split a name from the unit behind it: `X [ft]`, `y_mm`, `Z(m)`."""
+    found = re.fullmatch(
+        r"\s*(.+?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|[_ ]([A-Za-z-]+))\s*", label[:200]
+    )
+    if found is None:
+        return label, None
+    text = next(part for part in found.groups()[1:] if part is not None)
+    unit = unit_of_word(text)
+    return (found[1], unit) if unit else (label, None)
+
+
+def _readings(n_columns: int) -> list[tuple[str, ...]]:
+    """All orders of an intensity, colours and normals that take so many columns."""
+    parts = (("intensity",), COLOURS, NORMALS)
+    return [
+        tuple(itertools.chain(*order))
+        for count in range(len(parts) + 1)
+        for order in itertools.permutations(parts, count)
+        if sum(map(len, order)) == n_columns
+    ]
+
+
+def _fits(name: str, values: NDArray[np.float64]) -> bool:
+    """Whether three columns can be colours (`r`) or normals (`nx`)."""
+    finite = values[np.isfinite(values).all(axis=1)]
+    if not len(finite):
+        return False
+    lengths = np.linalg.norm(finite, axis=1)
+    unit = (np.abs(lengths - 1.0) < 0.02) | (lengths == 0.0)
+    is_unit = bool(unit.mean() > 0.9 and lengths.any())
+    if name == "nx":
+        return is_unit
+    if finite.min() < 0.0 or finite.max() > 65535.0:
+        return False
+    is_whole = bool(np.all(finite == np.rint(finite)))
+    return (is_whole and not (is_unit and finite.max() <= 1.0)) or (
+        finite.max() <= 1.0 and not is_unit
+    )

@@ -1,0 +1,213 @@
+"""Units of coordinates as files state them: coordinate systems, comments, names of columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from orthoflow.errors import InputError
+
+US_SURVEY_FOOT_M: Final = 1200.0 / 3937.0
+UNITS_M: Final[dict[str, float]] = {
+    "m": 1.0,
+    "cm": 0.01,
+    "mm": 0.001,
+    "ft": 0.3048,
+    "us-ft": US_SURVEY_FOOT_M,
+    "in": 0.0254,
+    "km": 1000.0,
+}
+_WORDS: Final[dict[str, str]] = {
+    r"us[\s_-]*survey[\s_-]*(?:foot|feet|ft)": "us-ft",
+    r"survey[\s_-]*(?:foot|feet|ft)|us[\s_-]*(?:ft|foot|feet)|usft|ftus|sft": "us-ft",
+    r"(?:international[\s_-]*)?(?:foot|feet|ft|ift)": "ft",
+    r"milli(?:metre|meter)s?|mm": "mm",
+    r"centi(?:metre|meter)s?|cm": "cm",
+    r"kilo(?:metre|meter)s?|km": "km",
+    r"(?:metre|meter)s?|m": "m",
+    r"inch(?:es)?|in": "in",
+    r"degrees?|deg|decimal[\s_-]*degrees": "deg",
+}
+_UNIT: Final = "|".join(f"(?P<u{k}>{word})" for k, word in enumerate(_WORDS))
+_ANY: Final = re.compile(rf"(?:{_UNIT})\b", re.IGNORECASE)
+# A unit counts where the comment speaks of one; `in` only directly behind the word `unit`.
+_CONTEXT: Final = re.compile(
+    r"\b(?:(?:length|linear|coordinate|xyz|measurement)?[\s_-]*units?(?:[\s_-]*of[\s_-]*\w+)?"
+    r"|(?:coordinates?|coords?|xyz|lengths?|distances?|positions?)(?:\s+(?:are|is|given))?\s+in\b)"
+    r"(?:\s+(?:are|is|in))?[\s:=\"'\[(]*",
+    re.IGNORECASE,
+)
+_EPSG: Final = re.compile(r"\b(?:EPSG|epsg)(?:\s*[:=]{1,2}\s*|\s+)(\d{4,6})(?:\s*\+\s*(\d{4,6}))?")
+_WKT: Final = re.compile(
+    r"(?:COMPD_?CS|COMPOUNDCRS|PROJ_?CS|PROJCRS|PROJECTEDCRS|GEOG_?CS|GEOGCRS|GEOGRAPHICCRS"
+    r"|GEODCRS|GEOC_?CS|LOCAL_?CS|ENGCRS|ENGINEERINGCRS|BOUNDCRS|VERT_?CS|VERTCRS)\s*[\[(].*",
+    re.DOTALL,
+)
+# GeoTIFF 1.0, 6.2 and 6.3.1.3: keys, and codes of units of length.
+_MODEL_TYPE: Final = 1024
+_GEOGRAPHIC: Final = 2
+_GEOGRAPHIC_TYPE: Final = 2048
+_PROJECTED: Final = 3072
+_LINEAR_UNITS: Final = 3076
+_VERTICAL: Final = 4096
+_VERTICAL_UNITS: Final = 4099
+_GEO_UNITS: Final[dict[int, float]] = {
+    9001: 1.0,
+    9002: 0.3048,
+    9003: US_SURVEY_FOOT_M,
+    9036: 1000.0,
+    1025: 0.001,
+    1033: 0.01,
+}
+# Beyond, a text is no coordinate system, and pyproj would be busy with it.
+_LONGEST_CRS: Final = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedUnit:
+    """The unit that a file states.
+
+    Attributes:
+        name: of `UNITS_M`, or `deg` for geographic coordinates; with two names, `us-ft/m`, heights
+            have the second.
+        metres: of the unit along x, y and z.
+        source: where it is stated.
+    """
+
+    name: str
+    metres: tuple[float, float, float]
+    source: str
+
+
+def unit_of_name(name: str, source: str) -> StatedUnit:
+    """Build the unit of one name of `UNITS_M`, or `deg`."""
+    metres = UNITS_M.get(name, float("nan"))
+    return StatedUnit(name=name, metres=(metres, metres, metres), source=source)
+
+
+def unit_of_word(text: str) -> str | None:
+    """Name of the unit that a text is, e.g. `[ft]`; None for anything else."""
+    found = _ANY.fullmatch(text.strip(" []()._-"))
+    return None if found is None else _name(found)
+
+
+def unit_of_comments(comments: Iterable[str], what: str = "comment") -> StatedUnit | None:
+    """Find the unit in comments of a header: a coordinate system, or words about a unit."""
+    for comment in comments:
+        if len(comment) > _LONGEST_CRS:
+            continue
+        text = " ".join(comment.split())
+        wkt = _WKT.search(text)
+        epsg = _EPSG.search(text)
+        if wkt or epsg:
+            code = "" if epsg is None else "EPSG:" + "+".join(filter(None, epsg.groups()))
+            found = unit_of_crs(wkt[0] if wkt else code, what)
+            if found is not None:
+                return found
+        word = unit_of_word(text)
+        for context in _CONTEXT.finditer(text):
+            match = _ANY.match(text, context.end())
+            word = _name(match) if match else word
+        if word is not None:
+            return unit_of_name(word, f"{what} {text[:60]!r}")
+    return None
+
+
+def unit_of_crs(text: str, what: str) -> StatedUnit | None:
+    """Unit of a coordinate system, WKT or `EPSG:nnnn`; None where pyproj does not know it."""
+    if not text.strip() or len(text) > _LONGEST_CRS:
+        return None
+    import pyproj
+
+    try:
+        crs = pyproj.CRS.from_user_input(text.strip(" \0\t\r\n"))
+    except (pyproj.exceptions.CRSError, ValueError, UnicodeError):
+        return None
+    return unit_of_axes(crs, what)
+
+
+# Any: pyproj has no types that strict checks accept.
+def unit_of_axes(crs: Any, what: str) -> StatedUnit | None:
+    """Unit along x, y and z of a pyproj coordinate system."""
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    source = f"{what} {crs.name[:80]}"
+    axes = [axis for part in parts for axis in part.axis_info]
+    level = [axis for axis in axes if axis.direction not in ("up", "down")]
+    heights = [axis for axis in axes if axis.direction in ("up", "down")]
+    if not level:
+        return None
+    if crs.is_geographic or any("deg" in axis.unit_name.lower() for axis in level):
+        return unit_of_name("deg", source)
+    metres = float(level[0].unit_conversion_factor)
+    height = float(heights[0].unit_conversion_factor) if heights else metres
+    return unit_of_factors(metres, height, source)
+
+
+def unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit | None:
+    """Build the unit of two factors to metres; None where they are no lengths."""
+    if not (level_m > 0.0 and height_m > 0.0):
+        return None
+    names = dict.fromkeys(_name_of_factor(factor) for factor in (level_m, height_m))
+    return StatedUnit(name="/".join(names), metres=(level_m, level_m, height_m), source=source)
+
+
+def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
+    """Unit that GeoTIFF keys state: their own unit keys win over those of the coded systems."""
+    import pyproj
+
+    level_m = height_m = None
+    names, is_degrees = [], keys.get(_MODEL_TYPE) == _GEOGRAPHIC
+    for key in (_PROJECTED, _GEOGRAPHIC_TYPE, _VERTICAL):
+        code = keys.get(key, 0)
+        if not 1024 < code < 32767 or (key == _GEOGRAPHIC_TYPE and _PROJECTED in keys):
+            continue
+        try:
+            crs = pyproj.CRS.from_epsg(code)
+        except pyproj.exceptions.CRSError:
+            continue
+        unit = crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
+        names.append(crs.name)
+        is_degrees = is_degrees or crs.is_geographic
+        if key == _VERTICAL:
+            height_m = unit
+        elif not crs.is_geographic:
+            level_m = unit
+            height_m = crs.axis_info[-1].unit_conversion_factor if crs.is_compound else None
+    level_m = _GEO_UNITS.get(keys.get(_LINEAR_UNITS, 0), level_m)
+    height_m = _GEO_UNITS.get(keys.get(_VERTICAL_UNITS, 0), height_m)
+    if _GEO_UNITS.get(keys.get(_LINEAR_UNITS, 0)) and _PROJECTED in keys:
+        is_degrees = False
+    source = " + ".join(["GeoTIFF keys", *names])
+    if is_degrees:
+        return unit_of_name("deg", source)
+    return None if level_m is None else unit_of_factors(level_m, height_m or level_m, source)
+
+
+def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
+    """Refuse geographic coordinates, from which no wall can be measured.
+
+    Raises:
+        InputError: the unit is degrees.
+    """
+    if unit.name == "deg":
+        raise InputError(
+            f"{file_name} states geographic coordinates in degrees ({unit.source}): expected "
+            "metres or feet in a plane system. Project it, e.g. with `pdal translate ... "
+            "reprojection --filters.reprojection.out_srs=EPSG:nnnn`, or set cloud.unit=m if its "
+            "numbers are metres all the same"
+        )
+
+
+def _name(match: re.Match[str]) -> str:
+    names = list(_WORDS.values())
+    return names[int(str(match.lastgroup)[1:])]
+
+
+def _name_of_factor(metres: float) -> str:
+    """Name of a unit; feet differ in the sixth digit."""
+    for name, factor in UNITS_M.items():
+        if abs(metres / factor - 1.0) < 1e-7:
+            return name
+    return f"{metres:.10g} m"
