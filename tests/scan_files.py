@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.points import PointBlock, open_scan
-from orthoflow.files.points.columns import Columns
+from orthoflow.files.points.fields import Columns
 
 
 def read_all(path: Path, columns: Columns | None = None) -> list[PointBlock]:

@@ -9,7 +9,7 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files.points import open_scan
-from orthoflow.files.points.columns import columns_of_text
+from orthoflow.files.points.fields import columns_of_text
 from tests.scan_files import read_all, read_points
 
 
