@@ -68,7 +68,7 @@ def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
 def _difference(name: str, planned: dict[str, Any], here: dict[str, Any] | str) -> str:
     if isinstance(here, str):
         return here
-    for library in planned["libraries"].keys() | here["libraries"].keys():
+    for library in sorted(planned["libraries"].keys() | here["libraries"].keys()):
         versions = [facts["libraries"].get(library, "none") for facts in (planned, here)]
         if versions[0] != versions[1]:
             return f"{name} has {library} {versions[1]} there, {versions[0]} in the plan"

@@ -230,6 +230,10 @@ def _table(path: Path) -> Recognised:
         found = _read("cameras", path, lambda file: _cameras_said([file]))
         if found.kind == "cameras":
             return found
+    elif _column_names(path) >= _CAMERA_COLUMNS:
+        return Recognised(
+            kind="unknown", path=path, said="a list of cameras, which is read from .csv: rename it"
+        )
     try:
         return _scan(path)
     except InputError as error:
@@ -248,12 +252,19 @@ _COLUMNS: Final[Mapping[FileKind, frozenset[str]]] = {
 }
 
 
+# Of a list of cameras; no scan has them.
+_CAMERA_COLUMNS: Final = frozenset(("heading", "pitch", "roll"))
+
+
 def _has_columns_of(path: Path, kind: FileKind) -> bool:
     """Whether the first line names the columns of a table, which nothing else would."""
+    return _COLUMNS[kind] <= _column_names(path)
+
+
+def _column_names(path: Path) -> frozenset[str]:
     with path.open("rb") as file:
         first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
-    names = {word.strip().lower() for word in re.split(r"[,;\t]", first)}
-    return _COLUMNS[kind] <= names
+    return frozenset(word.strip().lower() for word in re.split(r"[,;\t]", first))
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:

@@ -319,9 +319,10 @@ def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
 
 def test_workers_with_other_versions_are_refused_by_name(office: Office) -> None:
     plan = office.plan()
+    tools = plan.methods["work.slow"].tools
     for change, said in (
         ({"result_version": 7}, "work.slow has the result version 1 there, 7 in the plan"),
-        ({"tools": {"far": "2.0"}}, "work.slow has far none there, 2.0 in the plan"),
+        ({"tools": {**tools, "far": "2.0"}}, "work.slow has far none there, 2.0 in the plan"),
         ({"code": {"toy_plugin": "0"}}, "work.slow has other code there"),
     ):
         facts = dataclasses.replace(plan.methods["work.slow"], **change)

@@ -194,7 +194,9 @@ def columns_of_values(
     """
     n_columns = samples.shape[1]
     lead: tuple[str, ...] = ()
-    if n_columns > 3 and len(samples) >= 5 and np.all(np.diff(samples[:, 0]) == 1.0):
+    first = samples[:, 0]
+    counts = np.all(np.diff(first) == 1.0) and np.all(first == np.round(first))
+    if n_columns > 3 and len(samples) >= 5 and counts:
         lead = ("number",)
     rest = samples[:, len(lead) + 3 :]
     readings = [
