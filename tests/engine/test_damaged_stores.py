@@ -136,7 +136,7 @@ def test_no_damage_of_a_store_is_sealed_as_good(laboratory: StoredRuns) -> None:
         answer = laboratory.run(name, name)
         assert answer.code == 0, f"{what}: {answer.said}"
         assert laboratory.sealed(name) == expected, what
-        n_said += "was damaged" in answer.said
+        n_said += "stored-result-damaged" in answer.said
         # What no run needed, such as a scan that nothing reads any more, is found by looking.
         check_store(Store(store))
         assert check_store(Store(store)).damaged == (), what
