@@ -220,7 +220,7 @@ class DaskExecutor:
     # Any: what a worker said of itself.
     def _hear(self, event: tuple[float, Any]) -> None:
         said = event[1]
-        with suppress(KeyError, TypeError):
+        with suppress(AttributeError, KeyError, TypeError, ValueError):
             told = said.get("diagnostic")
             heard = StepEvent(
                 kind=said["kind"],
