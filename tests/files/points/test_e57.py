@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import e57, open_scan
+from orthoflow.files.points import Scan, e57, open_scan
 from tests import scan_files
 from tests.scan_files import read_all
 
@@ -35,15 +35,15 @@ def test_e57_scans_are_placed_by_their_poses(tmp_path: Path, points: NDArray[np.
             "translation": (634512.347, 486215.781, 112.193),
         },
     ]
-    first, second = read_all(scan_files.write_e57(tmp_path / "a.e57", scans))
+    opened = open_scan(scan_files.write_e57(tmp_path / "a.e57", scans))
+    first, second = opened.read()
     np.testing.assert_allclose(first.points, points, atol=1e-6)
     turned = np.column_stack([-points[:, 1], points[:, 0], points[:, 2]])
     expected = turned + np.array([634512.347, 486215.781, 112.193])
     np.testing.assert_allclose(second.points, expected, atol=1e-6)
     assert (first.scan, second.scan) == (0, 1)
-    assert second.station is not None
-    np.testing.assert_array_equal(second.station, [634512.347, 486215.781, 112.193])
-    assert (first.station_is_posed, second.station_is_posed) == (False, True)
+    np.testing.assert_array_equal(opened.scans[1].station, [634512.347, 486215.781, 112.193])
+    assert [scan.station_is_posed for scan in opened.scans] == [False, True]
 
 
 HALF = np.sqrt(0.5)
@@ -78,13 +78,13 @@ def test_a_tilted_e57_scanner_turns_each_axis_where_its_pose_says(
 ) -> None:
     station = np.array([4.0, -2.0, 1.0])
     scan = {
-        "fields": cartesian(np.vstack([np.zeros(3), np.eye(3), [[2.0, 3.0, 5.0]]])),
+        "fields": cartesian(np.vstack([np.eye(3), [[2.0, 3.0, 5.0]]])),
         "rotation": rotation,
         "translation": station,
     }
     (block,) = read_all(scan_files.write_e57(tmp_path / "a.e57", [scan]))
     x, y, z = np.array(axes_world)
-    expected = station + np.array([np.zeros(3), x, y, z, 2.0 * x + 3.0 * y + 5.0 * z])
+    expected = station + np.array([x, y, z, 2.0 * x + 3.0 * y + 5.0 * z])
     np.testing.assert_allclose(block.points, expected, atol=1e-14)
 
 
@@ -108,8 +108,9 @@ def test_e57_rows_columns_colours_and_limits_are_kept(
     opened = open_scan(scan_files.write_e57(tmp_path / "a.e57", [scan]))
     (block,) = opened.read()
     assert opened.fields == {"intensity", "rgb", "grid"}
-    assert opened.intensity_limits == (0.0, 8.0)
-    assert opened.rgb_limit == 255.0
+    (scan_read,) = opened.scans
+    assert scan_read.intensity_limits == (0.0, 8.0)
+    assert scan_read.rgb_limit == 255.0
     np.testing.assert_allclose(block.intensity, index / 10.0, rtol=1e-6)
     np.testing.assert_array_equal(block.rgb, np.column_stack([index, index + 1, index + 2]))
     # 16 bits would have overflowed.
@@ -125,7 +126,7 @@ def test_e57_leaves_out_points_without_a_position(
     (block,) = read_all(scan_files.write_e57(tmp_path / "a.e57", [{"fields": fields}]))
     np.testing.assert_allclose(block.points, points[state == 0], atol=1e-6)
     np.testing.assert_array_equal(block.intensity, np.flatnonzero(state == 0))
-    assert (block.n_read, block.n_invalid) == (40, 26)
+    assert (block.n_read, block.left_out) == (40, {"invalid": 26})
 
 
 def test_e57_spherical_coordinates_become_cartesian(
@@ -261,13 +262,13 @@ def header_of(**known: Any) -> e57.ScanHeader:
         "names": frozenset({"cartesianX", "cartesianY", "cartesianZ"}),
         "rotation": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
         "translation": np.array([10.0, 20.0, 30.0]),
-        "is_posed": True,
-        "intensity_limits": None,
-        "rgb_limit": None,
+        "intensity": None,
+        "scan": Scan(),
     }
     return e57.ScanHeader(**{**plain, **known})
 
 
+FULL = header_of(intensity="intensity", scan=Scan(fields=frozenset({"intensity", "rgb", "grid"})))
 ARRAYS = {
     "cartesianX": np.array([1.0, 2.0, 3.0]),
     "cartesianY": np.array([4.0, 5.0, 6.0]),
@@ -286,31 +287,25 @@ MORE = {
 def test_a_block_has_what_its_scan_has() -> None:
     block = e57._block(dict(ARRAYS), header_of(), 2)
     np.testing.assert_allclose(block.points, [[6, 21, 37], [5, 22, 38], [4, 23, 39]])
-    assert (block.scan, block.n_read, block.n_invalid) == (2, 3, 0)
-    assert block.station is not None
-    np.testing.assert_array_equal(block.station, [10.0, 20.0, 30.0])
+    assert (block.scan, block.n_read, block.left_out) == (2, 3, {})
     assert block.intensity is None
     assert block.rgb is None
     assert block.row is None
     assert block.column is None
-    still = e57._block(dict(ARRAYS), header_of(is_posed=False), 2)
+    still = e57._block(dict(ARRAYS), header_of(scan=Scan(station_is_posed=False)), 2)
     np.testing.assert_array_equal(still.points[0], [1.0, 4.0, 7.0])
-    full = e57._block({**ARRAYS, **MORE}, header_of(), 0)
+    full = e57._block({**ARRAYS, **MORE}, FULL, 0)
     np.testing.assert_array_equal(full.intensity, [0.25, 0.5, 0.75])
     np.testing.assert_array_equal(full.rgb, [[1, 4, 7], [2, 5, 8], [3, 6, 9]])
     np.testing.assert_array_equal(full.row, [0, 1, 2])
     np.testing.assert_array_equal(full.column, [5, 6, 7])
-    # Two of three colours, or a row alone, are none.
-    for gone, name in (("colorBlue", "rgb"), ("columnIndex", "row")):
-        some = {key: values for key, values in {**ARRAYS, **MORE}.items() if key != gone}
-        assert getattr(e57._block(some, header_of(), 0), name) is None
 
 
 def test_points_without_a_position_are_left_out_with_all_that_is_theirs() -> None:
     arrays = {**ARRAYS, **MORE, "cartesianInvalidState": np.array([0.0, 2.0, 0.0])}
-    block = e57._block(arrays, header_of(is_posed=False), 0)
-    assert (block.n_read, block.n_invalid) == (3, 1)
-    np.testing.assert_array_equal(block.points[:, 0], [1.0, 3.0])
+    block = e57._block(arrays, FULL, 0)
+    assert (block.n_read, block.left_out) == (3, {"invalid": 1})
+    np.testing.assert_array_equal(block.points[:, 1], [21.0, 23.0])
     np.testing.assert_array_equal(block.intensity, [0.25, 0.75])
     np.testing.assert_array_equal(block.column, [5, 7])
 

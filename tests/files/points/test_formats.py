@@ -29,7 +29,7 @@ from tests.scan_files import read_all
             "room.laz is named as LAS/LAZ but does not begin with 'LASF'",
         ),
         ("room.ply", "this is text\n", "room.ply is named as PLY but does not begin with 'ply'"),
-        ("room.pcd", "this is text\n", "room.pcd is named as PCD but does not begin with"),
+        ("room.pcd", "this is text\n", "room.pcd has no PCD header that can be read"),
         ("room.rcp", "this is text\n", "room.rcp is no point file .* one of .e57 .las .laz"),
         ("room.e57", "", "room.e57 is empty"),
         ("room.xyz", "", "room.xyz is empty"),
@@ -76,7 +76,7 @@ def test_points_are_counted_in_four_bytes() -> None:
             name="a.las",
             format_name="LAS/LAZ",
             n_most=n_most,
-            fields=frozenset(),
+            scans=[],
             read=lambda: iter(()),
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -129,7 +130,11 @@ def block(*points: tuple[float, float, float], told: bool = True) -> PointBlock:
 
 def outside(found: PointBlock, low: object, high: object) -> int:
     bounds = np.array([np.broadcast_to(low, 3), np.broadcast_to(high, 3)], dtype=np.float64)  # type: ignore[call-overload]
-    return las._outside(Path("a.las"), found, bounds)
+    header = SimpleNamespace(mins=bounds[0], maxs=bounds[1], are_points_compressed=True)
+    check = las._BoundsCheck(Path("a.las"), header)
+    check.add(found)
+    notes = "".join(check.notes())
+    return int(notes.split()[1]) if notes else 0
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["with bounds", "without"])

@@ -37,7 +37,7 @@ def test_ply_gives_its_vertices(tmp_path: Path, points: NDArray[np.float64], enc
     np.testing.assert_allclose(block.points[:, 2], points[:, 2], atol=1e-6)
     np.testing.assert_array_equal(block.rgb[:, 2], np.arange(40) + 2)  # type: ignore[index]
     np.testing.assert_array_equal(block.intensity, np.arange(40))
-    assert scan.rgb_limit == 255.0
+    assert scan.scans[0].rgb_limit == 255.0
     assert scan.fields == {"intensity", "rgb"}
 
 

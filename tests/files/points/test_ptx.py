@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan, tables
+from orthoflow.files.points import open_scan, ptx
 from tests import scan_files
 from tests.scan_files import read_all
 
@@ -29,30 +29,38 @@ def test_ptx_scans_are_placed_and_their_grid_is_known(
     np.testing.assert_allclose(first.points, points[seen], atol=1e-9)
     turned = np.column_stack([-points[:, 1], points[:, 0], points[:, 2]])[seen]
     np.testing.assert_allclose(second.points, turned + matrix[:3, 3], atol=1e-9)
-    np.testing.assert_array_equal(second.station, matrix[:3, 3])
+    np.testing.assert_array_equal(scan.scans[1].station, matrix[:3, 3])
     np.testing.assert_array_equal(first.row, (np.arange(40) % 8)[seen])
     np.testing.assert_array_equal(first.column, (np.arange(40) // 8)[seen])
     np.testing.assert_array_equal(second.row, (np.arange(40) % 5)[seen])
-    assert (first.n_read, first.n_invalid) == (40, 1)
+    assert (first.n_read, first.left_out) == (40, {"no_return": 1})
     assert scan.fields == {"intensity", "rgb", "grid"}
 
 
-@pytest.mark.parametrize(
-    ("cut", "message"),
-    [
-        (-20, r"a\.ptx is cut off: its scan 0 holds \d+ points, its header states 40"),
-        (30, r"a\.ptx, line 1: expected the ten header lines of a PTX scan"),
-    ],
-    ids=["points", "header"],
-)
-def test_a_ptx_file_that_is_cut_off_is_refused(
-    tmp_path: Path, points: NDArray[np.float64], cut: int, message: str
+def test_a_ptx_file_of_fewer_lines_than_places_is_read_without_its_grid(
+    tmp_path: Path, points: NDArray[np.float64]
 ) -> None:
     path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))])
     lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:-3] if cut < 0 else lines[:5]))
-    with pytest.raises(InputError, match=message):
-        read_all(path)
+    path.write_text("\n".join(lines[:-3]))
+    scan = open_scan(path)
+    (block,) = scan.read()
+    np.testing.assert_allclose(block.points, points[:-3], atol=1e-9)
+    assert block.row is None
+    assert scan.fields == frozenset()
+    assert scan.notes == [
+        "a.ptx: scan 0 has 37 lines of points, its header states 5 x 8 = 40: they are read "
+        "without their places in the scan's grid"
+    ]
+
+
+def test_a_ptx_file_that_ends_in_its_header_is_refused(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))])
+    path.write_text("\n".join(path.read_text().splitlines()[:5]))
+    with pytest.raises(InputError, match=r"a\.ptx, line 1: expected the ten header lines of a PTX"):
+        open_scan(path)
 
 
 def test_a_ptx_line_with_an_odd_number_of_columns_is_refused(tmp_path: Path) -> None:
@@ -65,10 +73,10 @@ def test_a_ptx_line_with_an_odd_number_of_columns_is_refused(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("line", "text", "message"),
     [
-        (51, "8 5", r"a\.ptx, line 51: expected the ten header lines of a PTX scan"),
+        (51, "8 5", r"a\.ptx, line 57: expected 3 numbers"),
         (61, "1 2 x", r"a\.ptx, line 61"),
         (70, "1 2 x", r"a\.ptx, line 70"),
-        (101, "8 5", r"a\.ptx, line 101: expected the ten header lines"),
+        (101, "8 5", r"a\.ptx, line 107: expected 3 numbers"),
     ],
     ids=["second-header", "its-first-point", "its-tenth", "third-header"],
 )
@@ -87,7 +95,7 @@ def test_what_is_wrong_with_a_later_scan_is_told_with_its_line(
 def test_the_grid_of_a_ptx_goes_on_from_block_to_block(
     tmp_path: Path, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "BLOCK_POINTS", 15)
+    monkeypatch.setattr(ptx, "BLOCK_POINTS", 15)
     path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))] * 2)
     blocks = read_all(path)
     assert [(block.scan, block.n_read) for block in blocks] == [
