@@ -151,16 +151,17 @@ class CloudAssembly:
         ]
         first_scan = len(self.counts)
         self.counts += counts
-        n_done = sum(count.n_read for count in self.counts)
+        n_before = sum(count.n_read for count in self.counts)
+        n_done = 0
         for block in file.read():
             self._add(block, first_scan + block.scan)
             n_done += block.n_read
-            share = min(n_done / self._capacity, 1.0)
+            share = min((n_before + n_done) / self._capacity, 1.0)
             self._ctx.progress(share, f"{file.name}: {n_done} points")
         left_out = sum((count.left_out for count in counts), Counter())
         is_choice = left_out["outside_box"] or left_out["other_class"]
         if not is_choice and not any(count.n_kept for count in counts):
-            causes = ", ".join(f"{n} {cause}" for cause, n in left_out.items() if n)
+            causes = ", ".join(f"{n} {c.replace('_', ' ')}" for c, n in left_out.items() if n)
             raise InputError(
                 f"{file.name} holds no usable points: of {sum(c.n_read for c in counts)}, left out "
                 f"are {causes}; export it again"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from orthoflow_plugins.read import assembly
 from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
 
 from orthoflow.errors import InputError, StoreError
-from orthoflow.files.points.blocks import PointBlock, PointField, ScanFile
+from orthoflow.files.points.blocks import PointBlock, PointField, Scan, ScanFile
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 
@@ -37,12 +37,17 @@ def block(seed: int, n: int, *, scan: int = 0, **more: object) -> PointBlock:
     return PointBlock(**(plain | more))  # type: ignore[arg-type]
 
 
-def file(name: str, *blocks: PointBlock, fields: Sequence[PointField] = FIELDS) -> ScanFile:
+def file(
+    name: str,
+    *blocks: PointBlock,
+    fields: Sequence[PointField] = FIELDS,
+) -> ScanFile:
+    n_scans = max(one.scan for one in blocks) + 1
     return ScanFile(
         name=name,
         format_name="toy",
         n_most=sum(len(one.points) for one in blocks),
-        fields=frozenset(fields),
+        scans=[Scan(fields=frozenset(fields)) for _ in range(n_scans)],
         read=lambda: iter(blocks),
     )
 
@@ -57,11 +62,15 @@ def context(folder: Path, progress: list[tuple[float, str]] | None = None) -> St
     )
 
 
+def metres(unit_m: float = 1.0) -> Callable[[Scan], NDArray[np.float64]]:
+    return lambda scan: np.full(3, unit_m)
+
+
 def assembled(
     folder: Path, *files: ScanFile, unit_m: float = 1.0, box_m: NDArray[np.float64] | None = None
 ) -> CloudAssembly:
     folder.mkdir(exist_ok=True)
-    growing = CloudAssembly(context(folder), list(files), unit_m, box_m)
+    growing = CloudAssembly(context(folder), list(files), metres(unit_m), box_m)
     for one in files:
         growing.add_file(one)
     return growing
@@ -117,65 +126,51 @@ def test_what_comes_in_blocks_is_what_there_is(
     )
     scans = np.repeat([0, 1, 2], [40, 30, 20])
     np.testing.assert_array_equal(found.array("scan"), scans[inside])
-    intensity = np.concatenate([one.intensity for one in blocks if one.intensity is not None])
-    finite = intensity[inside & np.isfinite(intensity)]
-    assert found.intensity_range == (float(finite.min()), float(finite.max()))
-    assert found.n_intensity_lost == np.count_nonzero(inside & ~np.isfinite(intensity))
-    for scan, summary in enumerate(found.scans):
-        mine = points[inside & (scans == scan)]
-        np.testing.assert_array_equal([summary.low, summary.high], [mine.min(0), mine.max(0)])
-    a, b = found.files
-    assert (a.n_read, a.n_not_finite, a.n_far) == (70, 4, 2)
-    assert a.n_kept == np.count_nonzero(inside[:70])
-    assert a.n_outside == np.count_nonzero(usable[:70] & ~inside[:70])
-    assert a.first_far_m == pytest.approx(tuple(points[47]))
-    assert (b.n_read, b.n_kept, b.n_not_finite) == (20, np.count_nonzero(inside[70:]), 0)
+    for scan, count in enumerate(found.counts):
+        mine = scans == scan
+        assert (count.n_read, count.n_kept) == (mine.sum(), inside[mine].sum())
+        assert count.left_out["outside_box"] == np.count_nonzero(usable[mine] & ~inside[mine])
+        np.testing.assert_array_equal(scans[inside][count.start : count.stop], scan)
+    assert [count.left_out["not_finite"] for count in found.counts] == [0, 2, 0]
+    assert [count.left_out["too_far"] for count in found.counts] == [0, 2, 0]
+    assert found.counts[1].first_far_m == pytest.approx(tuple(points[47]))
 
 
-def test_what_a_reader_left_out_is_counted_file_by_file(tmp_path: Path) -> None:
-    left_out = block(1, 10, n_read=16, n_invalid=1, n_withheld=2, n_unwanted=3)
+def test_what_a_reader_left_out_is_counted_scan_by_scan(tmp_path: Path) -> None:
+    left_out = block(1, 10, n_read=16, left_out={"invalid": 1, "withheld": 2, "other_class": 3})
     found = assembled(tmp_path, file("a", left_out, left_out), file("b", block(2, 5)))
-    counts = [
-        (one.n_read, one.n_kept, one.n_invalid, one.n_withheld, one.n_unwanted, one.n_outside)
-        for one in found.files
-    ]
-    assert counts == [(32, 20, 2, 4, 6, 0), (5, 5, 0, 0, 0, 0)]
-    assert [one.name for one in found.files] == ["a", "b"]
+    first, second = found.counts
+    assert (first.file, first.n_read, first.n_kept) == ("a", 32, 20)
+    assert +first.left_out == {"invalid": 2, "withheld": 4, "other_class": 6}
+    assert (second.file, second.n_read, second.n_kept, +second.left_out) == ("b", 5, 5, {})
 
 
-def test_scans_are_numbered_through_all_files_and_keep_their_stations(tmp_path: Path) -> None:
-    station = np.array([1000.0, 2000.0, 3000.0])
-    blocks = [
-        block(1, 4, station=station),
-        block(2, 4, scan=1),
-        block(3, 4, scan=1, station=2 * station, station_is_posed=False),
-    ]
+def test_scans_are_numbered_through_all_files(tmp_path: Path) -> None:
+    blocks = [block(1, 4), block(2, 4, scan=1), block(3, 4, scan=1)]
     found = assembled(tmp_path, file("a", *blocks), file("b", block(4, 4)), unit_m=0.001)
-    assert len(found.scans) == 3
-    first, second, third = found.scans
-    np.testing.assert_allclose(first.station, station / 1000.0)
-    np.testing.assert_allclose(second.station, station / 500.0)
-    assert (first.is_posed, second.is_posed, third.station) == (True, False, None)
+    assert [(count.file, count.index) for count in found.counts] == [("a", 0), ("a", 1), ("b", 0)]
     np.testing.assert_array_equal(found.array("scan"), np.repeat([0, 1, 1, 2], 4))
 
 
 def test_one_scan_needs_no_numbers_and_missing_fields_are_missing(tmp_path: Path) -> None:
     found = assembled(tmp_path, file("a", block(1, 6)), fields_only())
-    assert found.fields == {"intensity"}
-    for name in ("rgb", "row", "column"):
+    # Colours have a mask of those that there are; of rows and columns there are all or none.
+    assert found.array("has_rgb").tolist() == [True] * 6 + [False] * 6  # type: ignore[union-attr]
+    assert [count.n_without_rgb for count in found.counts] == [0, 6]
+    for name in ("row", "column"):
         assert found.array(name) is None
     single = assembled(tmp_path / "other", file("a", block(1, 6)))
     assert single.array("scan") is None
 
 
 def fields_only() -> ScanFile:
-    return file("b", block(2, 6), fields=("intensity",))
+    return file("b", block(2, 6, rgb=None), fields=("intensity",))
 
 
 def test_progress_is_the_share_of_the_points_that_may_come(tmp_path: Path) -> None:
     told: list[tuple[float, str]] = []
     files = [file("a", block(1, 30), block(2, 10)), file("b", block(3, 40))]
-    growing = CloudAssembly(context(tmp_path, told), files, 1.0)
+    growing = CloudAssembly(context(tmp_path, told), files, metres())
     for one in files:
         growing.add_file(one)
     assert told == [
@@ -186,15 +181,17 @@ def test_progress_is_the_share_of_the_points_that_may_come(tmp_path: Path) -> No
 
 
 def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_path: Path) -> None:
-    lost = block(1, 4, points=np.full((4, 3), np.nan), n_read=9, n_invalid=3, n_withheld=2)
+    lost = block(
+        1, 4, points=np.full((4, 3), np.nan), n_read=9, left_out={"invalid": 3, "withheld": 2}
+    )
     with pytest.raises(InputError) as caught:
         assembled(tmp_path, file("a", lost))
     assert str(caught.value) == (
-        "a holds no usable points: of 9, 3 are marked as invalid, 2 as deleted and 4 are not "
-        "finite; export it again"
+        "a holds no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; export "
+        "it again"
     )
     # Points of other classes, or outside, are no damage.
-    for more in ({"n_unwanted": 5}, {}):
+    for more in ({"left_out": {"other_class": 5}}, {}):
         away = block(1, 4, **more)
         box_m = np.array([HERE + 50.0, HERE + 60.0])
         growing = assembled(tmp_path / f"{len(more)}", file("a", away), box_m=box_m)
@@ -231,7 +228,7 @@ def test_rows_and_columns_beyond_32_bits_are_cut(tmp_path: Path) -> None:
 
 def test_sixteen_bits_number_the_scans(tmp_path: Path) -> None:
     last = file("a", *(block(k, 1, scan=k) for k in range(2)))
-    growing = CloudAssembly(context(tmp_path), [last], 1.0)
+    growing = CloudAssembly(context(tmp_path), [last], metres())
     growing._store_scan(65_535, slice(0, 1))
     assert growing._scan is not None
     assert growing._scan.tolist() == [65_535, 0]
@@ -245,7 +242,7 @@ def test_there_is_room_for_every_array_of_a_point(
     many = replace(file("a", block(1, 1)), n_most=1000)
     # x, y, z, intensity, row and column of 4 bytes, three of colour, two of the scan: what is asked
     # for is more than that, and not twice.
-    growing = CloudAssembly(context(tmp_path), [many], 1.0)
+    growing = CloudAssembly(context(tmp_path), [many], metres())
     growing._store_scan(1, slice(0, 1))
     n_bytes = sum(path.stat().st_size for path in (tmp_path / "allocated").iterdir())
     assert n_bytes == 1000 * (6 * 4 + 3 + 2)
@@ -254,10 +251,10 @@ def test_there_is_room_for_every_array_of_a_point(
         folder = tmp_path / f"{free}"
         folder.mkdir()
         if is_enough:
-            CloudAssembly(context(folder), [many], 1.0)
+            CloudAssembly(context(folder), [many], metres())
         else:
             with pytest.raises(StoreError, match="1000 points need"):
-                CloudAssembly(context(folder), [many], 1.0)
+                CloudAssembly(context(folder), [many], metres())
             assert list(folder.iterdir()) == []
 
 

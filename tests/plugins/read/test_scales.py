@@ -5,46 +5,64 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from orthoflow_plugins.read import scales
-from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scale, normalise
+from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scales, normalise
 
-STATED = "limits that the files state"
-SEEN = "range of the data"
+Range = tuple[float, float]
 
 
 @pytest.mark.parametrize(
     ("seen", "stated", "intensity_max", "scale"),
     [
-        ((2.0, 9.0), [(0.0, 10.0)], 50.0, (0.0, 50.0, "0 to intensity_max")),
-        ((2.0, 9.0), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
-        ((2.0, 9.0), [(1.0, 8.0), (3.0, 10.0)], None, (1.0, 10.0, STATED)),
+        ((2.0, 9.0), (0.0, 10.0), 50.0, (0.0, 50.0, "intensity_max")),
+        ((2.0, 9.0), (0.0, 10.0), None, (0.0, 10.0, "stated")),
         # A millionth beyond is rounding, more than that is another scale.
-        ((0.0, 10.000_005), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
-        ((-0.000_005, 10.0), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
-        ((0.0, 10.000_02), [(0.0, 10.0)], None, (0.0, 10.000_02, SEEN)),
-        ((-0.000_02, 10.0), [(0.0, 10.0)], None, (-0.000_02, 10.0, SEEN)),
-        ((100.0, 110.000_1), [(100.0, 110.0)], None, (100.0, 110.000_1, SEEN)),
-        ((2.0, 9.0), [(0.0, 10.0), None], None, (2.0, 9.0, SEEN)),
-        ((2.0, 9.0), [], None, (2.0, 9.0, SEEN)),
-        ((7.0, 7.0), [], None, (0.0, 7.0, "0 to the only value")),
-        ((-7.0, -7.0), [None], None, (-7.0, 0.0, "0 to the only value")),
+        ((0.0, 10.000_005), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((-0.000_005, 10.0), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((0.0, 10.000_02), (0.0, 10.0), None, (0.0, 10.000_02, "data")),
+        ((-0.000_02, 10.0), (0.0, 10.0), None, (-0.000_02, 10.0, "data")),
+        # Limits of which the data take less than a tenth are those of the sensor.
+        ((0.0, 0.99), (0.0, 10.0), None, (0.0, 0.99, "data")),
+        ((0.0, 1.01), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((2.0, 9.0), None, None, (2.0, 9.0, "data")),
+        ((7.0, 7.0), None, None, (0.0, 7.0, "data")),
+        ((-7.0, -7.0), None, None, (-7.0, 0.0, "data")),
     ],
 )
-def test_one_scale_serves_all_scans(
-    seen: tuple[float, float],
-    stated: list[tuple[float, float] | None],
-    intensity_max: float | None,
-    scale: tuple[float, float, str],
+def test_a_scan_has_the_users_scale_the_one_it_states_or_that_of_its_data(
+    seen: Range, stated: Range | None, intensity_max: float | None, scale: tuple[float, float, str]
 ) -> None:
-    found = choose_scale(seen, stated, intensity_max)
+    (found,) = choose_scales([seen], [stated], intensity_max)
+    assert found is not None
     assert (found.low, found.high, found.rule) == scale
+    assert found.stated == (stated if scale[2] == "data" else None)
 
 
-def test_intensities_go_from_nought_to_one_and_the_rest_is_clipped_and_counted() -> None:
-    scale = IntensityScale(low=10.0, high=30.0, rule="")
+def test_each_scan_is_scaled_by_its_own_limits_and_similar_ones_together() -> None:
+    ranges = [(0.1, 0.9), (7000.0, 60000.0), None, (0.0, 255.0), (5.0, 200.0), (-2048.0, 2047.0)]
+    stated = [(0.0, 1.0), (0.0, 65535.0), (0.0, 1.0), None, None, None]
+    scales = choose_scales(ranges, stated, None)
+    assert scales[2] is None
+    assert [(scale.low, scale.high) for scale in scales if scale is not None] == [
+        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0)),
+    ]
+
+
+def test_few_extreme_values_set_no_range() -> None:
+    values = np.linspace(300.0, 1800.0, 1000, dtype=np.float32)
+    values[::250] = 65535.0
+    values[1] = np.nan
+    low, high = scales.robust_range(values)  # type: ignore[misc]
+    assert (low, high) == pytest.approx((303.0, 1800.0), abs=2.0)
+    assert scales.robust_range(np.full(3, np.nan, dtype=np.float32)) is None
+    assert scales.robust_range(np.zeros(0, dtype=np.float32)) is None
+
+
+def test_intensities_go_from_nought_to_one_and_what_lies_beyond_is_clipped_and_counted() -> None:
+    scale = IntensityScale(low=10.0, high=30.0, rule="data")
     values = np.array([10.0, 20.0, 30.0, 5.0, 40.0, np.nan, np.inf, -np.inf])
     values = values.astype(np.float32)
-    assert normalise(values, scale) == 4
-    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    assert normalise(values, scale) == 2
+    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, np.nan, np.nan, np.nan])
     # A millionth beyond is not worth counting.
     near = np.array([30.0 + 1e-5, 10.0 - 1e-5], dtype=np.float64).astype(np.float32)
     assert normalise(near, scale) == 0
@@ -53,10 +71,10 @@ def test_intensities_go_from_nought_to_one_and_the_rest_is_clipped_and_counted()
 
 def test_long_arrays_are_scaled_to_their_end() -> None:
     values = np.full(150_000, 3.0, dtype=np.float32)
-    assert normalise(values, IntensityScale(low=1.0, high=2.0, rule="")) == 150_000
+    assert normalise(values, IntensityScale(low=1.0, high=2.0, rule="data")) == 150_000
     assert (values == 1.0).all()
     inside = np.full(150_000, 1.5, dtype=np.float32)
-    assert normalise(inside, IntensityScale(low=1.0, high=2.0, rule=""), may_exceed=False) == 0
+    assert normalise(inside, IntensityScale(low=1.0, high=2.0, rule="data")) == 0
     assert (inside == 0.5).all()
 
 
@@ -123,7 +141,24 @@ def test_whole_numbers_are_never_shares_of_one() -> None:
     assert stored(np.array([[0, 0, 256]], dtype=np.uint16)) == ([[0, 0, 1]], "16 bit")
 
 
-@pytest.mark.parametrize("limit", [1.0, 100.0, 255.0, 65535.0])
-def test_a_stated_limit_is_full_brightness(limit: float) -> None:
-    block = np.array([[0.0, 0.4 * limit, limit], [2.0 * limit, -limit, np.nan]], dtype=np.float64)
-    assert stored(block, limit=limit) == ([[0, 102, 255], [255, 0, 0]], "stated limit")
+@pytest.mark.parametrize(
+    ("largest", "limit", "expected", "scale"),
+    [
+        (1.0, 1.0, [0, 102, 255], "0..1"),
+        (255.0, 255.0, [0, 102, 255], "8 bit"),
+        (65535.0, 65535.0, [0, 102, 255], "16 bit"),
+        (1023.0, 1023.0, [0, 102, 255], "stated limit"),
+        # What does not fit its limit is read as what it is.
+        (255.0, 1.0, [0, 102, 255], "8 bit"),
+        (255.0, 65535.0, [0, 102, 255], "8 bit"),
+        (65535.0, 255.0, [0, 102, 255], "16 bit"),
+    ],
+)
+def test_a_stated_limit_is_full_brightness_where_data_fit_it(
+    largest: float, limit: float, expected: list[int], scale: str
+) -> None:
+    block = np.array([[0.0, 0.4 * largest, largest]])
+    assert stored(block, limit=limit) == ([expected], scale)
+    colours = ColourScale(np.zeros((1, 3), dtype=np.uint8), limit)
+    colours.add(block)
+    assert colours.misfit == (None if largest == limit else limit)

@@ -8,21 +8,20 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import assembly
-from orthoflow_plugins.read import scan as module
 from orthoflow_plugins.read.assembly import rounding_m
 from orthoflow_plugins.read.figures import polar_view_png
-from orthoflow_plugins.read.scales import ColourScale, choose_scale, normalise
+from orthoflow_plugins.read.scales import ColourScale
 from orthoflow_plugins.read.scan import ReadScan
 from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 from orthoflow.errors import CancelledStepError, InputError, StoreError
 from orthoflow.files.images import decode_image
-from orthoflow.files.points.copc import Wish
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import StepContext
 from tests import scan_files
@@ -65,6 +64,12 @@ def points() -> NDArray[np.float64]:
     return np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3)), 4)
 
 
+def scan_of(cloud: PointCloud) -> dict[str, Any]:
+    """What is kept of the only scan of a cloud."""
+    (scan,) = cloud.source["scans"]  # type: ignore[misc]
+    return scan  # type: ignore[return-value]
+
+
 def write_text(path: Path, table: Iterable[Iterable[float]], header: str = "") -> Path:
     rows = [" ".join(repr(float(value)) for value in row) for row in table]
     path.write_text("\n".join([*([header] if header else []), *rows, ""]))
@@ -96,7 +101,7 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     np.testing.assert_allclose(cloud.points_world(), world_m, atol=1e-5)
     assert (cloud.origin == np.floor(cloud.origin)).all()
     assert np.abs(cloud.origin - shift).max() < 5.0
-    assert cloud.source["unit"] == unit
+    assert scan_of(cloud)["unit"] == unit
     assert cloud.x.dtype == np.float32
     sides_m = np.ptp(world_m, axis=0)
     assert [read.metrics[f"extent_{axis}_m"] for axis in "xyz"] == pytest.approx(sides_m, abs=1e-5)
@@ -120,9 +125,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(
     assert len(kept) in (inside.sum(), inside.sum() - 1)
     assert (kept >= corner - 4.00001).all()
     assert (kept <= corner + 1e-5).all()
-    (file,) = cloud.source["files"]  # type: ignore[misc]
-    assert file["outside"] == 400 - len(kept)  # type: ignore[index,call-overload]
-    assert cloud.source["counts"]["dropped"] == 400 - len(kept)  # type: ignore[index,call-overload]
+    assert scan_of(cloud)["left_out"] == {"outside_box": 400 - len(kept)}
 
 
 def test_points_on_the_faces_of_a_box_are_kept(tmp_path: Path, read: Reader) -> None:
@@ -134,14 +137,14 @@ def test_points_on_the_faces_of_a_box_are_kept(tmp_path: Path, read: Reader) -> 
 
 
 def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Reader) -> None:
-    steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
+    steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) + 1.0
     path = write_text(tmp_path / "a.xyz", steps)
     with pytest.raises(InputError) as caught:
         read(path, box=[[10, 10, 10], [11, 11, 11]])
-    beside = write_text(tmp_path / "b.xyz", steps + 8.0)
+    beside = write_text(tmp_path / "b.xyz", steps + 7.0)
     # Of several files, one may lie beside the box as a whole.
     assert len(read(path, beside, box=[[10, 10, 10], [11, 11, 11]])) == 8
-    assert "125 lie outside the box: the points reach from (0.00, 0.00, 0.00) to (4.00, " in str(
+    assert "125 lie outside the box: the points reach from (1.00, 1.00, 1.00) to (5.00, " in str(
         caught.value
     )
 
@@ -161,12 +164,10 @@ def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
     box = [[0.0, 0.0, 0.0], [3.9 * 0.3048] * 3]
     cloud = read(path, unit="ft", box=box)
     assert len(cloud) == 400 + np.count_nonzero((coarse <= 3.9).all(axis=1))
-    (file,) = cloud.source["files"]  # type: ignore[misc]
-    assert file["read"] == 800  # type: ignore[index,call-overload]
-    assert file["header"]["octree"] == "2 of 3 nodes, levels 0 to 1 of 0 to 1"  # type: ignore[index,call-overload]
-    assert "gsd_m only speaks" not in read.warnings
+    assert scan_of(cloud)["n_read"] == 800
+    assert "gsd_m only concerns" not in read.warnings
     read(scan_files.write_las(tmp_path / "b.laz", points), gsd_m=0.1)
-    assert "gsd_m only speaks of COPC files" in read.warnings
+    assert "gsd_m only concerns COPC files" in read.warnings
 
 
 def test_a_box_without_an_inside_is_refused() -> None:
@@ -181,12 +182,11 @@ def test_classes_choose_points_of_las_files(
     path = scan_files.write_las(tmp_path / "a.laz", points, classes=classes)
     cloud = read(path, classes=[0, 2])
     np.testing.assert_allclose(cloud.points_world(), points[classes != 1], atol=6e-5)
-    (file,) = cloud.source["files"]  # type: ignore[misc]
-    assert file["unwanted"] == 133  # type: ignore[index,call-overload]
+    assert scan_of(cloud)["left_out"] == {"other_class": 133}
     with pytest.raises(InputError, match="400 are of other classes than those asked for; change"):
         read(path, classes=[9])
     read(write_text(tmp_path / "a.xyz", points), classes=[2])
-    assert "classes only speaks of LAS and LAZ files" in read.warnings
+    assert "classes only concerns LAS and LAZ files" in read.warnings
 
 
 def test_a_shift_by_whole_metres_changes_the_origin_only(
@@ -204,7 +204,7 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
     world = points + np.array([634512.347, 486215.781, 112.193])
-    world[:3] = 0.0
+    world[:3] = 1.0
     cloud = read(write_text(tmp_path / "a.xyz", world))
     np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
     assert "coordinates are kept to 62.50 mm only" in read.warnings
@@ -214,7 +214,7 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
 def test_beyond_five_hundred_metres_offsets_are_coarser_than_half_a_tenth_of_a_millimetre(
     tmp_path: Path, read: Reader, wide_m: float, is_coarse: bool
 ) -> None:
-    steps = np.linspace(0.0, wide_m, 21)[:, None] * [1.0, 0.0, 0.0]
+    steps = np.linspace(0.0, wide_m, 21)[:, None] * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.0]
     read(write_text(tmp_path / "a.xyz", steps))
     said = f"reach {wide_m / 2:.0f} m from the origin of the cloud, where coordinates are kept to "
     assert (f"{said}0.06 mm only" in read.warnings) == is_coarse
@@ -246,7 +246,7 @@ def test_points_that_are_not_finite_are_dropped_and_counted(
     np.testing.assert_allclose(cloud.intensity, kept / 399.0, atol=1e-6)
     assert read.metrics["n_not_finite"] == 4
     assert read.metrics["n_points"] == 396
-    assert cloud.source["counts"] == {"read": 400, "kept": 396, "dropped": 4}
+    assert scan_of(cloud)["left_out"] == {"not_finite": 3, "too_far": 1}
     assert "1 points lie farther than 1e+09 m" in read.warnings
 
 
@@ -259,8 +259,8 @@ def test_finite_points_beyond_any_survey_are_named(
     cloud = read(write_text(tmp_path / "a.xyz", points))
     assert len(cloud) == 397
     assert (
-        "a.xyz: 2 points lie farther than 1e+09 m from the origin, the first at 0.5 1e+30 -2, and "
-        "were left out"
+        "a.xyz, scan 0: 2 points lie farther than 1e+09 m from the origin, the first at 0.5 1e+30 "
+        "-2, and were left out"
     ) in read.warnings
 
 
@@ -292,9 +292,9 @@ def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
     read(write_text(tmp_path / "a.xyz", points))
-    assert "is unit" not in read.warnings
+    assert "is that right?" not in read.warnings
     read(write_text(tmp_path / "b.xyz", points), unit="mm")
-    assert "m only: is unit of read.scan right?" in read.warnings
+    assert "m (no file states a unit): is that right?" in read.warnings
 
 
 def test_rounding_is_told_in_metres_whatever_the_unit(
@@ -331,8 +331,9 @@ def test_several_files_become_one_cloud(
         cloud.points_world()[400:800], points + np.array([10.0, 0, 0]), atol=1e-6
     )
     np.testing.assert_array_equal(cloud.stations, [[10.0, 0, 0], [20.0, 0, 0]])
-    assert "only 2 of 3 scans say where the scanner stood" in read.warnings
-    assert [item["name"] for item in cloud.source["files"]] == ["a.xyz", "b.e57"]  # type: ignore[union-attr, call-overload, index]
+    assert "only 2 of 3 scans state where the scanner stood" in read.warnings
+    scans = [(item["file"], item["scan"]) for item in cloud.source["scans"]]  # type: ignore[union-attr, call-overload, index]
+    assert scans == [("a.xyz", 0), ("b.e57", 0), ("b.e57", 1)]
 
 
 def test_stations_belong_to_scans_in_their_order(
@@ -356,15 +357,17 @@ def test_stations_belong_to_scans_in_their_order(
     assert read.metrics["n_stations"] == 2
 
 
-def test_fields_that_only_some_files_have_are_left_out_with_a_word(
+def test_fields_that_only_some_files_have_are_kept_with_a_word(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
     first = write_text(tmp_path / "a.xyz", points)
     second = write_text(tmp_path / "b.xyz", np.column_stack([points, np.arange(400)]))
     cloud = read(first, second)
-    assert cloud.intensity is None
-    assert "a.xyz has no intensity, the other files have" in read.warnings
-    assert "has no colours" not in read.warnings
+    assert cloud.intensity is not None
+    assert np.isnan(cloud.intensity[:400]).all()
+    np.testing.assert_allclose(cloud.intensity[400:], np.arange(400) / 399, atol=1e-6)
+    assert "a.xyz, scan 0 has no intensity: its 400 points have a position only" in read.warnings
+    assert "has no colour" not in read.warnings
 
 
 # Stations
@@ -436,36 +439,6 @@ def test_ptx_scanner_positions_are_stations(
 # Intensity
 
 
-@pytest.mark.parametrize(
-    ("seen", "stated", "intensity_max", "expected"),
-    [
-        ((0.4, 0.7), [(0.0, 1.0)], None, (0.0, 1.0)),
-        ((0.4, 0.7), [(0.0, 1.0), (0.5, 2.0)], None, (0.0, 2.0)),
-        ((0.4, 1.7), [(0.0, 1.0)], None, (0.4, 1.7)),
-        ((28.0, 44114.0), [None], None, (28.0, 44114.0)),
-        ((28.0, 44114.0), [(0.0, 50000.0), None], None, (28.0, 44114.0)),
-        ((28.0, 44114.0), [(0.0, 50000.0)], 65535.0, (0.0, 65535.0)),
-        ((5.0, 5.0), [None], None, (0.0, 5.0)),
-        ((-5.0, -5.0), [None], None, (-5.0, 0.0)),
-    ],
-)
-def test_the_intensity_scale_is_the_users_the_files_or_that_of_the_data(
-    seen: tuple[float, float],
-    stated: list[tuple[float, float] | None],
-    intensity_max: float | None,
-    expected: tuple[float, float],
-) -> None:
-    scale = choose_scale(seen, stated, intensity_max)
-    assert (scale.low, scale.high) == expected
-
-
-def test_normalising_is_linear_and_counts_what_it_clips() -> None:
-    values = np.array([0.0, 25.0, 100.0, 150.0, np.nan, -1.0], np.float32)
-    n_clipped = normalise(values, choose_scale((0.0, 150.0), [None], 100.0))
-    np.testing.assert_allclose(values, [0.0, 0.25, 1.0, 1.0, 0.0, 0.0], atol=1e-7)
-    assert n_clipped == 2
-
-
 def test_limits_in_an_e57_header_set_the_scale(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -473,7 +446,7 @@ def test_limits_in_an_e57_header_set_the_scale(
     scan = {"fields": fields, "intensity_limits": (0.0, 400.0)}
     cloud = read(scan_files.write_e57(tmp_path / "a.e57", [scan]))
     np.testing.assert_allclose(cloud.intensity, np.linspace(0.25, 0.75, 400), atol=1e-6)
-    assert cloud.source["intensity"]["rule"] == "limits that the files state"  # type: ignore[index, call-overload]
+    assert scan_of(cloud)["intensity"] == {"low": 0.0, "high": 400.0, "rule": "stated"}
 
 
 def test_the_user_can_set_full_intensity(
@@ -482,7 +455,7 @@ def test_the_user_can_set_full_intensity(
     table = np.column_stack([points, np.arange(400)])
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
     np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
-    assert "199 intensities lie beyond 0..200 (intensity_max) and were clipped" in read.warnings
+    assert "199 intensities lie beyond 0 to 200 (intensity_max) and were clipped" in read.warnings
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=399.0)
     np.testing.assert_allclose(cloud.intensity, np.arange(400) / 399, atol=1e-6)
     assert "were clipped" not in read.warnings
@@ -646,11 +619,11 @@ def test_a_picture_from_above_is_drawn(
             lambda folder: scan_files.write_ptx(
                 folder / "a.ptx", [(np.zeros((6, 3)), 2, np.eye(4))]
             ),
-            "a.ptx holds no usable points: of 6, 6 are marked as invalid, 0 as deleted and 0",
+            "a.ptx holds no usable points: of 6, left out are 6 no return",
         ),
         (
             lambda folder: write_text(folder / "a.xyz", [], header="x y z"),
-            "a.xyz has no line that begins with three numbers",
+            "a.xyz has no line with three numbers",
         ),
         (
             lambda folder: scan_files.write_las(folder / "a.laz", np.empty((0, 3))),
@@ -658,7 +631,7 @@ def test_a_picture_from_above_is_drawn(
         ),
         (
             lambda folder: write_text(folder / "a.xyz", [[1.0, 2.0, np.nan]]),
-            "a.xyz holds no usable points: of 1, 0 are marked as invalid, 0 as deleted and 1",
+            "a.xyz holds no usable points: of 1, left out are 1 not finite",
         ),
     ],
     ids=["no-returns", "blank", "empty", "not-finite"],
@@ -679,33 +652,11 @@ def test_columns_without_a_text_file_are_said_to_do_nothing(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
     read(scan_files.write_las(tmp_path / "a.laz", points), columns="x y z")
-    assert "columns only speaks of text files" in read.warnings
+    assert "columns only concerns text files" in read.warnings
     text = write_text(tmp_path / "a.xyz", points)
     for columns in ("x y z", None):
         read(text, columns=columns)
-        assert "columns only speaks" not in read.warnings
-
-
-@pytest.mark.parametrize(("unit", "unit_m"), [("m", 1.0), ("mm", 0.001)])
-def test_readers_are_told_box_and_spacing_in_the_unit_of_the_file(
-    read: Reader, unit: str, unit_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class AskedError(Exception):
-        pass
-
-    def asked(*_: object, wish: Wish, **__: object) -> None:
-        raise AskedError(wish)
-
-    monkeypatch.setattr(module, "open_scan", asked)
-    box = [[0.5, 0.0, -2.0], [1.0, 3.0, 4.0]]
-    with pytest.raises(AskedError) as caught:
-        read(Path("a.laz"), unit=unit, gsd_m=0.02, box=box)
-    (wish,) = caught.value.args
-    np.testing.assert_allclose(wish.box, np.array(box) / unit_m)
-    assert wish.spacing == pytest.approx(0.02 / unit_m)
-    with pytest.raises(AskedError) as caught:
-        read(Path("a.laz"), unit=unit)
-    assert caught.value.args == (Wish(box=None, spacing=None),)
+        assert "columns only concerns" not in read.warnings
 
 
 def test_too_little_scratch_space_is_said_before_anything_is_written(
