@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from orthoflow.records.runs import open_run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys
 from tests.killed_runs import Answer, RunServer, run_server

@@ -57,7 +57,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.comparison import compare_runs
-    from orthoflow.records.runs import open_run
+    from orthoflow.records.unfinished import open_run
     from orthoflow.records.verification import broken_seal
 
     runs = (open_run(first), open_run(second))

@@ -196,7 +196,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     """Write the results of a run for other programs; 3 where the record's seal does not hold."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
-    from orthoflow.records.runs import open_run
+    from orthoflow.records.unfinished import open_run
     from orthoflow.records.verification import broken_seal
 
     chosen = Choices(**choices)

@@ -78,7 +78,7 @@ def replay(
     from orthoflow.engine.store import Store
     from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
-    from orthoflow.records.runs import open_run
+    from orthoflow.records.unfinished import open_run
 
     options = RunOptions(**choices)
     original = open_run(run)

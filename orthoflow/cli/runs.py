@@ -140,7 +140,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     from orthoflow.engine.run_folder import RECORD_FILE
     from orthoflow.errors import ArgumentError
     from orthoflow.records.joined import join_runs, joined_csv
-    from orthoflow.records.runs import open_run
+    from orthoflow.records.unfinished import open_run
     from orthoflow.report.browsing import run_folders
 
     if not table.absolute().parent.is_dir():

@@ -60,7 +60,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     the record does not hold; of large arrays, which are not read, `orthoflow verify` says so.
     """
     from orthoflow.engine.run_folder import RECORD_FILE
-    from orthoflow.records.runs import open_run
+    from orthoflow.records.unfinished import open_run
     from orthoflow.records.verification import broken_seal
 
     if run.is_dir() and not (run / RECORD_FILE).exists():

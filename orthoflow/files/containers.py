@@ -7,6 +7,7 @@ which other decoders fill with grey or noise.
 from __future__ import annotations
 
 import io
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
 HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
+# 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
+MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
 _TIFF_MAGICS: Final = {b"II*\0": "TIFF", b"MM\0*": "TIFF", b"II+\0": "BigTIFF", b"MM\0+": "BigTIFF"}
@@ -58,6 +61,7 @@ _MAX_PAGES: Final = 200
 # What libjpeg says of data that end, or whose codes make no sense; the rest of the photo is noise.
 _LOST_DATA: Final = ("premature end", "bad huffman code", "invalid component", "corrupt")
 _EXTRA_BYTES: Final = "extraneous bytes"
+_ANY_SIZE: Final = threading.Lock()
 
 
 def photo_format(encoded: bytes) -> str | None:
@@ -208,10 +212,15 @@ def opened(encoded: bytes, *, is_upright: bool = True) -> Iterator[Image | None]
         _register_heic()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            image = Image.open(io.BytesIO(as_decoded(encoded, is_upright=is_upright)))
-        except Exception:  # noqa: BLE001 - Pillow's plugins raise anything on damaged files
-            image = None
+        with _ANY_SIZE:
+            # Pillow refuses less than `MOST_PIXELS`, which all who decode look at.
+            most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                image = Image.open(io.BytesIO(as_decoded(encoded, is_upright=is_upright)))
+            except Exception:  # noqa: BLE001 - Pillow's plugins raise anything on damaged files
+                image = None
+            finally:
+                Image.MAX_IMAGE_PIXELS = most
         try:
             yield image
         finally:
@@ -290,6 +299,10 @@ def damage(encoded: bytes) -> tuple[str, bool]:
     Returns:
         What was found, empty for a sound file; True where a part of the photo is missing or noise.
     """
+    size = stated_size(encoded)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        # It is not decoded, here or later.
+        return "", False
     if photo_format(encoded) == "JPEG":
         import simplejpeg
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, ProductError
 from orthoflow.files.containers import (
     HOW_TO_READ_HEIC,
+    MOST_PIXELS,
     READABLE,
     as_decoded,
     is_whole_png,
@@ -36,8 +37,6 @@ RAW_SUFFIXES: Final = frozenset(
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
-MOST_PIXELS: Final = 1 << 28
 # How far 8 bits lie apart that are cut off, or rounded.
 _ROUNDED_LEVELS: Final = 2
 # Larger images are averaged before they are shrunk, so many rows of the result at a time.

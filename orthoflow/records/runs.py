@@ -252,26 +252,6 @@ class Run:
         return self.folder / PRODUCTS_FOLDER
 
 
-def open_run(path: str | Path) -> Run:
-    """Open a run; one that goes on or was broken off as far as it is.
-
-    Args:
-        path: a run folder, or the `run.h5` in it.
-
-    Raises:
-        ArgumentError: nothing is there, or the folder holds no finished run.
-        RecordError: the record is damaged, no record at all, or of a newer format.
-    """
-    from orthoflow.records.unfinished import (  # noqa: PLC0415 - builds on this
-        has_outline,
-        open_unfinished,
-    )
-
-    if has_outline(Path(path)):
-        return open_unfinished(Path(path))
-    return read_run(find_record(path))
-
-
 def read_run(path: Path, *, later_name: str = "") -> Run:
     """Read a record file, whatever it is called.
 

@@ -41,7 +41,7 @@ from orthoflow.engine.run_folder import (
 )
 from orthoflow.errors import ArgumentError, StoreError
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run, read_run
+from orthoflow.records.runs import Run, find_record, read_run
 from orthoflow.records.verification import published_state
 
 if TYPE_CHECKING:
@@ -49,6 +49,21 @@ if TYPE_CHECKING:
     from orthoflow.engine.store import Store
 
 OUTLINE_FILE: Final = ".outline.json"
+
+
+def open_run(path: str | Path) -> Run:
+    """Open a run; one that goes on or was broken off as far as it is.
+
+    Args:
+        path: a run folder, or the `run.h5` in it.
+
+    Raises:
+        ArgumentError: nothing is there, or the folder holds no finished run.
+        RecordError: the record is damaged, no record at all, or of a newer format.
+    """
+    if has_outline(Path(path)):
+        return open_unfinished(Path(path))
+    return read_run(find_record(path))
 
 
 def write_outline(

@@ -19,7 +19,8 @@ from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.metrics import cell_metrics
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import words_of

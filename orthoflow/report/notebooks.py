@@ -30,7 +30,7 @@ from orthoflow.records.datasets import parts_of
 from orthoflow.records.joined import RunSet, join_runs
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.records.runs import open_run as open_plain_run
+from orthoflow.records.unfinished import open_run as open_plain_run
 from orthoflow.records.verification import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.moved import moved_first

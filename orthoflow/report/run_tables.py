@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import OrthoflowError
-from orthoflow.records.runs import REPORT_FILE, open_run
+from orthoflow.records.runs import REPORT_FILE
+from orthoflow.records.unfinished import open_run
 from orthoflow.report.browsing import RunSummary, differing_facts, key_metrics, told_apart
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS

@@ -13,7 +13,7 @@ from orthoflow_provenance.verify import verify_record
 
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, RecordError
-from orthoflow.records.runs import open_run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.writing import write_embedded
 from tests.studios import Studio, open_copy, open_finished_studio
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.store import Store
-from orthoflow.records.runs import open_run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
 from tests.killed_runs import Answer, RunServer, run_server
 from tests.long_loops import IS_LONG

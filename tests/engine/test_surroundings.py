@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.runs import open_run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command

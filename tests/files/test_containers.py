@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -27,6 +29,7 @@ from orthoflow.files.containers import (
 from orthoflow.files.exif import read_exif
 from orthoflow.files.images import decode_image, encode_jpeg
 from tests import photo_files as made
+from tests.optional import skip_unless
 
 PICTURE = made.picture(128, 96)
 
@@ -231,8 +234,9 @@ def test_a_flipped_bit_in_a_png_is_found() -> None:
     assert damage(bytes(encoded))[1]
 
 
+@skip_unless(find_spec("pillow_heif") is not None, "program", "pillow_heif")
 def test_heic_is_read_by_its_plugin_or_named_with_the_way_out(tmp_path: Path) -> None:
-    heif = pytest.importorskip("pillow_heif")
+    heif = import_module("pillow_heif")
     stream = io.BytesIO()
     heif.from_pillow(Image.fromarray(PHOTO)).save(stream, quality=95)
     encoded = stream.getvalue()

@@ -285,13 +285,13 @@ def _folder_files(folder: Path) -> None:
     (folder / "calibration.yaml").write_text(
         'cameras: {"*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}}\n'
     )
-    (folder / "scan.xyz").write_text("1.5 2.5 3.5\n4.5 5.5 6.5\n")
+    (folder / "scan.xyz").write_text("1.5 2.5 3.5 0.5\n4.5 5.5 6.5 0.25\n")
     photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture())})
 
 
 def _draft(path: Path) -> object:
     """Draft for the file, with a scan and a name from nowhere beside it."""
-    path.with_name("room.xyz").write_text("1.5 2.5 3.5\n4.5 5.5 6.5\n")
+    path.with_name("room.xyz").write_text("1.5 2.5 3.5 0.5\n4.5 5.5 6.5 0.25\n")
     return draft_workflow(recognised([path.parent]), path.with_name("workflow.yaml"), None).text
 
 

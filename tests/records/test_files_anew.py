@@ -10,7 +10,8 @@ import pytest
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.products import Orthoimages
 from orthoflow.records.files_anew import with_files
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import published_state
 from tests.drawing_runs import WALL, write_drawing_run
 

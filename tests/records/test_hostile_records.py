@@ -364,7 +364,7 @@ def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
     with h5py.File(folder / "run" / "run.h5", "r+") as file:
         file["cells/paint"].attrs["method"] = np.bytes_("other")
     # Nothing there reads the preimage, so let something fail in its place.
-    monkeypatch.setattr("orthoflow.records.runs.open_run", lambda _: {}["missing"])
+    monkeypatch.setattr("orthoflow.records.unfinished.open_run", lambda _: {}["missing"])
     runs = (finished.folder / "first", folder / "run") if command[0] == "compare" else ("run",)
     done = finished(command[0], *runs)
     assert done.exit_code == 3, done.output

@@ -21,7 +21,7 @@ from prov.model import (
 )
 
 from orthoflow.records.prov import prov_document
-from orthoflow.records.runs import open_run
+from orthoflow.records.unfinished import open_run
 from tests.report_runs import cell as recorded_cell
 from tests.report_runs import record
 from tests.studios import Studio, open_finished_studio

@@ -30,7 +30,8 @@ from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
 from tests import samples
 from tests.report_runs import environment

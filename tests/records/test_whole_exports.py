@@ -12,8 +12,9 @@ import pytest
 from orthoflow.records.crates import NO_LICENSE, write_crate
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.published import _by_number, publish_products, published_files
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
 from orthoflow.records.spreadsheets import write_csv_tables
+from orthoflow.records.unfinished import open_run
 from tests.provenance_records import sample_record, write_sample
 
 CLOUD, WALLS, ENVIRONMENT = "sha256:" + "c" * 64, "sha256:" + "d" * 64, "sha256:" + "e" * 64

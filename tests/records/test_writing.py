@@ -25,7 +25,8 @@ from orthoflow.engine.scheduling import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
 from orthoflow.records.writing import begin_run, executed_and_written, show_unfinished, write_run
 from orthoflow.workflow.document import load_workflow

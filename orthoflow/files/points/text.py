@@ -46,7 +46,9 @@ SAMPLE_LINES: Final = 1000
 _MOST_DIGITS: Final = 20
 _COMMENT: Final = "#/ \t;!%"
 # `Points:0`, `P_x`: what no sentence holds, but the names of columns may be.
-_NO_WORD: Final = re.compile(r"[A-Za-z]+[:_.\[(]?[0-2xyzXYZ][\])]?|//?X|[PL][xyz]|[A-Za-z]+Time")
+_NO_WORD: Final = re.compile(
+    r"[A-Za-z]+(?:[:_.\[(]?[0-2]|[:_.\[(][xyzXYZ])[\])]?|//?X|[PL][xyz]|[A-Za-z]+Time"
+)
 
 
 @dataclass(frozen=True, kw_only=True)

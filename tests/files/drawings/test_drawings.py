@@ -20,7 +20,8 @@ from PIL import Image
 from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
 from orthoflow.errors import RecordError
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.records.wall_results import room_results
 from tests.drawing_runs import (
     GAP_M,
