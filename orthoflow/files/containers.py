@@ -323,11 +323,13 @@ def damage(encoded: bytes) -> tuple[str, bool]:
             pass
         else:
             return "", False
+    found = ""
     with opened(encoded) as image:
         if image is None:
-            return "its header cannot be read", True
-        try:
-            image.load()
-        except Exception as error:  # noqa: BLE001 - Pillow's plugins raise anything
-            return str(error) or type(error).__name__, True
-    return "", False
+            found = "its header cannot be read"
+        else:
+            try:
+                image.load()
+            except Exception as error:  # noqa: BLE001 - Pillow's plugins raise anything
+                found = str(error) or type(error).__name__
+    return found, bool(found)
