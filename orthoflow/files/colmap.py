@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError, InputError, PluginError
+from orthoflow.files.containers import MOST_PIXELS
 from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
@@ -32,7 +33,6 @@ from orthoflow.files.given_cameras import (
     photo_path,
     rotation_of,
 )
-from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.panoramas import face_lens
 from orthoflow.files.regular_files import open_file, reading
 from orthoflow.files.sidecars import write_text

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import MOST_PIXELS, decode_levels, encode_png
+from orthoflow.files.containers import MOST_PIXELS
+from orthoflow.files.images import decode_levels, encode_png
 from orthoflow.files.panoramas import FACES, MOST_PX, PANORAMA_FROM_CAMERA, face_name, face_rays
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.opencv_border import HALF_PIXEL

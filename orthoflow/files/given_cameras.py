@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.containers import MOST_PIXELS
 from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
-from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_name
 from orthoflow.files.regular_files import open_text, reading, text_of_file

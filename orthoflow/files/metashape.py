@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.containers import MOST_PIXELS
 from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
@@ -37,7 +38,6 @@ from orthoflow.files.given_cameras import (
     rotation_of,
     text_of,
 )
-from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.panoramas import face_lens
 from orthoflow.products import Intrinsics
 
