@@ -31,6 +31,14 @@ from orthoflow_plugins.plane.support import INNER_SHARE, CellSums, SurfaceRaster
 
 # Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
 _FITTED_MOST: Final = 12_000_000
+# A plane whose cells cover less of its rectangle is a frame or scattered parts.
+_FILLED_SHARE: Final = 0.5
+# Rectangles that one plane is cut into at most: a frame has four sides.
+_RECTANGLES_MOST: Final = 8
+# Cells along a side that cuts are looked for between.
+_CUT_CELLS: Final = 64
+# Claims are bytes.
+_SLABS_MOST: Final = 127
 
 
 def fit_to_all(found: list[FoundPlane], cloud: PreparedCloud, rules: Rules) -> list[FoundPlane]:
@@ -95,11 +103,16 @@ def _verified(
 
 
 def label(found: list[FoundPlane], cloud: PreparedCloud, find_m: float) -> None:
-    """Claim all points for the nearest plane in whose rectangle they lie."""
-    slabs, bounds = _slabs(found, find_m)
+    """Claim all points for the nearest plane in whose rectangles they lie."""
+    slabs, bounds, plane_of_slab = _slabs(found, find_m)
+    # The last entry is for a claim of -1.
+    names = np.append(plane_of_slab, -1).astype(np.int8)
 
     def give(_part: int, piece: slice) -> None:
-        assign_points(piece_of(cloud.points, piece), cloud.claims[piece], slabs, bounds)
+        claims = cloud.claims[piece]
+        assign_points(piece_of(cloud.points, piece), claims, slabs, bounds)
+        if len(slabs) > len(found):
+            claims[:] = names[claims]
 
     each_part(len(cloud.claims), cloud.parts, give)
 
@@ -158,7 +171,8 @@ def _measured(
     # Flat tables over the cells of all rasters, of each part its own.
     counts = np.zeros((cloud.parts, int(starts[-1]), 3), dtype=np.int32)
     sums = np.zeros((cloud.parts, int(starts[-1]), 2), dtype=np.int64)
-    slabs, bounds = _slabs(found, rules.find_m)
+    slabs, bounds, plane_of_slab = _slabs(found, rules.find_m)
+    rows = rows[plane_of_slab]
 
     def add(part: int, piece: slice) -> None:
         points, drawn = piece_of(cloud.points, piece), (every, piece.start // BLOCK_POINTS)
@@ -177,7 +191,103 @@ def _measured(
 
 def _slabs(
     found: list[FoundPlane], find_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slabs (k, 12) of planes and their bounds (k, 5), as the compiled passes take them."""
-    slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)
-    return slabs, np.array([item.label_bounds(find_m) for item in found]).reshape(-1, 5)
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return slabs (k, 12), their bounds (k, 5), and (k,) the plane that each slab is of.
+
+    A plane has one slab over its rectangle. Where its cells cover little of that, it has several
+    that do: a frame must not compete for the points of the wall that it surrounds.
+    """
+    slabs: list[NDArray[np.float64]] = []
+    bounds: list[NDArray[np.float64]] = []
+    planes: list[int] = []
+    n_spare = _SLABS_MOST - len(found)
+    for index, item in enumerate(found):
+        cells, every = _coarser(item.support.cells)
+        rectangles = _rectangles(cells, min(_RECTANGLES_MOST, n_spare + 1))
+        n_spare -= len(rectangles) - 1
+        if len(rectangles) == 1:
+            own = item.label_bounds(find_m)[None]
+        else:
+            low_m = item.raster.low_m[[1, 1, 0, 0]]
+            rows_columns_m = low_m + every * item.raster.cell_m * np.array(rectangles)
+            grown = rows_columns_m[:, [2, 3, 0, 1]] + find_m * np.array([-1.0, 1.0, -1.0, 1.0])
+            own = np.column_stack([np.full(len(grown), find_m), grown])
+        slabs.extend([item.raster.slab()] * len(own))
+        bounds.extend(own)
+        planes.extend([index] * len(own))
+    return (
+        np.array(slabs).reshape(-1, 12),
+        np.array(bounds).reshape(-1, 5),
+        np.array(planes, dtype=np.int64),
+    )
+
+
+def _coarser(cells: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int]:
+    """Join cells (rows, columns) until `_CUT_CELLS` are left along a side; and how many are one."""
+    every = max(1, math.ceil(max(cells.shape) / _CUT_CELLS))
+    rows, columns = (math.ceil(side / every) for side in cells.shape)
+    padded = np.zeros((rows * every, columns * every), dtype=bool)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    joined = padded.reshape(rows, every, columns, every).any(axis=(1, 3))
+    return np.asarray(joined, dtype=np.bool_), every
+
+
+def _rectangles(cells: NDArray[np.bool_], n_most: int) -> list[tuple[int, int, int, int]]:
+    """Cover cells (rows, columns) by first row, end row, first column, end column of rectangles.
+
+    One rectangle where it is covered well; else the cut that leaves the smallest area is made
+    again and again, until `_FILLED_SHARE` is reached.
+    """
+    rectangles = [_tight(cells, (0, cells.shape[0], 0, cells.shape[1]))]
+    n_cells = np.count_nonzero(cells)
+    while len(rectangles) < n_most and n_cells < _FILLED_SHARE * sum(map(_area, rectangles)):
+        cuts = [_best_cut(cells, rectangle) for rectangle in rectangles]
+        saved = [
+            _area(rectangle) - sum(map(_area, cut))
+            for rectangle, cut in zip(rectangles, cuts, strict=True)
+        ]
+        best = int(np.argmax(saved))
+        if saved[best] <= 0:
+            break
+        rectangles[best : best + 1] = cuts[best]
+    return rectangles
+
+
+def _best_cut(
+    cells: NDArray[np.bool_], rectangle: tuple[int, int, int, int]
+) -> list[tuple[int, int, int, int]]:
+    """Cut a rectangle in two that cover its cells with the smallest area; itself if none does."""
+    top, bottom, left, right = rectangle
+    best = [rectangle]
+    for row in range(top + 1, bottom):
+        halves = [_tight(cells, (top, row, left, right)), _tight(cells, (row, bottom, left, right))]
+        best = min(best, halves, key=lambda cut: sum(map(_area, cut)))
+    for column in range(left + 1, right):
+        halves = [
+            _tight(cells, (top, bottom, left, column)),
+            _tight(cells, (top, bottom, column, right)),
+        ]
+        best = min(best, halves, key=lambda cut: sum(map(_area, cut)))
+    return best
+
+
+def _tight(
+    cells: NDArray[np.bool_], rectangle: tuple[int, int, int, int]
+) -> tuple[int, int, int, int]:
+    """Shrink a rectangle to the cells in it; without any it has no area."""
+    top, bottom, left, right = rectangle
+    within = cells[top:bottom, left:right]
+    rows, columns = np.flatnonzero(within.any(axis=1)), np.flatnonzero(within.any(axis=0))
+    if not len(rows):
+        return (top, top, left, left)
+    return (
+        top + int(rows[0]),
+        top + int(rows[-1]) + 1,
+        left + int(columns[0]),
+        left + int(columns[-1]) + 1,
+    )
+
+
+def _area(rectangle: tuple[int, int, int, int]) -> int:
+    top, bottom, left, right = rectangle
+    return (bottom - top) * (right - left)

@@ -128,3 +128,34 @@ def test_points_belong_to_the_nearest_plane_whose_rectangle_holds_them(
     labels = np.empty(len(points), dtype=np.int16)
     name_points(cloud, names, labels)
     np.testing.assert_array_equal(labels, names[cloud.claims])
+
+
+@pytest.mark.parametrize("gap_m", [0.0, 0.8], ids=["connected", "in two parts"])
+def test_a_frame_around_a_wall_leaves_the_wall_its_points(gap_m: float) -> None:
+    # Its rectangle covers the wall, and its plane runs through the wall at an angle of one degree.
+    walls = (Rectangle("wall", (0, 2, 0), (2, 0, 0), (0, 0, 1), 60_000),)
+    lean = 0.02
+    frame = (
+        Rectangle("side", (2.35, 1.98, 0), (0.15, 0, 0), (0, lean, 1), 6_000),
+        Rectangle(
+            "below", (-gap_m, 1.98 - 1.25 * lean, -1.25), (2.5, 0, 0), (0, 0.2 * lean, 0.2), 9_000
+        ),
+    )
+    on_wall, on_frame = sampled(walls, noise_m=0.004), sampled(frame, noise_m=0.002)
+    found = []
+    for points, normal in ((on_wall, (0.0, 1.0, 0.0)), (on_frame, (0.0, 1.0, -lean))):
+        alone = prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.01, parts=2)
+        unit = np.array(normal) / np.linalg.norm(normal)
+        offset_m = float(np.median(points @ unit))
+        rough = Candidate(plane=Plane(normal=unit, offset_m=offset_m), family="wall", votes=1.0)
+        item = verify(rough, Unassigned.of(alone), RULES)
+        assert item is not None
+        found.append(item)
+    both = np.concatenate([on_wall, on_frame])
+    cloud = prepare(cloud_of(both), np.eye(3), cell_m=0.5, least_share=0.01, parts=2)
+    fitted = fit_to_all(found, cloud, RULES)
+    for item, rectangle in zip(fitted, (*walls, frame[0]), strict=True):
+        assert_as_true(item, rectangle, within_m=0.0003)
+    label(fitted, cloud, RULES.find_m)
+    assert (cloud.claims[: len(on_wall)] == 0).mean() > 0.95
+    assert (cloud.claims[len(on_wall) :] == 1).mean() > 0.95
