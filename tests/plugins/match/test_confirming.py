@@ -136,18 +136,12 @@ def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() ->
 def sifted(
     folder: Path, places: dict[int, list[Placed]], structure: Literal["never", "confirmed", "alone"]
 ) -> tuple[Ties, list[str]]:
-    said: list[str] = []
-    ctx = StepContext(
-        rng=np.random.default_rng(1),
-        cores=2,
-        scratch=folder,
-        listen=lambda event: said.append(event.text) if event.kind == "warning" else None,
-    )
+    ctx = StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
     inputs = MatchSift.In(photos=Photos(photos=photos().photos[:2]), walls=WALLS)
     # Key points count for nothing here, so that a few will do.
     params = MatchSift.Params(structure=structure, n_features_max=500)
     ties = MatchSift().run(inputs, params, ctx).ties
-    return ties, said
+    return ties, ctx.warnings
 
 
 def test_a_photo_that_nobody_confirms_is_placed_only_for_who_asks_and_looks(
