@@ -165,7 +165,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Keep which tests lacked a program, for `--with-programs`."""
     config = terminalreporter.config
-    if config.getoption("--with-programs") or config.cache is None:
+    if config.getoption("--with-programs") or getattr(config, "cache", None) is None:
         return
     lacking = [
         report.nodeid

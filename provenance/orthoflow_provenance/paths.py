@@ -39,6 +39,8 @@ _BY_NUMBER: Final = os.open in os.supports_dir_fd and hasattr(os, "O_DIRECTORY")
 # On Windows bytes are bytes only where one asks.
 _SAFE: Final = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"))
 _FOLDER_FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _SAFE
+# The first folder is what the user named, and may be a link.
+_FIRST_FLAGS: Final = _FOLDER_FLAGS & ~getattr(os, "O_NOFOLLOW", 0)
 _FILE_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _SAFE
 _NEW_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE
 
@@ -256,7 +258,7 @@ def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> I
         yield _Place(_path_of_folder(folder, names, is_made=is_made), None)
         return
     path = folder.joinpath(*names)
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    descriptor = os.open(folder, _FIRST_FLAGS)
     try:
         for depth, name in enumerate(names):
             if is_made:

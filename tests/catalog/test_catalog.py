@@ -84,7 +84,7 @@ def test_a_strangers_distribution_is_found_by_its_metadata(
     assert entry.load().result_version == 3
     assert catalog.kinds["plane"].spec.outputs == {"planes": "planes", "labels": "labels"}
     assert catalog.product_class("planes") is Planes
-    assert catalog.publisher("cloud") is None
+    assert catalog.publisher("labels") is None
     assert catalog.broken == ()
 
 
