@@ -47,7 +47,8 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.records.runs import Run, open_run
+from orthoflow.records.runs import Run
+from orthoflow.records.unfinished import open_run
 from orthoflow.sdk import StepContext
 
 STRETCH = 24

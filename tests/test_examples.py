@@ -72,7 +72,7 @@ def test_a_kind_and_a_product_of_a_plugin_go_through_a_comparison_like_ours(crac
 @pytest.mark.usefixtures("cracks")
 def test_the_schema_has_a_plugins_parameters() -> None:
     schema = workflow_schema(discover_catalog())
-    params = schema["$defs"]["params.crack.dark-lines"]["properties"]
+    params = schema["$defs"]["crack.dark-lines"]["properties"]
     assert params["width_max_m"]["description"] == "Wider dark strips are no cracks."
     assert params["width_max_m"]["default"] == 0.02
 

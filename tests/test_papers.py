@@ -87,7 +87,7 @@ def test_every_metric_named_is_declared_by_a_method() -> None:
     methods = discover_catalog().methods
     ours = [name for name in methods if methods[name].distribution.name == "orthoflow-tls"]
     loaded = [discover_catalog().method(name).load() for name in ours]
-    known = {metric for method in loaded for metric in method.metrics}
+    known = {metric.name for method in loaded for metric in method.metric_specs()}
     assert len(METRICS) > 15
     assert set(METRICS) <= known
 
