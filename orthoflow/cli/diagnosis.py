@@ -95,8 +95,17 @@ LIBRARIES: Final = (
     Library(distribution="laspy", module="laspy", use="LAS and LAZ files: read.scan, --to laz"),
     Library(distribution="lazrs", module="lazrs", use="compressed LAZ files: read.scan, --to laz"),
     Library(distribution="pye57", module="pye57", use="E57 files: read.scan, --to e57"),
+    Library(
+        distribution="pyproj",
+        module="pyproj",
+        use="coordinate systems: read.scan, cameras of Metashape",
+    ),
     Library(distribution="pandas", module="pandas", use="text files of points: read.scan"),
     Library(distribution="pillow", module="PIL", use="EXIF data of photos: read.photos, ortho"),
+    Library(
+        distribution="simplejpeg", module="simplejpeg", use="damage in JPEG files: read.photos"
+    ),
+    Library(distribution="psutil", module="psutil", use="free memory: methods of raster"),
     Library(
         distribution="matplotlib",
         module="matplotlib",

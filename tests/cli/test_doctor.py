@@ -258,7 +258,13 @@ def test_plugins_are_counted_and_broken_ones_cost_their_methods(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     broken = SimpleNamespace(entry_point="odd", distribution="odd-methods", error="no such name")
-    catalog = SimpleNamespace(methods={"a.b": 1, "a.c": 2}, broken=(broken,))
+    entry = SimpleNamespace(problem="", looked_at=lambda: entry)
+    catalog = SimpleNamespace(
+        methods={"a.b": entry, "a.c": entry},
+        broken=(broken,),
+        products={},
+        kinds={},
+    )
     monkeypatch.setattr("orthoflow.catalog.discovery.discover_catalog", lambda: catalog)
     fine, odd = doctor._diagnose_plugins()
     assert (fine.name, fine.verdict, fine.found, fine.cost) == ("plugins", "ok", "2 methods", "")

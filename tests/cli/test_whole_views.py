@@ -42,7 +42,6 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
         "",
         *(f"{row[0]:31}  {row[1]:23}  {row[2]:28}  {row[3]}".rstrip() for row in rows),
         "ortho failed: no cell has enough points",
-        f"warning, {wall}: the scan has no intensity",
         "",
         f"{'step':31}  metric  value  unit",
         f"{wall}  rms_mm  1.25   mm",
@@ -71,15 +70,17 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
     with open_record(path) as opened:
         seal = opened.content_sha256
     words = "verified: 1 product (1 more by digest only), seal ok"
-    assert said("verify", path) == f"seal: sha256:{seal}\n{words}\n"
+    note = "not covered by the record: product-0.h5, product-1.h5"
+    assert said("verify", path) == f"note: {note}\nseal: sha256:{seal}\n{words}\n"
     assert json.loads(said("verify", path, "--json")) == {
         "record": str(path),
         "ok": True,
         "products": 1,
         "inputs": 0,
         "published": 0,
+        "pages": 0,
         "findings": [],
-        "notes": [],
+        "notes": [note],
         "seal": seal,
         "signed_with": "",
     }

@@ -33,6 +33,7 @@ def wall(width_m: float = 3.8, height_m: float = 2.3, *kinds: str, gsd_m: float 
         rasters={kind: Path(f"{kind}.tif") for kind in kinds or ("ortho", "depth")},
         accuracy=("RMSE 1 mm", "RMS 2 mm"),
         colours="colours untouched",
+        intensity_source="laser",
     )
 
 
