@@ -152,12 +152,7 @@ def test_the_lines_of_python(shell: Shell) -> None:
 
 # Commands between backticks about a finished RUN that it is no run for, and who runs them.
 NOT_OF_A_PLAIN_RUN: Final = {
-    "orthoflow export RUN --to colmap": "of photos: tests/road/test_photos.py",
     "orthoflow export RUN --split": "of datasets: tests/cli/test_datasets.py",
-    "orthoflow sign RUN --key FILE": "as SECURITY.md has it, above",
-    "orthoflow verify RUN --signer FILE.pub": "as SECURITY.md has it, above",
-    "orthoflow replay RUN": "as the tutorial has it, above",
-    "orthoflow export RUN --embed": "as docs/archiving.md has it, above",
 }
 
 

@@ -15,7 +15,7 @@ NOTEBOOK = ROOT / "examples" / "runs.ipynb"
 
 @pytest.mark.filterwarnings("default")  # of the notebook's own machinery
 def test_the_notebook_runs_and_shows_what_it_promises(
-    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import nbclient
     import nbformat
@@ -23,9 +23,6 @@ def test_the_notebook_runs_and_shows_what_it_promises(
     monkeypatch.setenv("PYTHONPATH", ":".join(CHECKOUT))
     # Charts are shown in the notebook unless a reader's surroundings say otherwise.
     monkeypatch.delenv("MPLBACKEND", raising=False)
-    # A reader's store has compiled kernels from the second run on.
-    (tmp_path / ".orthoflow").mkdir()
-    (tmp_path / ".orthoflow" / "numba").symlink_to(store / "numba")
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)
     # Half the points along each side: what is asserted needs no more.

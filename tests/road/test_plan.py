@@ -155,7 +155,7 @@ def test_the_sidecar_places_the_map(plan: Path) -> None:
     assert content["map_crs"] == "EPSG:2100"
     assert content["u_world"] == [1.0, 0.0, 0.0]
     assert content["v_world"] == [0.0, -1.0, 0.0]
-    assert content["raster"]["geotiff"].startswith("X = origin_world[0]")
+    assert content["raster"]["geotiff"].startswith("X = x_of_left_m + gsd_m * column (east)")
 
 
 def test_a_system_in_degrees_and_one_that_is_none_are_refused(shell: Shell) -> None:

@@ -209,9 +209,9 @@ def _add_texts(space: Modelspace, drawing: SectionDrawing) -> None:
     ).set_placement((left + 3 * step_m + drawing.mm(2.0), top))
     if drawing.up_label:
         foot = np.array([left + 3 * step_m + drawing.mm(28.0), top])
-        tip = [*foot, 0.0, drawing.mm(8.0)]
+        tip = foot + np.array([0.0, drawing.mm(8.0)])
         for side in (-1.0, 1.0):
-            barb = [*tip, side * drawing.mm(1.2), -drawing.mm(2.5)]
+            barb = tip + np.array([side * drawing.mm(1.2), -drawing.mm(2.5)])
             space.add_line(tuple(tip), tuple(barb), dxfattribs={"layer": "A-ANNO-SYMB"})
         space.add_line(tuple(foot), tuple(tip), dxfattribs={"layer": "A-ANNO-SYMB"})
         space.add_text(

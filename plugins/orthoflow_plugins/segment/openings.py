@@ -180,7 +180,7 @@ def _found_on(inputs: SegmentOpenings.In, place: int, rule: AreaRule, ctx: StepC
         if is_other:
             return _Found(wall=wall, openings=(), n_unbounded=0)
     grey = _grey(inputs.orthoimages, wall, relief, ctx)
-    spacing_m = replace(inputs.walls, walls=(wall,), buffers_m=()).spacing_m()
+    spacing_m = replace(inputs.walls, walls=(wall,), buffers_m=(), included=()).spacing_m()
     openings: list[Opening] = []
     n_unbounded = 0
     for area in open_areas(relief, rule):
