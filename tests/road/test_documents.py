@@ -169,5 +169,6 @@ def test_what_sentences_say_of_a_finished_run(finished: Path, shell: Shell) -> N
         if text not in NOT_OF_A_PLAIN_RUN:
             filled = [{"FORMAT": "csv"}.get(word, word) for word in words]
             store = ("--store", shell.store) if words[0] == "export" else ()
+            shutil.rmtree(shell.folder / "RUN" / "export", ignore_errors=True)
             ended = shell(*filled, *store)
             assert ended.code == 0, f"{text}: {ended.said}"
