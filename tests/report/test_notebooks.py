@@ -395,7 +395,7 @@ def test_what_is_wrong_with_a_workflow_is_raised(
         ({"scna": "a.e57"}, r"^datasets=: hall\.scna: there is no input scna \(did you mean scan"),
         ({"scan": ["a.e57", Path("b.e57")]}, r"^input scan@hall: there is no file a\.e57 in the w"),
         ({"scan": 1}, r"^datasets=: hall\.scan: expected a text, got 1"),
-        (0.1, r"^datasets=: hall: expected what the dataset gives, as in \{scan: FILE\}, got 0\.1"),
+        (0.1, r"^datasets=: hall: expected a mapping such as \{scan: FILE\}, got 0\.1"),
         ({"scan": {1}}, r"^datasets\['hall'\]\['scan'\] must be a path, a text, .* got \{1\}"),
     ):
         with pytest.raises(OrthoflowError, match=message):

@@ -49,7 +49,7 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
-    result_version = 5
+    result_version = 6
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

@@ -33,7 +33,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 5
+    result_version = 6
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

@@ -35,7 +35,7 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
-    result_version = 4
+    result_version = 5
     determinism = "seeded"
     metrics = (*DETECTOR_METRICS, "own_tolerance_mm")
     citations = (

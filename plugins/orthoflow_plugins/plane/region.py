@@ -53,7 +53,7 @@ class Region(Method):
     """
 
     id = "plane.region"
-    result_version = 4
+    result_version = 5
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,

@@ -58,7 +58,7 @@ class ReadScan(Method):
     """Read E57, LAS, LAZ, COPC, PLY, PCD, PTX and text scans, several files into one cloud."""
 
     id = "read.scan"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     metrics = (
         "n_points",
