@@ -95,10 +95,7 @@ def inpainted(
     method: Inpainting,
     radius_px: float,
 ) -> NDArray[np.uint8]:
-    """Paint the fillable cells with colours that come from painted cells only.
-
-    OpenCV's fronts run from the top and from the left first, which shifts what they paint. So the
-    raster is painted in all eight ways in which it may be turned and mirrored, and the mean taken.
+    """Paint the fillable cells by OpenCV with colours that come from painted cells only.
 
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.
@@ -110,22 +107,24 @@ def inpainted(
     Returns:
         (rows, cols, 3) colours, 0 in void cells that are not filled.
     """
+    import cv2
+
     painted = np.where(is_void[..., np.newaxis], np.uint8(0), rgb)
     if is_void.all() or not is_fillable.any():
         return painted
-    sums = np.zeros(rgb.shape, dtype=np.uint16)
-    for is_mirrored in (False, True):
-        for quarters in range(4):
-            side = np.s_[:, :: -1 if is_mirrored else 1]
-            found = _inpainted_once(
-                np.rot90(rgb[side], quarters),
-                np.rot90(is_void[side], quarters),
-                np.rot90(is_fillable[side], quarters),
-                method=method,
-                radius_px=radius_px,
-            )
-            sums += np.rot90(found, -quarters)[side]
-    painted[is_fillable] = (sums[is_fillable] + 4) // 8
+    # cv2.inpaint takes every cell outside its mask for known, so that the black of large voids
+    # would creep into the gaps beside them. Void cells lend the colour of their nearest painted
+    # cell while it runs.
+    _, labels = cv2.distanceTransformWithLabels(
+        is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    known = np.flatnonzero(~is_void)
+    known_of_label = np.zeros(known.size + 1, dtype=np.int64)
+    known_of_label[labels.ravel()[known]] = known
+    lent = rgb.reshape(-1, 3)[known_of_label[labels.ravel()]].reshape(rgb.shape)
+    flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
+    found = cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag)
+    painted[is_fillable] = found[is_fillable]
     return painted
 
 
@@ -158,33 +157,6 @@ def painted_between(
     found = interpolate(gaps, around, values, into, reach_cells=reach_cells, threads=threads)
     is_filled.ravel()[gaps[found]] = True
     return is_filled
-
-
-def _inpainted_once(
-    rgb: NDArray[np.uint8],
-    is_void: NDArray[np.bool_],
-    is_fillable: NDArray[np.bool_],
-    *,
-    method: Inpainting,
-    radius_px: float,
-) -> NDArray[np.uint8]:
-    """Colours (rows, cols, 3) as OpenCV fills them; those of other void cells mean nothing."""
-    import cv2
-
-    # cv2.inpaint takes every cell outside its mask for known, so that the black of large voids
-    # would creep into the gaps beside them. Void cells lend the colour of their nearest painted
-    # cell while it runs.
-    _, labels = cv2.distanceTransformWithLabels(
-        is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    painted = np.flatnonzero(~is_void)
-    painted_of_label = np.zeros(painted.size + 1, dtype=np.int64)
-    painted_of_label[labels.ravel()[painted]] = painted
-    lent = rgb.reshape(-1, 3)[painted_of_label[labels.ravel()]].reshape(rgb.shape)
-    flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
-    return np.asarray(
-        cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag), dtype=np.uint8
-    )
 
 
 def filling_preview(layer: Layer) -> bytes:

@@ -62,7 +62,7 @@ class PointcloudDirect(Method):
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "painted_share",
@@ -116,8 +116,7 @@ class PointcloudDirect(Method):
         inpaint: Inpainting = Field(
             default="between",
             description="How gaps are filled: between the painted cells about them, by where their "
-            "points lie; telea and navier-stokes of OpenCV, the mean of all eight ways in which "
-            "the raster may be turned and mirrored; none.",
+            "points lie; telea and navier-stokes of OpenCV, as skarlatos2012 has it; none.",
         )
         inpaint_radius_px: float = Field(
             default=3.0,

@@ -146,6 +146,21 @@ def test_only_gaps_are_filled_and_they_are_marked(tmp_path: Path, method: str) -
     assert not layer.quality[layer.mask != LayerMask.PAINTED].any()
 
 
+@pytest.mark.parametrize(("method", "flag"), [("telea", 1), ("navier-stokes", 0)])
+def test_small_gaps_are_filled_as_opencv_fills_them(
+    tmp_path: Path, method: str, flag: int
+) -> None:
+    import cv2
+
+    is_void = np.zeros((40, 50), dtype=bool)
+    is_void[5:35:6, 5:45:7] = True
+    cloud, walls = holey_wall(is_void)
+    bare = painted(cloud, walls, tmp_path, inpaint="none")
+    layer = painted(cloud, walls, tmp_path, inpaint=method, inpaint_radius_px=3.0)
+    expected = cv2.inpaint(np.asarray(bare.rgb), is_void.astype(np.uint8), 3.0, flag)
+    np.testing.assert_array_equal(layer.rgb, expected)
+
+
 @pytest.mark.parametrize("method", ["telea", "navier-stokes"])
 def test_no_black_of_a_large_void_creeps_into_the_gaps_beside_it(
     tmp_path: Path, method: str
