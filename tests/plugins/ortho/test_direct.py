@@ -147,9 +147,7 @@ def test_only_gaps_are_filled_and_they_are_marked(tmp_path: Path, method: str) -
 
 
 @pytest.mark.parametrize(("method", "flag"), [("telea", 1), ("navier-stokes", 0)])
-def test_small_gaps_are_filled_as_opencv_fills_them(
-    tmp_path: Path, method: str, flag: int
-) -> None:
+def test_small_gaps_are_filled_as_opencv_fills_them(tmp_path: Path, method: str, flag: int) -> None:
     import cv2
 
     is_void = np.zeros((40, 50), dtype=bool)
