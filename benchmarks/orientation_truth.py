@@ -43,10 +43,10 @@ Estimator = type[OrientPnp] | type[OrientColmapBundle]
 _SCRATCH: list[tempfile.TemporaryDirectory[str]] = []
 # As the shipped workflows have it: a first pose needs to be good to a few cells only.
 ROUGHLY = {
-    "n_quadrant_min": 0,
-    "hull_min_ratio": 0.1,
-    "sigma_wall_max_cells": 4.0,
-    "sigma_corner_max_cells": 8.0,
+    "min_quadrant_ties": 0,
+    "min_hull_ratio": 0.1,
+    "max_sigma_wall_cells": 4.0,
+    "max_sigma_corner_cells": 8.0,
 }
 TIES = ("unmasked", "masked", "guided")
 ESTIMATORS: dict[str, Estimator] = {"pnp": OrientPnp, "bundle": OrientColmapBundle}

@@ -25,7 +25,8 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.estimation import EstimationRule, estimate_pose
+from orthoflow_plugins.orient import pose
+from orthoflow_plugins.orient.parameters import OrientParams
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
@@ -101,8 +102,11 @@ def ours(seen: TiedPhoto) -> NDArray[np.float64] | None:
         sigma_px=np.full(n, NOISE_PX),
         sigma_m=np.full(n, 1e-5),
     )
-    rule = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=20_000, seed=1)
-    found = estimate_pose(PHOTO, ties, np.zeros(n, np.bool_), rule)
+    nobody = np.zeros(n, np.bool_)
+    tied = pose.TiedPhoto(
+        photo=PHOTO, chosen=np.arange(n), seen=ties, is_check=nobody, by_hand=nobody, seed=1
+    )
+    found = pose.estimate_pose(tied, OrientParams())
     return None if isinstance(found, str) else found.resection.camera.centre_world
 
 

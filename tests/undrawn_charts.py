@@ -61,10 +61,10 @@ def build_orient_charts_once(
 ) -> None:
     """Let a test set up the charts of its orientations once; see `_build_charts_once`."""
     import matplotlib.figure
-    from orthoflow_plugins.orient import reporting
+    from orthoflow_plugins.orient import report
 
     names = ("draw_positions", "draw_residuals")
-    _build_charts_once(request, patch, (reporting, names, matplotlib.figure), test)
+    _build_charts_once(request, patch, (report, names, matplotlib.figure), test)
 
 
 def _build_charts_once(

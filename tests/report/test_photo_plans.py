@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.residuals import residual_rows
+from orthoflow_plugins.orient.report import residual_rows
 
 from orthoflow.geometry.cameras import looking_at
 from orthoflow.products import Camera, Cameras

@@ -26,7 +26,7 @@ QUICK: dict[str, dict[str, object]] = {
     "raster.grid": {"gsd_m": 0.05},
     "match.sift": {"n_features_max": 1000},
     "match.guided": {"n_ties_max": 400},
-    "orient.colmap-bundle": {"n_features_max": 1000, "n_photo_points_max": 300},
+    "orient.colmap-bundle": {"max_features": 1000},
 }
 
 # Check that a method cannot pass -> why; the suite says when it starts to pass.

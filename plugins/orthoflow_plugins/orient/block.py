@@ -25,8 +25,8 @@ from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values,
 from orthoflow.geometry.resection import whiten
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo
-from orthoflow_plugins.orient.layout import GROUPS, image_cells
 from orthoflow_plugins.orient.lenses import Lens
+from orthoflow_plugins.orient.pose import PLACES_A_SIDE, places_in_photo
 
 # A known point is never exact: an adjustment divides by its variance.
 SIGMA_LEAST_M: Final = 1e-6
@@ -503,8 +503,8 @@ def _groups(block: Block) -> NDArray[np.intp]:
     groups = np.zeros(len(block.seen), dtype=np.intp)
     for photo, camera in enumerate(block.cameras):
         mine = block.seen.photo == photo
-        cells = image_cells(block.seen.pixels[mine], (camera.width, camera.height), GROUPS)
-        groups[mine] = photo * GROUPS**2 + cells
+        cells = places_in_photo(block.seen.pixels[mine], camera)
+        groups[mine] = photo * PLACES_A_SIDE**2 + cells
     return groups
 
 
@@ -524,7 +524,7 @@ def _places(block: Block) -> NDArray[np.intp]:
     for photo, camera in enumerate(block.cameras):
         distances = camera.project(block.points.now[seen.point[seen.photo == photo]])[:, 2]
         if distances.size:
-            side_px = max(camera.width, camera.height) / GROUPS
+            side_px = max(camera.width, camera.height) / PLACES_A_SIDE
             widths.append(side_px / camera.fx * float(np.median(distances)))
     cubes = np.floor(block.points.now[seen.point] / float(np.median(widths))).astype(np.intp)
     return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel(), dtype=np.intp)

@@ -14,10 +14,9 @@ from orthoflow.errors import GeometryError
 from orthoflow.products import JsonValue, Photo, Ties
 from orthoflow.sdk import Method, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.acceptance import reason_to_leave_out
+from orthoflow_plugins.orient.adjustment import Adjusted, adjust_block, of_another_lens
 from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
-from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
-from orthoflow_plugins.orient.estimation import estimate_pose
+from orthoflow_plugins.orient.gates import GATES_BEFORE_BLOCK, refusal
 from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
@@ -33,23 +32,25 @@ from orthoflow_plugins.orient.photo_ties import (
     photo_features,
     tie_photos,
 )
-from orthoflow_plugins.orient.reporting import hand_over
-from orthoflow_plugins.orient.shared_lenses import of_another_lens
-from orthoflow_plugins.orient.single_photo import (
+from orthoflow_plugins.orient.photos import (
     Oriented,
-    TiedPhoto,
+    Trusted,
+    by_itself,
     candidate_of,
-    judged,
-    oriented_by_hand,
-    reason_not_to_try,
     refused,
     require,
     tied_photo,
     with_believable_priors,
 )
+from orthoflow_plugins.orient.pose import TiedPhoto, estimate_pose
+from orthoflow_plugins.orient.report import hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
+# Photos are tied when each shows so much of what the other shows of the walls.
+_MIN_OVERLAP: Final = 0.2
+# So many points between photos fix a block; more would only take time.
+_MAX_PHOTO_POINTS: Final = 1000
 # So shared, a lens is asked of each of its photos whether it can be its own.
 _TESTED: Final = "focal-group"
 
@@ -98,18 +99,8 @@ class OrientColmapBundle(Method):
         photo_ties: bool = Field(
             default=True, description="Tie the photos to each other, too, where they overlap."
         )
-        overlap_min_share: float = Field(
-            default=0.2,
-            gt=0,
-            le=1,
-            description="Photos are tied when each shows at least this share of what the other "
-            "shows of the walls.",
-        )
-        n_features_max: int = Field(
+        max_features: int = Field(
             default=3000, ge=100, description="Key points per photo for ties between photos."
-        )
-        n_photo_points_max: int = Field(
-            default=1000, ge=0, description="Points at most that tie photos to each other."
         )
 
     In = OrientIn
@@ -139,8 +130,7 @@ class OrientColmapBundle(Method):
                 estimates = list(adjusted.estimates)
                 details = _report_block(ctx, adjusted, [item.tied.photo for item in block])
             for at, item, estimate in zip(trusted, block, estimates, strict=True):
-                candidate = candidate_of(item.tied, ties, params, estimate)
-                found[at] = item.hand.or_alone(judged(item.tied, candidate))
+                found[at] = item.judged(ties, params, estimate)
         every = [found[nth] for nth in range(len(photos))]
         return OrientOut(cameras=hand_over(ctx, ties, photos, every, details))
 
@@ -155,22 +145,14 @@ def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
     """Orient a photo by its own ties; refused where they agree by chance only."""
-    hand = oriented_by_hand(tied, ties, params)
-    if hand.joined is not None:
-        return Trusted(tied=tied, estimate=hand.joined, hand=hand)
-    if hand.is_enough:
-        return hand.alone
-    reason = reason_not_to_try(tied, hand)
-    if reason:
-        return refused(tied, reason)
-    estimate = estimate_pose(tied.photo, tied.seen, tied.is_check, tied.rule)
-    if isinstance(estimate, str):
-        return refused(tied, hand.reason or estimate)
+    found = by_itself(tied, ties, params, estimate_pose)
+    if isinstance(found, Oriented):
+        return found
     # A wrong pose would pull at the photos that are tied to it.
-    reason = reason_to_leave_out(candidate_of(tied, ties, params, estimate))
-    if reason:
-        return refused(tied, hand.reason or reason)
-    return Trusted(tied=tied, estimate=estimate, hand=hand)
+    against = refusal(candidate_of(tied, ties, params, found.estimate), GATES_BEFORE_BLOCK)
+    if against is None:
+        return found
+    return refused(tied, against.text if found.by_hand is None else found.by_hand.camera.status)
 
 
 def _adjusted(
@@ -184,7 +166,7 @@ def _adjusted(
     try:
         while True:
             groups = lens_groups(photos, cameras, params.intrinsics, params.refine, apart)
-            adjusted = adjust_block(block, between, groups)
+            adjusted = adjust_block(block, between, groups, params)
             others = of_another_lens(block, adjusted) if params.intrinsics == _TESTED else apart
             if others <= apart:
                 return adjusted
@@ -203,10 +185,8 @@ def _photo_ties(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> PhotoTies:
     cameras = [item.estimate.resection.camera for item in block]
-    shown = [
-        item.tied.seen.points_world[item.estimate.agreeing & ~item.tied.is_check] for item in block
-    ]
-    pairs = overlapping_pairs(cameras, shown, params.overlap_min_share)
+    shown = [item.tied.control(item.estimate.agreeing).points_world for item in block]
+    pairs = overlapping_pairs(cameras, shown, _MIN_OVERLAP)
     if not (params.photo_ties and pairs):
         return no_photo_ties()
     needed = {at for pair in pairs for at in pair}
@@ -214,9 +194,9 @@ def _photo_ties(
     for at, item in enumerate(block):
         done = _SHARE_BY_ITSELF + (_SHARE_FEATURES - _SHARE_BY_ITSELF) * at / len(block)
         ctx.progress(done, f"key points of {item.tied.photo.name}")
-        wanted = photo_features(item.tied.photo, params.n_features_max) if at in needed else None
+        wanted = photo_features(item.tied.photo, params.max_features) if at in needed else None
         features.append(wanted or no_features())
-    return tie_photos(cameras, features, pairs, params.n_photo_points_max)
+    return tie_photos(cameras, features, pairs, _MAX_PHOTO_POINTS)
 
 
 def _report_block(

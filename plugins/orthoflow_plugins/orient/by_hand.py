@@ -21,9 +21,8 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import Resection, SeenPoints, adjust, misfit, stated
-from orthoflow.products import Photo
-from orthoflow_plugins.orient.estimation import Estimate, Start, undistorted_pixels
-from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior
+from orthoflow_plugins.orient.lenses import LensPrior, lens_prior
+from orthoflow_plugins.orient.pose import Estimate, Start, TiedPhoto, undistorted_pixels
 
 TIES_LEAST: Final = 6
 _WRONG_MOST: Final = 2
@@ -65,21 +64,20 @@ class PoseByHand:
     start: Start
 
 
-def pose_by_hand(photo: Photo, seen: SeenPoints, by_hand: NDArray[np.bool_]) -> PoseByHand | str:
+def pose_by_hand(tied: TiedPhoto) -> PoseByHand | str:
     """Orient a photo by the ties that a person measured, or say why not.
 
     Args:
-        photo: the photo.
-        seen: all its ties.
-        by_hand: (n,) which of them a person measured; at least `TIES_LEAST`.
+        tied: the photo; of its ties at least `TIES_LEAST` are measured by a person.
     """
-    prior, hand = lens_prior(photo), seen.take(by_hand)
+    seen = tied.seen
+    prior, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
     found = _consistent(hand, prior)
     if isinstance(found, str):
         return found
     kept, fit = found
     agreeing = np.zeros(len(seen), dtype=np.bool_)
-    agreeing[np.flatnonzero(by_hand)[kept]] = True
+    agreeing[np.flatnonzero(tied.by_hand)[kept]] = True
     own, camera = seen.take(agreeing), fit.resection.camera
     lens = fit.resection.lens
     n_lost = len(hand) - len(kept)
@@ -89,7 +87,6 @@ def pose_by_hand(photo: Photo, seen: SeenPoints, by_hand: NDArray[np.bool_]) -> 
         notes.append(f"left out of them, as they contradict the others: {_places(pixels)}")
     estimate = Estimate(
         resection=_as_stated(fit.resection),
-        intrinsics=intrinsics_of(fit.resection, prior.source),
         source=prior.source,
         fit=misfit(seen, camera),
         agreeing=agreeing,

@@ -1,24 +1,75 @@
-"""`orient.dlt`: each photo by itself by a direct linear transform (markiewicz2015, 3.6 and 4.3)."""
+"""`orient.dlt`: each photo by itself by a direct linear transform (markiewicz2015, 3.6 and 4.3).
+
+Eleven parameters, without anything known before, start an adjustment; what the lens model of that
+leaves out is stated as error.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom, linearised
+from orthoflow.geometry.resection import (
+    Resection,
+    SeenPoints,
+    adjust,
+    moved_origin,
+    predicted_covariances,
+)
 from orthoflow.sdk import Method, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.direct_linear import Distortion, estimate_dlt
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
     OrientIn,
     OrientOut,
     OrientParams,
 )
-from orthoflow_plugins.orient.reporting import hand_over
-from orthoflow_plugins.orient.single_photo import each_by_itself
+from orthoflow_plugins.orient.photos import each_by_itself
+from orthoflow_plugins.orient.pose import (
+    SOFT_LIMIT,
+    Estimate,
+    Start,
+    TiedPhoto,
+    adjusted,
+    no_pose,
+    places_in_photo,
+    robust_start,
+)
+from orthoflow_plugins.orient.report import hand_over
+
+Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
+
+# Nearly free: what points with relief say of a lens outweighs these by far.
+_FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
+_CENTRE_SHARE: Final = 0.5
+_SKEW_SHARE: Final = 0.5
+# Decentring and principal point explain each other on all but the deepest relief.
+_PINNED_CENTRE_SHARE: Final = 0.05
+_FULL: Final = "k1 k2 p1 p2"
+_FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
+    "none": LensFreedom(**_FREE),
+    "k1": LensFreedom(**_FREE, k1_sigma=0.5),
+    _FULL: LensFreedom(**_FREE, k1_sigma=0.5, k2_sigma=0.5, tangential_sigma=0.01),
+}
+_LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
+# Relief below this many standard deviations of the points is mostly their noise.
+_RELIEF_SIGMAS: Final = 10.0
+# Flatter control leaves the eleven parameters to the rounding of its coordinates.
+_CONDITION_MOST: Final = 5000.0
+# Ties that deviate so many times more than they should show what the lens model lacks.
+_SIGMA0_MOST: Final = 1.5
+# Points per side of the grid over a photo on which lens models are compared.
+_FRAME: Final = 12
 
 
 class OrientDlt(Method):
@@ -65,12 +116,10 @@ class OrientDlt(Method):
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient the photos one after the other."""
-        estimator = partial(
-            estimate_dlt,
-            distortion=params.distortion,
-            keeps_skew=params.skew,
-            forgets_lens=params.prior == "none",
-        )
+
+        def estimator(tied: TiedPhoto, _: OrientParams) -> Estimate | str:
+            return estimate_dlt(tied, params)
+
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
@@ -78,3 +127,305 @@ class OrientDlt(Method):
     def tools(cls) -> dict[str, str]:
         """OpenCV rejects wrong ties."""
         return {name: version(name) for name in ("opencv-python-headless", "scipy")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectLinear:
+    """A camera found by a direct linear transform.
+
+    Attributes:
+        camera: without distortion; with the skew.
+        condition: largest over second smallest singular value of the normalised equations; on
+            points of one plane it grows without bound.
+    """
+
+    camera: ViewingCamera
+    condition: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relief:
+    """How far points leave the plane that fits them best.
+
+    Attributes:
+        rms_m: root mean square distance from it.
+        extent_m: standard deviation along its longer axis.
+    """
+
+    rms_m: float
+    extent_m: float
+
+
+def relief(points: NDArray[np.float64]) -> Relief:
+    """Measure how far points (n, 3) leave a plane."""
+    centred = points - points.mean(axis=0)
+    variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", centred, centred) / len(points))
+    roots = np.sqrt(np.maximum(variances, 0.0))
+    return Relief(rms_m=float(roots[0]), extent_m=float(roots[2]))
+
+
+def direct_linear(
+    pixels: NDArray[np.float64], points_world: NDArray[np.float64], size_px: tuple[int, int]
+) -> DirectLinear:
+    """Solve for the eleven parameters (Abdel-Aziz & Karara 1971, normalised after Hartley 1997).
+
+    Args:
+        pixels: (n, 2), at least six.
+        points_world: (n, 3) metres.
+        size_px: width and height of the photo.
+
+    Raises:
+        GeometryError: the points do not determine a camera.
+    """
+    if len(pixels) < 6:
+        raise GeometryError(f"a direct linear transform needs six points, got {len(pixels)}")
+    shift_px, scale_px = _normalisation(pixels, math.sqrt(2.0))
+    shift_m, scale_m = _normalisation(points_world, math.sqrt(3.0))
+    uv = (pixels - shift_px) * scale_px
+    xyz = np.column_stack([(points_world - shift_m) * scale_m, np.ones(len(pixels))])
+    rows = np.zeros((len(pixels), 2, 12))
+    rows[:, 0, :4], rows[:, 0, 8:] = xyz, -uv[:, :1] * xyz
+    rows[:, 1, 4:8], rows[:, 1, 8:] = xyz, -uv[:, 1:] * xyz
+    # Of the normal equations, summed in order: a singular value decomposition of the rows adds up
+    # differently with another number of threads. The adjustment makes good the lost digits.
+    values, vectors = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
+    matrix = vectors[:, 0].reshape(3, 4)
+    inverse_px = np.array(
+        [[1 / scale_px, 0.0, shift_px[0]], [0.0, 1 / scale_px, shift_px[1]], [0.0, 0.0, 1.0]]
+    )
+    local = inverse_px @ matrix @ np.diag([scale_m, scale_m, scale_m, 1.0])
+    camera = _decomposed(local, points_world - shift_m, size_px)
+    return DirectLinear(
+        camera=camera.shifted(-shift_m),
+        condition=math.sqrt(float(values[-1]) / max(float(values[1]), 1e-300)),
+    )
+
+
+def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
+    """Orient a photo by a direct linear transform of its control ties, or say why not.
+
+    With `prior: none` neither calibration nor EXIF helps to reject wrong ties either. Without
+    `skew` the adjustment goes on from square pixels.
+    """
+    if params.prior == "none":
+        tied = replace(tied, photo=replace(tied.photo, intrinsics=None, exif_focal_px=None))
+    robust = robust_start(tied, params)
+    if robust is None:
+        return no_pose(tied.seen)
+    control = tied.control(robust.agreeing)
+    least = _LEAST[params.distortion] + params.skew
+    reason = _too_few(len(control), params.distortion, least) or _too_flat(control)
+    if reason:
+        return reason
+    size_px = (tied.photo.width, tied.photo.height)
+    try:
+        linear = direct_linear(control.pixels_photo, control.points_world, size_px)
+        if linear.condition > _CONDITION_MOST:
+            return _flat(control, f"the equations have condition {linear.condition:.0f}")
+        camera = linear.camera if params.skew else replace(linear.camera, skew=0.0)
+        start = Start(
+            camera=camera,
+            prior=replace(camera, cx=0.5 * size_px[0], cy=0.5 * size_px[1], skew=0.0),
+            agreeing=robust.agreeing,
+            freedom=_freedom(params.distortion, size_px, keeps_skew=params.skew),
+            source="dlt",
+            n_least_for_lens=least,
+        )
+        estimate = adjusted(tied, start, params)
+    except GeometryError as error:
+        return f"{error}: use orient.pnp or orient.colmap-bundle"
+    skew_px = estimate.resection.camera.skew if params.skew else linear.camera.skew
+    estimate = replace(estimate, numbers={"skew_px": skew_px, "condition": linear.condition})
+    control = tied.control(estimate.agreeing)
+    if params.distortion == _FULL or len(control) < _LEAST[_FULL]:
+        return estimate
+    fuller = _freedom(_FULL, size_px, keeps_skew=params.skew)
+    return _with_what_is_missing(estimate, control, start, fuller)
+
+
+def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
+    """Shift and scale that bring points to the origin, at this distance from it on average."""
+    shift = values.mean(axis=0)
+    mean = float(np.linalg.norm(values - shift, axis=1).mean())
+    if not mean > 0.0:
+        raise GeometryError("the points of a direct linear transform lie in one place")
+    return shift, length / mean
+
+
+def _decomposed(
+    matrix: NDArray[np.float64], points: NDArray[np.float64], size_px: tuple[int, int]
+) -> ViewingCamera:
+    """Take a projection matrix (3, 4) apart."""
+    if np.linalg.det(matrix[:, :3]) < 0.0:
+        matrix = -matrix
+    # RQ from QR: rows and columns in reverse order.
+    q, r = np.linalg.qr(matrix[::-1, :3].T)
+    upper, rotation = r.T[::-1, ::-1], q.T[::-1]
+    signs = np.sign(np.diag(upper))
+    if not signs.all():
+        raise GeometryError("the points of a direct linear transform do not determine a camera")
+    upper, rotation = upper * signs, signs[:, None] * rotation
+    translation = np.linalg.solve(upper, matrix[:, 3])
+    if float(np.median(points @ rotation[2] + translation[2])) <= 0.0:
+        raise GeometryError("a direct linear transform puts the points behind the camera")
+    upper = upper / upper[2, 2]
+    return ViewingCamera(
+        width=size_px[0],
+        height=size_px[1],
+        fx=float(upper[0, 0]),
+        fy=float(upper[1, 1]),
+        cx=float(upper[0, 2]),
+        cy=float(upper[1, 2]),
+        distortion=np.zeros(5),
+        rotation=rotation,
+        translation=translation,
+        skew=float(upper[0, 1]),
+    )
+
+
+def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bool) -> LensFreedom:
+    share = _PINNED_CENTRE_SHARE if distortion == _FULL else _CENTRE_SHARE
+    return replace(
+        _FREEDOMS[distortion],
+        centre_sigma_px=share * max(size_px),
+        skew_sigma_px=_SKEW_SHARE * max(size_px) if keeps_skew else 0.0,
+    )
+
+
+def _too_few(n_control: int, distortion: Distortion, least: int) -> str:
+    if n_control >= least:
+        return ""
+    return (
+        f"only {n_control} control ties agree with one pose, a DLT with distortion "
+        f'"{distortion}" needs {least}'
+    )
+
+
+def _too_flat(control: SeenPoints) -> str:
+    """Say that control lies too near a plane for eleven parameters; empty when it does not."""
+    depth = relief(control.points_world)
+    sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
+    if depth.rms_m < _RELIEF_SIGMAS * sigma_m:
+        return _flat(
+            control,
+            f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
+            f"{_RELIEF_SIGMAS:g} times as much relief",
+        )
+    if depth.rms_m < depth.extent_m / _CONDITION_MOST:
+        return _flat(control, "a DLT needs relief")
+    return ""
+
+
+def _with_what_is_missing(
+    estimate: Estimate, control: SeenPoints, start: Start, freedom: LensFreedom
+) -> Estimate:
+    """Widen what is stated of a camera by how far a fuller lens model would move it, everywhere.
+
+    Residuals show hardly a tenth of what a lens model lacks: the other parameters take up the rest,
+    and bend the photo between and beyond the ties. So the error of the poorer camera is taken as
+    its distance from the fuller one, and the error of that one on top. With the distortion of a
+    usual lens unknown, eleven parameters stated a ninth of their error without this.
+
+    Args:
+        estimate: by the poorer model.
+        control: the ties that determined it.
+        start: what it started from.
+        freedom: what the fuller model may change of the lens.
+    """
+    model = estimate.resection
+    try:
+        full = adjust(
+            control,
+            model.camera,
+            prior=start.prior,
+            lens=freedom,
+            groups=places_in_photo(control.pixels_photo, model.camera),
+            soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
+        )
+    except GeometryError:
+        return estimate
+    points = control.points_world
+    missing = _mean_square(_moved_px(model.camera, full.camera, points)) - _variance_px2(
+        full, points
+    )
+    if missing <= 0.0:
+        return estimate
+    bias = _bias(model.camera, full, control)
+    wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
+    factor = _variance_px2(wider, points) / _variance_px2(model, points)
+    wider = replace(wider, variance_factor=factor * model.variance_factor)
+    # A misfit of the lens bends neighbouring ties alike, and has widened the poorer model already.
+    beyond_noise = factor * model.variance_factor / model.sigma0**2
+    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, beyond_noise))
+
+
+def _flat(control: SeenPoints, why: str) -> str:
+    depth = relief(control.points_world)
+    return (
+        f"the control lies within {1000 * depth.rms_m:.1f} mm (RMS) of one plane; {why}: use "
+        "orient.pnp or orient.colmap-bundle"
+    )
+
+
+def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
+    """How the parameters (p,) would have to change to see all the frame as the full model does.
+
+    Not the difference of the parameters: focal length and distance, say, differ by much that
+    cancels, and to first order it would not.
+    """
+    middle = control.points_world.mean(axis=0)
+    points = _frame_points(camera, control) - middle
+    near = camera.shifted(middle)
+    linear = linearised(near, points, full.lens)
+    moved = _moved_px(near, full.camera.shifted(middle), points)
+    seen = np.isfinite(moved).all(axis=1)
+    rows = linear.by_parameters[seen].reshape(-1, len(full.covariance))
+    scale = np.linalg.norm(rows, axis=0)
+    bias = np.linalg.lstsq(rows / scale, moved[seen].ravel(), rcond=1e-9)[0] / scale
+    return np.asarray(moved_origin(camera, middle, len(bias)) @ bias)
+
+
+def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.float64]:
+    """Points (n, 3) behind the pixels of a grid over the photo, each as far as control near it."""
+    across, down = ((np.arange(_FRAME) + 0.5) / _FRAME for _ in range(2))
+    pixels = np.stack(np.meshgrid(across * camera.width, down * camera.height), axis=-1)
+    pixels = pixels.reshape(-1, 2)
+    off = pixels[:, None] - control.pixels_photo
+    nearest = (off**2).sum(axis=2).argmin(axis=1)
+    ranges = np.linalg.norm(control.points_world - camera.centre_world, axis=1)
+    rays = camera.rays_world(pixels)
+    points: NDArray[np.float64] = (
+        camera.centre_world + (ranges[nearest] / np.linalg.norm(rays, axis=1))[:, None] * rays
+    )
+    return points
+
+
+def _moved_px(
+    camera: ViewingCamera, other: ViewingCamera, points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How far (n, 2) another camera sees points from where the first sees them, in pixels."""
+    return other.project(points)[:, :2] - camera.project(points)[:, :2]
+
+
+def _mean_square(moved_px: NDArray[np.float64]) -> float:
+    """Mean square of a coordinate of moves (n, 2)."""
+    return 0.5 * float((moved_px**2).sum(axis=1).mean())
+
+
+def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
+    """Mean predicted variance of a coordinate of the pixels of points (n, 3)."""
+    covariances = predicted_covariances(resection, points)
+    return 0.5 * float(np.trace(covariances, axis1=1, axis2=2).mean())
+
+
+def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[str, ...]:
+    sigma0 = estimate.resection.sigma0
+    if sigma0 <= _SIGMA0_MOST and factor <= _SIGMA0_MOST**2:
+        return ()
+    note = (
+        f"its ties deviate {sigma0:.1f} times as much as they should, and a fuller lens model "
+        f"would move its points by {math.sqrt(missing_px2):.1f} px: its lens has distortion "
+        "that a DLT without that does not describe, worst at the corners; the stated error is "
+        f"{math.sqrt(factor):.1f} times as large for it"
+    )
+    return (note,)

@@ -15,7 +15,7 @@ from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, TieRole
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.acceptance import Candidate
+from orthoflow_plugins.orient.gates import Candidate
 from orthoflow_plugins.orient.wall_errors import sigmas_on_wall
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
 from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientOut, OrientParams
-from orthoflow_plugins.orient.reporting import hand_over, measure_expected
-from orthoflow_plugins.orient.single_photo import Oriented, oriented_by_hand, tied_photo
+from orthoflow_plugins.orient.photos import Oriented, oriented_by_hand, tied_photo
+from orthoflow_plugins.orient.report import hand_over, measure_expected
 
 _SIDE: Final = 15
 # A tie farther off than that does not belong to the pose.
@@ -99,7 +99,7 @@ def _oriented(
 ) -> Oriented:
     tied = tied_photo(photo, ties, params, ctx.rng)
     if tied.by_hand.sum() >= TIES_LEAST:
-        return oriented_by_hand(tied, ties, params).alone
+        return oriented_by_hand(tied, ties, params)[0]
     residuals_px = np.full((len(tied.chosen), 2), np.nan)
     notes: tuple[str, ...] = ()
     if camera.status == "ok" and len(tied.seen):

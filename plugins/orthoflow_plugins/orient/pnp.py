@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import version
-from typing import ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
+import numpy as np
 from pydantic import Field
 
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.resection import SeenPoints, misfit, stated
 from orthoflow.sdk import Method, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.estimation import estimate_pose
-from orthoflow_plugins.orient.opencv_pose import estimate_by_opencv
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
     OrientIn,
     OrientOut,
     OrientParams,
 )
-from orthoflow_plugins.orient.reporting import hand_over
-from orthoflow_plugins.orient.single_photo import Estimator, each_by_itself
+from orthoflow_plugins.orient.photos import each_by_itself
+from orthoflow_plugins.orient.pose import (
+    MAX_ROUNDS,
+    Estimate,
+    TiedPhoto,
+    estimate_pose,
+    expected_px,
+    no_pose,
+    places_in_photo,
+    robust_start,
+    unit_deviation,
+    without_chance,
+)
+from orthoflow_plugins.orient.report import hand_over
 
-PoseMethod = Literal["weighted", "opencv"]
-_ESTIMATORS: Final[dict[PoseMethod, Estimator]] = {
-    "weighted": estimate_pose,
-    "opencv": estimate_by_opencv,
-}
+# solvePnP needs six points where they do not lie in a plane.
+_LEAST: Final = 6
 
 
 class OrientPnp(Method):
@@ -49,7 +62,7 @@ class OrientPnp(Method):
     class Params(OrientParams):
         """How the pose is adjusted, rejection, withheld share, and the gates to pass."""
 
-        method: PoseMethod = Field(
+        method: Literal["weighted", "opencv"] = Field(
             default="weighted",
             description="weighted: each tie counts by its own sigmas and an uncalibrated lens is "
             "refined; opencv: cv2.solvePnP, iterative, all ties alike, the lens as it is known "
@@ -61,7 +74,7 @@ class OrientPnp(Method):
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient the photos one after the other."""
-        estimator = _ESTIMATORS[params.method]
+        estimator = estimate_pose if params.method == "weighted" else estimate_by_opencv
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
@@ -69,3 +82,73 @@ class OrientPnp(Method):
     def tools(cls) -> dict[str, str]:
         """OpenCV finds the first pose."""
         return {name: version(name) for name in ("opencv-python-headless", "scipy")}
+
+
+def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
+    """Orient a photo by `cv2.solvePnP` (iterative, Levenberg-Marquardt), or say why not.
+
+    Every tie counts alike, the lens stays as it is known, and solvePnP starts from nothing. Ties
+    that deviate too much are rejected, and it is called again until they stay the same. The first
+    of them are told by sampling, as everywhere here: least squares of all would not bear them.
+    """
+    seen, is_check = tied.seen, tied.is_check
+    robust = robust_start(tied, params)
+    if robust is None:
+        return no_pose(seen)
+    # Each pixel as uncertain as is usual, the points exact.
+    alike = replace(
+        seen,
+        sigma_px=np.full(len(seen), expected_px(tied.control(robust.agreeing))),
+        sigma_m=np.zeros(len(seen)),
+    )
+    agreeing = robust.agreeing
+    try:
+        for _ in range(MAX_ROUNDS):
+            used = agreeing & ~is_check
+            camera = _solved(alike.take(used), robust.camera)
+            fit = misfit(alike, camera)
+            unit = unit_deviation(fit.normalised[used])
+            limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
+            agreeing = fit.normalised <= limit
+            if np.array_equal(agreeing & ~is_check, used):
+                break
+        chosen = alike.take(used)
+        resection = stated(chosen, camera, groups=places_in_photo(chosen.pixels_photo, camera))
+    except GeometryError as error:
+        return f"{error}: use orient.pnp with method weighted"
+    return Estimate(
+        resection=resection, source=robust.source, fit=fit, agreeing=agreeing, limit=limit
+    )
+
+
+def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
+    """Give the camera at the pose that solvePnP finds.
+
+    Raises:
+        GeometryError: it finds none.
+    """
+    import cv2
+
+    if len(seen) < _LEAST:
+        raise GeometryError(f"solvePnP needs {_LEAST} ties, {len(seen)} agree with one pose")
+    if lens.skew:
+        raise GeometryError(f"solvePnP knows no skew, and the lens has {lens.skew:.1f} px of it")
+    # Survey coordinates would cost digits.
+    middle = seen.points_world.mean(axis=0)
+    # Any: the stubs want one of its many array types.
+    call: Any = cv2.solvePnP
+    try:
+        found, turn, shift = call(
+            seen.points_world - middle,
+            np.ascontiguousarray(to_opencv(seen.pixels_photo)),
+            opencv_matrix(lens),
+            lens.distortion,
+            flags=cv2.SOLVEPNP_ITERATIVE,
+        )
+    except cv2.error as error:
+        raise GeometryError(f"solvePnP gave up ({error.err})") from error
+    if not found:
+        raise GeometryError("solvePnP finds no pose")
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    posed = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    return posed.shifted(-middle)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +28,7 @@ from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 from tests.scenes import SURVEY_SHIFT_M
 
-FEW = {"n_features_max": 1500, "n_photo_points_max": 300}
+FEW = {"max_features": 1500}
 ALONE = {"photo_ties": False}
 
 
@@ -419,28 +417,3 @@ def test_key_points_off_the_epipolar_line_are_no_tie() -> None:
     )
     assert right.sum() == 30
     assert len(found.points_world) <= 33
-
-
-@pytest.mark.parametrize("by_hand", ["", "two poses agree with its ties measured by hand"])
-def test_a_photo_that_would_harm_the_others_is_refused_with_the_first_reason(
-    by_hand: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hand = SimpleNamespace(joined=None, is_enough=False, reason=by_hand)
-    for name, given in (
-        ("oriented_by_hand", hand),
-        ("reason_not_to_try", ""),
-        ("estimate_pose", SimpleNamespace()),
-        ("candidate_of", None),
-        ("reason_to_leave_out", "it agrees by chance"),
-    ):
-        monkeypatch.setattr(bundle_method, name, lambda *_, given=given: given)
-    tied: Any = SimpleNamespace(
-        photo=SimpleNamespace(name="a.png"),
-        seen=None,
-        is_check=None,
-        rule=None,
-        chosen=np.arange(3),
-    )
-    nothing: Any = None
-    found: Any = bundle_method._by_itself(tied, nothing, nothing)
-    assert found.camera.status == (by_hand or "it agrees by chance")

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient import by_hand
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
+from orthoflow_plugins.orient.by_hand import pose_by_hand
 from orthoflow_plugins.orient.dlt import OrientDlt
 from orthoflow_plugins.orient.pnp import OrientPnp
+from orthoflow_plugins.orient.pose import TiedPhoto
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom
-from orthoflow.geometry.resection import Resection, SeenPoints
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, Cameras, Intrinsics, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
@@ -234,140 +230,6 @@ def test_fewer_than_six_are_ordinary_ties(orient: Orient) -> None:
 # --- which of them fit together ---
 
 
-def numbered(n: int) -> SeenPoints:
-    """Ties that are told apart by their pixels: the k-th in a file is at u = k, v = 10 k."""
-    at = np.arange(n, dtype=np.float64)
-    return SeenPoints(
-        pixels_photo=np.column_stack([at, 10.0 * at]) + 0.5,
-        points_world=np.zeros((n, 3)),
-        sigma_px=np.ones(n),
-        sigma_m=np.zeros(n),
-    )
-
-
-def pose(turn_deg: float, chance: float = 0.5) -> Any:
-    rotation = rotation_from_vector(np.radians([turn_deg, 0.0, 0.0]))
-    camera = SimpleNamespace(rotation=rotation)
-    return SimpleNamespace(resection=SimpleNamespace(camera=camera), chance=chance)
-
-
-def told(
-    monkeypatch: pytest.MonkeyPatch, n: int, fits: dict[tuple[int, ...], list[Any]]
-) -> tuple[list[int] | str, list[tuple[int, ...]]]:
-    """What is said of some ties, by which poses fit without some of them; and what was asked."""
-    asked: list[tuple[int, ...]] = []
-
-    def found(seen: SeenPoints, prior: object) -> Iterator[Any]:
-        kept = seen.pixels_photo[:, 0].astype(int).tolist()
-        without = tuple(k for k in range(n) if k not in kept)
-        asked.append(without)
-        yield from fits.get(without, [])
-
-    monkeypatch.setattr(by_hand, "_fits", found)
-    prior: Any = None
-    verdict = by_hand._consistent(numbered(n), prior)
-    return (verdict if isinstance(verdict, str) else verdict[0].tolist()), asked
-
-
-def test_all_ties_are_kept_where_they_fit_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert told(monkeypatch, 9, {(): [pose(0.0)]}) == (list(range(9)), [()])
-    # One pose that comes out twice is one.
-    twice = {(): [pose(0.0), pose(1.9, 0.9), pose(3.5)]}
-    assert told(monkeypatch, 9, twice)[0] == list(range(9))
-
-
-@pytest.mark.parametrize("without", [(), (3,)])
-def test_two_poses_are_not_told_apart(
-    monkeypatch: pytest.MonkeyPatch, without: tuple[int, ...]
-) -> None:
-    said, _ = told(monkeypatch, 9, {without: [pose(0.0), pose(2.1)]})
-    assert isinstance(said, str)
-    assert said.startswith("two poses agree with its ties measured by hand")
-
-
-@pytest.mark.parametrize("wrong", [(4,), (0,), (2, 6)])
-def test_what_is_plainly_wrong_is_left_out(
-    monkeypatch: pytest.MonkeyPatch, wrong: tuple[int, ...]
-) -> None:
-    kept, asked = told(monkeypatch, 8, {wrong: [pose(0.0)]})
-    assert kept == [k for k in range(8) if k not in wrong]
-    # As few as possible: all that leave out less were asked before.
-    assert asked == [some for n in range(len(wrong) + 1) for some in combinations(range(8), n)]
-
-
-@pytest.mark.parametrize(
-    ("fitting", "places"),
-    [
-        ([(2,), (5,)], "(u 2, v 20), (u 5, v 50)"),
-        ([(1, 2), (2, 6)], "(u 1, v 10), (u 2, v 20), (u 6, v 60)"),
-    ],
-)
-def test_what_may_be_wrong_is_named_where_it_is_not_plain(
-    monkeypatch: pytest.MonkeyPatch, fitting: list[tuple[int, ...]], places: str
-) -> None:
-    said, _ = told(monkeypatch, 8, {some: [pose(0.0)] for some in fitting})
-    assert said == (
-        "its 8 ties measured by hand contradict each other, and it is not plain which is wrong, "
-        f"one of {places}: measure them again, or add more"
-    )
-
-
-@pytest.mark.parametrize(
-    ("n", "n_most"), [(6, 0), (7, 1), (8, 2), (20, 2), (25, 2), (26, 1), (40, 1)]
-)
-def test_at_most_two_are_left_out_of_few_and_one_of_many(
-    monkeypatch: pytest.MonkeyPatch, n: int, n_most: int
-) -> None:
-    said, asked = told(monkeypatch, n, {})
-    assert isinstance(said, str)
-    assert f"leaving out up to {n_most} of them does not help (6 must stay)" in said
-    assert asked == [some for k in range(n_most + 1) for some in combinations(range(n), k)]
-
-
-@pytest.mark.parametrize("turn_deg", [1.9, 2.1, 90.0, 180.0])
-def test_poses_are_apart_by_more_than_two_degrees(turn_deg: float) -> None:
-    base = rotation_from_vector(np.array([0.3, -1.0, 0.4]))
-    for axis in np.eye(3):
-        turned = rotation_from_vector(np.radians(turn_deg) * axis) @ base
-        cameras: Any = [SimpleNamespace(rotation=each) for each in (base, turned)]
-        assert by_hand._are_apart(*cameras) == (turn_deg > 2.0)
-    # Rounding does not take the angle from what has a cosine.
-    assert not by_hand._are_apart(cameras[0], cameras[0])
-
-
-def test_of_each_pose_the_likeliest_is_kept() -> None:
-    poses = [pose(0.0, 0.2), pose(10.0, 0.4), pose(1.0, 0.9), pose(11.5, 0.3)]
-    kept = by_hand._distinct(iter(poses))
-    assert [each.chance for each in kept] == [0.9, 0.4]
-
-
-def resection(sigma0: float, n_lens: int = 0) -> Resection:
-    free = LensFreedom(focal_sigma=0.5, k1_sigma=0.25) if n_lens else LensFreedom()
-    return Resection(
-        camera=CAMERA,
-        covariance=sigma0**2 * np.diag(np.arange(1.0, 7.0 + n_lens)),
-        sigma0=sigma0,
-        variance_factor=sigma0**2,
-        lens=free,
-    )
-
-
-@pytest.mark.parametrize(("sigma0", "unit"), [(0.25, 1.0), (1.0, 1.0), (3.0, 3.0)])
-def test_small_residuals_do_not_make_a_pose_more_exact_than_its_ties(
-    sigma0: float, unit: float
-) -> None:
-    found = by_hand._as_stated(resection(sigma0))
-    np.testing.assert_allclose(found.covariance, unit**2 * np.diag(np.arange(1.0, 7.0)))
-    assert (found.sigma0, found.variance_factor) == (unit, unit**2)
-
-
-def test_a_known_lens_is_observed_as_well() -> None:
-    assert by_hand._redundancy(numbered(9), resection(0.5)) == 18 - 6
-    # Cofactors 7 and 8 of the lens, by what was known of it.
-    expected = 18 - 8 + 7.0 / 0.5**2 + 8.0 / 0.25**2
-    assert by_hand._redundancy(numbered(9), resection(0.5, 2)) == pytest.approx(expected)
-
-
 def by(points: NDArray[np.float64]) -> SeenPoints:
     return SeenPoints(
         pixels_photo=CAMERA.project(points)[:, :2],
@@ -377,50 +239,15 @@ def by(points: NDArray[np.float64]) -> SeenPoints:
     )
 
 
-@pytest.mark.parametrize("n", [3, 4, 9])
-@pytest.mark.parametrize("relief_m", [0.0, 0.001, 0.02, 0.2])
-def test_adjustments_start_from_poses_that_fit(n: int, relief_m: float) -> None:
-    rng = np.random.default_rng(2)
-    points = rng.uniform([0.9, 0.0, 0.7], [1.8, 1e-9, 1.5], (n, 3))
-    points[:, 1] = relief_m * np.where(np.arange(n) % 2 == 0, -1.0, 1.0)
-    starts = by_hand._starts(by(points), CAMERA)
-    if n < 4:
-        assert starts == []
-        return
-    off = [np.linalg.norm(start.centre_world - CAMERA.centre_world) for start in starts]
-    assert min(off) < 0.01
-    assert starts[int(np.argmin(off))].fx == CAMERA.fx
-    # Of points in a plane, the pose mirrored in it nearly fits as well.
-    is_flat = relief_m < 0.01
-    assert (len(starts) == 3) == is_flat
-    assert is_flat or len(starts) == 1
-    # What no ray of the lens shows says nothing.
-    if n > 4:
-        beyond = by(points)
-        beyond.pixels_photo[0] = [1e5, 1e5]
-        narrow = replace(CAMERA, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
-        assert len(by_hand._starts(beyond, narrow)) >= 1
-
-
-@pytest.mark.parametrize(("noise_px", "fits"), [(0.0, True), (1.0, True), (6.0, False)])
-def test_poses_fit_whose_residuals_are_no_larger_than_chance_makes_them(
-    noise_px: float, fits: bool
-) -> None:
-    from scipy import stats
-
-    rng = np.random.default_rng(2)
-    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (9, 3))
-    seen = by(points)
-    seen.pixels_photo[:] += noise_px * rng.normal(size=(9, 2))
-    prior: Any = SimpleNamespace(
-        guesses=[SimpleNamespace(posed=lambda: CAMERA)], freedom=LensFreedom()
+def tied(seen: SeenPoints, measured: np.ndarray) -> TiedPhoto:
+    return TiedPhoto(
+        photo=calibrated().photos[0],
+        chosen=np.arange(len(seen)),
+        seen=seen,
+        is_check=np.zeros(len(seen), dtype=np.bool_),
+        by_hand=measured,
+        seed=1,
     )
-    found = list(by_hand._fits(seen, prior))
-    assert bool(found) == fits
-    for fit in found:
-        squares = 12.0 * fit.resection.sigma0**2
-        assert fit.chance == pytest.approx(stats.chi2.sf(squares, 12), abs=1e-9)
-        assert fit.prior is CAMERA
 
 
 @pytest.mark.parametrize(("chance", "fits"), [(0.0012, True), (0.0008, False)])
@@ -430,19 +257,18 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     from scipy import stats
 
     rng = np.random.default_rng(2)
-    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (9, 3))
-    seen = replace(by(points), sigma_m=np.zeros(9))
-    seen.pixels_photo[:] += rng.normal(size=(9, 2))
-    prior: Any = SimpleNamespace(
-        guesses=[SimpleNamespace(posed=lambda: CAMERA)], freedom=LensFreedom()
-    )
-    fit = next(iter(by_hand._fits(seen, prior)))
-    # With such deviations the same residuals are as large as by chance one time in so many.
-    times = fit.resection.sigma0 * np.sqrt(12.0 / stats.chi2.isf(chance, 12))
-    found = list(by_hand._fits(replace(seen, sigma_px=times * seen.sigma_px), prior))
-    assert bool(found) == fits
-    if fits:
-        assert found[0].chance == pytest.approx(chance, rel=0.01)
+    # Of six none may be left out.
+    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (6, 3))
+    seen = replace(by(points), sigma_m=np.zeros(6))
+    seen.pixels_photo[:] += rng.normal(size=(6, 2))
+    everyone = np.ones(6, dtype=np.bool_)
+    found = pose_by_hand(tied(replace(seen, sigma_px=np.full(6, 3.0)), everyone))
+    assert not isinstance(found, str)
+    # In pixels, as none of the residuals is so small by luck that it is taken as larger.
+    squares = float((found.estimate.fit.residuals_px**2).sum())
+    sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
+    found = pose_by_hand(tied(replace(seen, sigma_px=sigma_px), everyone))
+    assert isinstance(found, str) != fits
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 0.0004])
@@ -456,7 +282,7 @@ def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) 
     away = across * np.sin(turn) + relief * np.cos(turn)
     points = np.array([1.3, 0.0, 1.1]) + np.stack([along, away, up], axis=1)
     seen = by(points)
-    said = by_hand.pose_by_hand(calibrated().photos[0], seen, np.ones(9, dtype=np.bool_))
+    said = pose_by_hand(tied(seen, np.ones(9, dtype=np.bool_)))
     assert isinstance(said, str)
     assert said.startswith("two poses agree with its ties measured by hand")
 
@@ -472,8 +298,7 @@ def test_a_pose_by_hand_knows_what_it_was_found_from() -> None:
     more = np.concatenate([hand, [1, 3]])
     measured[[1, 3]] = True
     seen.pixels_photo[hand[2]] += [70.0, -50.0]
-    photo = calibrated().photos[0]
-    found = by_hand.pose_by_hand(photo, seen, measured)
+    found = pose_by_hand(tied(seen, measured))
     assert not isinstance(found, str)
     estimate = found.estimate
     agreeing = np.zeros(14, dtype=np.bool_)
@@ -492,6 +317,6 @@ def test_a_pose_by_hand_knows_what_it_was_found_from() -> None:
     assert len({round(value / sure, 6) for value in worth}) == len(worth)
     assert estimate.fit.normalised.shape == (14,)
     assert found.start.camera is estimate.resection.camera
-    nothing_lost = by_hand.pose_by_hand(photo, seen, measured & (np.arange(14) != hand[2]))
+    nothing_lost = pose_by_hand(tied(seen, measured & (np.arange(14) != hand[2])))
     assert not isinstance(nothing_lost, str)
     assert len(nothing_lost.estimate.notes) == 1

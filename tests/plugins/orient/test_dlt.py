@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.direct_linear import (
+from orthoflow_plugins.orient.dlt import (
     Distortion,
+    OrientDlt,
     direct_linear,
     estimate_dlt,
     relief,
 )
-from orthoflow_plugins.orient.dlt import OrientDlt
-from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
+from orthoflow_plugins.orient.pose import Estimate, TiedPhoto
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 from orthoflow.errors import GeometryError
@@ -126,7 +126,7 @@ def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
 ) -> None:
     true = camera()
     ctx = context(tmp_path)
-    gates = {"sigma_wall_max_cells": 50.0, "sigma_corner_max_cells": 500.0}
+    gates = {"max_sigma_wall_cells": 50.0, "max_sigma_corner_cells": 500.0}
     found = orient(ties_of(true, seed), ctx, **gates).cameras[0]
     assert found.status == "ok"
     assert frame_errors_px(found.viewing(), true).max() >= 10.0
@@ -166,7 +166,7 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
     distortion: Distortion,
 ) -> None:
     true = replace(camera(), distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0]))
-    rule = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=2000, seed=1)
+    params = OrientDlt.Params(distortion=distortion)
     ratios, at_worst = [], []
     for seed in range(6):
         ties = ties_of(true, seed, noise_px=0.7)
@@ -177,7 +177,15 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
             sigma_m=ties.sigma_m,
         )
         is_check = np.arange(len(seen)) % 5 == 0
-        found = estimate_dlt(photos().photos[0], seen, is_check, rule, distortion=distortion)
+        tied = TiedPhoto(
+            photo=photos().photos[0],
+            chosen=np.arange(len(seen)),
+            seen=seen,
+            is_check=is_check,
+            by_hand=np.zeros(len(seen), dtype=np.bool_),
+            seed=1,
+        )
+        found = estimate_dlt(tied, params)
         assert isinstance(found, Estimate)
         stated = wall_error(found.resection, known_walls(ties, np.ones(len(seen), np.bool_)))
         assert stated is not None
@@ -263,7 +271,7 @@ def test_skew_is_kept_when_asked(tmp_path: Path, seed: int) -> None:
     assert kept.intrinsics.skew == pytest.approx(60.0, abs=3.0)
     # A corner is 28 px off where the skew is left out, and no pose takes up all of it.
     assert frame_errors_px(kept.viewing(), true).max() < 1.0
-    left_out = orient(ties, context(tmp_path), sigma_wall_max_cells=100, sigma_corner_max_cells=300)
+    left_out = orient(ties, context(tmp_path), max_sigma_wall_cells=100, max_sigma_corner_cells=300)
     (other,) = left_out.cameras
     if other.status == "ok":
         assert other.intrinsics is not None

@@ -7,18 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient import opencv_pose
-from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
-from orthoflow_plugins.orient.opencv_pose import estimate_by_opencv
+from orthoflow_plugins.orient.pnp import OrientPnp, estimate_by_opencv
+from orthoflow_plugins.orient.pose import Estimate, TiedPhoto
 
-from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
 from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
-RULE = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=1000, seed=1)
+PARAMS = OrientPnp.Params(method="opencv")
 CAMERA = ms.camera_before(ms.textured_wall(0))
 
 
@@ -49,41 +47,35 @@ def none_of(n: int) -> np.ndarray:
     return np.zeros(n, dtype=np.bool_)
 
 
+def tied(of: Photo, seen: SeenPoints, is_check: np.ndarray) -> TiedPhoto:
+    return TiedPhoto(
+        photo=of,
+        chosen=np.arange(len(seen)),
+        seen=seen,
+        is_check=is_check,
+        by_hand=none_of(len(seen)),
+        seed=1,
+    )
+
+
 @pytest.mark.parametrize("shift_m", [np.zeros(3), SURVEY_SHIFT_M], ids=["", "survey"])
 def test_exact_ties_give_the_exact_pose(shift_m: np.ndarray) -> None:
     viewer = CAMERA.shifted(-shift_m)
     seen = seen_by(CAMERA, 40)
     seen = replace(seen, points_world=seen.points_world + shift_m)
-    found = opencv_pose._solved(seen, replace(viewer, translation=np.zeros(3), rotation=np.eye(3)))
-    np.testing.assert_allclose(found.centre_world, viewer.centre_world, atol=1e-5)
-    np.testing.assert_allclose(found.rotation, viewer.rotation, atol=1e-5)
-    assert found.fx == viewer.fx
-
-
-@pytest.mark.parametrize(("n", "is_enough"), [(5, False), (6, True)])
-def test_solvepnp_needs_six_ties(n: int, is_enough: bool) -> None:
-    seen = seen_by(CAMERA, n)
-    if is_enough:
-        opencv_pose._solved(seen, CAMERA)
-        return
-    with pytest.raises(GeometryError, match="solvePnP needs 6 ties, 5 agree with one pose"):
-        opencv_pose._solved(seen, CAMERA)
+    found = estimate_by_opencv(tied(photo(), seen, none_of(40)), PARAMS)
+    assert isinstance(found, Estimate)
+    camera = found.resection.camera
+    np.testing.assert_allclose(camera.centre_world, viewer.centre_world, atol=1e-5)
+    np.testing.assert_allclose(camera.rotation, viewer.rotation, atol=1e-5)
+    assert camera.fx == viewer.fx
 
 
 def test_a_lens_with_skew_is_refused_with_what_to_do_instead() -> None:
-    with pytest.raises(GeometryError, match=r"solvePnP knows no skew, and the lens has 2\.5 px"):
-        opencv_pose._solved(seen_by(CAMERA, 20), replace(CAMERA, skew=2.5))
-    seen = seen_by(CAMERA, 40)
     skewed = replace(photo(), intrinsics=Intrinsics.of(replace(CAMERA, skew=2.5)))
-    said = estimate_by_opencv(skewed, seen, none_of(40), RULE)
+    said = estimate_by_opencv(tied(skewed, seen_by(CAMERA, 40), none_of(40)), PARAMS)
     assert isinstance(said, str)
     assert said.endswith("2.5 px of it: use orient.pnp with method weighted")
-
-
-def test_ties_that_agree_with_no_pose_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opencv_pose, "robust_start", lambda *_: None)
-    said = estimate_by_opencv(photo(), seen_by(CAMERA, 40), none_of(40), RULE)
-    assert said == "no pose agrees with enough of its 40 ties"
 
 
 @pytest.mark.parametrize("n_check", [0, 30])
@@ -92,7 +84,9 @@ def test_wrong_ties_are_rejected_and_every_other_counts_alike(n_check: int) -> N
     wrong = np.arange(120) % 10 == 3
     pixels = seen.pixels_photo + wrong[:, None] * np.array([9.0, -7.0])
     is_check = np.arange(120) % 4 == 0 if n_check else none_of(120)
-    found: Any = estimate_by_opencv(photo(), replace(seen, pixels_photo=pixels), is_check, RULE)
+    found: Any = estimate_by_opencv(
+        tied(photo(), replace(seen, pixels_photo=pixels), is_check), PARAMS
+    )
     assert isinstance(found, Estimate)
     np.testing.assert_array_equal(found.agreeing & wrong, none_of(120))
     assert found.agreeing[~wrong].mean() > 0.97
@@ -102,7 +96,7 @@ def test_wrong_ties_are_rejected_and_every_other_counts_alike(n_check: int) -> N
     # Whatever the ties say of themselves, the pose is the same.
     doubted = np.where(np.arange(120) % 2 == 0, 0.5, 0.9)
     other: Any = estimate_by_opencv(
-        photo(), replace(seen, pixels_photo=pixels, sigma_m=1e-4 * doubted), is_check, RULE
+        tied(photo(), replace(seen, pixels_photo=pixels, sigma_m=1e-4 * doubted), is_check), PARAMS
     )
     np.testing.assert_allclose(
         other.resection.camera.centre_world, found.resection.camera.centre_world, atol=1e-3

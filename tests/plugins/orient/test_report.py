@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.residuals import (
+from orthoflow_plugins.orient.report import (
     numbers_json,
     photo_numbers,
     residual_rows,

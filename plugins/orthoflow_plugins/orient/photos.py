@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,23 +14,25 @@ from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photo, Photos, ResidualRow, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.acceptance import (
+from orthoflow_plugins.orient.by_hand import TIES_LEAST, PoseByHand, pose_by_hand
+from orthoflow_plugins.orient.gates import (
+    GATES_BEFORE_BLOCK,
     Candidate,
-    reason_against,
-    reason_to_leave_out,
+    refusal,
     too_few,
     warnings_for,
 )
-from orthoflow_plugins.orient.by_hand import TIES_LEAST, pose_by_hand
-from orthoflow_plugins.orient.estimation import (
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.pose import (
     Estimate,
-    EstimationRule,
+    Estimator,
+    TiedPhoto,
     adjusted,
     focal_without_exif,
+    image_cells,
+    ties_of_photo,
 )
-from orthoflow_plugins.orient.layout import withheld
-from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.residuals import (
+from orthoflow_plugins.orient.report import (
     PhotoNumbers,
     numbers_json,
     photo_numbers,
@@ -38,33 +40,13 @@ from orthoflow_plugins.orient.residuals import (
 )
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
-_SEED_LIMIT = 2**31 - 1
+_SEED_LIMIT: Final = 2**31 - 1
+# More ties of a photo than that tell nothing new.
+_MAX_TIES: Final = 20_000
+# Check points come evenly from so many cells a side of a photo.
+_STRATA: Final = 6
 # Photos of a lens that are asked whether EXIF is right.
 _ASKED_OF_LENS: Final = 5
-
-Estimator = Callable[[Photo, SeenPoints, NDArray[np.bool_], EstimationRule], Estimate | str]
-"""Orients one photo by its control ties, or says why it cannot."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TiedPhoto:
-    """A photo with the ties it is oriented by.
-
-    Attributes:
-        photo: the photo.
-        chosen: (n,) index into all ties.
-        seen: these ties as an adjustment takes them.
-        is_check: (n,) withheld from every estimation.
-        by_hand: (n,) measured by a person.
-        rule: how to estimate, with a seed of its own.
-    """
-
-    photo: Photo
-    chosen: NDArray[np.intp]
-    seen: SeenPoints
-    is_check: NDArray[np.bool_]
-    by_hand: NDArray[np.bool_]
-    rule: EstimationRule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,39 +77,28 @@ class Oriented:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ByHand:
-    """What the ties that a person measured make of a photo.
+class Trusted:
+    """A photo whose own ties orient it beyond chance.
 
     Attributes:
-        alone: its orientation by them alone, or why there is none; without a reason where there
-            are too few of them to orient it.
-        kept: (n,) bool, ties of the photo that determine it.
-        joined: its orientation with the other ties that agree with these; None where they do not.
+        tied: its ties.
+        estimate: its orientation by itself.
+        by_hand: its orientation by the ties that a person measured alone, where it has one.
+        kept: (n,) bool, these of its ties.
     """
 
-    alone: Oriented
+    tied: TiedPhoto
+    estimate: Estimate
+    by_hand: Oriented | None
     kept: NDArray[np.bool_]
-    joined: Estimate | None = None
 
-    @property
-    def is_enough(self) -> bool:
-        """Whether they orient the photo alone."""
-        return self.alone.camera.status == "ok"
-
-    @property
-    def reason(self) -> str:
-        """Why they do not orient it; empty where they do, or are too few."""
-        return "" if self.is_enough else self.alone.camera.status
-
-    def agrees(self, agreeing: NDArray[np.bool_]) -> bool:
-        """Whether an orientation that these ties (n,) agree with has all that were kept."""
-        return bool(agreeing[self.kept].all())
-
-    def or_alone(self, oriented: Oriented) -> Oriented:
-        """Give an orientation by all ties if it is ok and not against those by hand."""
-        if oriented.camera.status == "ok" and self.agrees(oriented.role != TieRole.REJECTED):
-            return oriented
-        return self.alone if self.is_enough or self.reason else oriented
+    def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
+        """Judge an orientation by all ties; where it is against those by hand, these count."""
+        found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
+        is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
+        if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
+            return found
+        return self.by_hand
 
 
 def require(ties: Ties, photos: Photos) -> None:
@@ -152,40 +123,55 @@ def require(ties: Ties, photos: Photos) -> None:
         )
 
 
-def of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
-    """Index of the ties of a photo."""
-    if name not in ties.photo_names:
-        return np.empty(0, dtype=np.intp)
-    return np.flatnonzero(ties.photo == ties.photo_names.index(name))
-
-
 def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
     """Choose the ties of a photo and split them into control and check."""
     # Drawn for every photo, so that one photo's ties do not change the luck of the next.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
-    chosen = _usable(ties, photo.name, params.n_ties_max)
+    chosen = _usable(ties, photo.name)
     seen = SeenPoints(
         pixels_photo=ties.pixels_photo[chosen],
         points_world=ties.points_world[chosen],
         sigma_px=ties.sigma_px[chosen],
         sigma_m=ties.sigma_m[chosen],
     )
-    size_px = (photo.width, photo.height)
     by_hand = np.zeros(len(chosen), dtype=np.bool_)
     if ties.by_hand is not None:
         by_hand = ties.by_hand[chosen] > 0
     is_check = np.zeros(len(chosen), dtype=np.bool_)
-    is_check[~by_hand] = withheld(seen.pixels_photo[~by_hand], size_px, params.check_share, own)
+    is_check[~by_hand] = withheld(
+        seen.pixels_photo[~by_hand], (photo.width, photo.height), params.check_share, own
+    )
     return TiedPhoto(
         photo=photo,
         chosen=chosen,
         seen=seen,
         is_check=is_check,
         by_hand=by_hand,
-        rule=params.estimation(int(own.integers(_SEED_LIMIT))),
+        seed=int(own.integers(_SEED_LIMIT)),
     )
+
+
+def withheld(
+    pixels_photo: NDArray[np.float64],
+    size_px: tuple[int, int],
+    share: float,
+    rng: np.random.Generator,
+) -> NDArray[np.bool_]:
+    """Choose the check points (n,): a share of the ties, evenly from all parts of the image.
+
+    The ties are shuffled, ordered by the cell of the image they lie in, and one of every 1 / share
+    is taken along that order: each cell gives its share, and the whole is at least `share`.
+    """
+    shuffled = rng.permutation(len(pixels_photo))
+    cells = image_cells(pixels_photo, size_px, _STRATA)
+    order = shuffled[np.argsort(cells[shuffled], kind="stable")]
+    n_check = math.ceil(share * len(order))
+    picked = np.floor((np.arange(n_check) + rng.random()) * len(order) / max(n_check, 1))
+    chosen = np.zeros(len(order), dtype=np.bool_)
+    chosen[order[np.minimum(picked.astype(np.intp), len(order) - 1)]] = True
+    return chosen
 
 
 def with_believable_priors(
@@ -207,10 +193,7 @@ def with_believable_priors(
         rng = np.random.default_rng(0)
         tied = [tied_photo(photos[at], ties, params, rng) for at in members]
         tied.sort(key=lambda each: -len(each.seen))
-        asked = [
-            focal_without_exif(each.photo, each.seen, each.is_check, each.rule)
-            for each in tied[:_ASKED_OF_LENS]
-        ]
+        asked = [focal_without_exif(each, params) for each in tied[:_ASKED_OF_LENS]]
         found = [focal_px for focal_px in asked if focal_px is not None]
         if 2 * len(found) <= len(asked):
             continue
@@ -242,50 +225,60 @@ def each_by_itself(
     for nth, photo in enumerate(believed):
         ctx.progress(nth / len(believed), photo.name)
         tied = tied_photo(photo, ties, params, ctx.rng)
-        found.append(_by_itself(tied, ties, params, estimator))
+        result = by_itself(tied, ties, params, estimator)
+        if isinstance(result, Trusted):
+            result = result.judged(ties, params, result.estimate)
+        found.append(result)
     return found
 
 
-def _by_itself(tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator) -> Oriented:
-    hand = oriented_by_hand(tied, ties, params)
-    if hand.joined is not None:
-        return hand.or_alone(judged(tied, candidate_of(tied, ties, params, hand.joined)))
-    if hand.is_enough:
-        return hand.alone
-    reason = reason_not_to_try(tied, hand)
-    if reason:
-        return refused(tied, reason)
-    estimate = estimator(tied.photo, tied.seen, tied.is_check, tied.rule)
+def by_itself(
+    tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator
+) -> Trusted | Oriented:
+    """Orient a photo by its own ties.
+
+    Returns:
+        What is final where ties by hand alone orient it, or nothing does.
+    """
+    alone, kept = None, np.zeros(len(tied.seen), dtype=np.bool_)
+    reason = too_few(len(tied.seen))
+    if tied.by_hand.sum() >= TIES_LEAST:
+        alone, pose = oriented_by_hand(tied, ties, params)
+        # What a person measured is never withheld, so that the others have to check the pose.
+        too_few_others = too_few(int((~tied.by_hand).sum()))
+        if pose is not None:
+            kept = pose.estimate.agreeing
+            joined = None if too_few_others else _joined(tied, ties, params, pose)
+            if joined is not None:
+                return Trusted(tied=tied, estimate=joined, by_hand=alone, kept=kept)
+        if alone.camera.status == "ok":
+            return alone
+        if too_few_others:
+            reason = alone.camera.status
+    estimate = reason or estimator(tied, params)
     if isinstance(estimate, str):
-        return refused(tied, hand.reason or estimate)
-    return hand.or_alone(judged(tied, candidate_of(tied, ties, params, estimate)))
+        return refused(tied, estimate if alone is None else alone.camera.status)
+    return Trusted(tied=tied, estimate=estimate, by_hand=alone, kept=kept)
 
 
-def reason_not_to_try(tied: TiedPhoto, hand: ByHand) -> str:
-    """Say why a photo that ties by hand do not orient cannot be either by all its ties."""
-    # What a person measured is never withheld, so that the others have to check the pose.
-    n_withheld_from = int((~tied.by_hand).sum())
-    return (hand.reason if too_few(n_withheld_from) else "") or too_few(len(tied.seen))
-
-
-def oriented_by_hand(tied: TiedPhoto, ties: Ties, params: OrientParams) -> ByHand:
-    """Orient a photo by the ties that a person measured, alone and with those that agree."""
-    nothing = ByHand(alone=refused(tied, ""), kept=np.zeros(len(tied.seen), dtype=np.bool_))
-    if tied.by_hand.sum() < TIES_LEAST:
-        return nothing
-    found = pose_by_hand(tied.photo, tied.seen, tied.by_hand)
+def oriented_by_hand(
+    tied: TiedPhoto, ties: Ties, params: OrientParams
+) -> tuple[Oriented, PoseByHand | None]:
+    """Orient a photo by the ties that a person measured alone, of which there are enough."""
+    found = pose_by_hand(tied)
     if isinstance(found, str):
-        return replace(nothing, alone=refused(tied, found))
-    alone = judged(tied, candidate_of(tied, ties, params, found.estimate))
-    hand = ByHand(alone=alone, kept=found.estimate.agreeing)
-    if too_few(int((~tied.by_hand).sum())):
-        return hand
+        return refused(tied, found), None
+    return judged(tied, candidate_of(tied, ties, params, found.estimate)), found
+
+
+def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, pose: PoseByHand) -> Estimate | None:
+    """Orient a photo by all ties from the pose by hand; None where they are against it."""
     try:
-        joined = adjusted(tied.photo, tied.seen, tied.is_check, found.start, tied.rule)
+        joined = adjusted(tied, pose.start, params)
     except GeometryError:
-        return hand
-    is_trusted = not reason_to_leave_out(candidate_of(tied, ties, params, joined))
-    return replace(hand, joined=joined) if is_trusted and hand.agrees(joined.agreeing) else hand
+        return None
+    against = refusal(candidate_of(tied, ties, params, joined), GATES_BEFORE_BLOCK)
+    return joined if against is None and joined.agreeing[pose.estimate.agreeing].all() else None
 
 
 def candidate_of(
@@ -303,18 +296,19 @@ def candidate_of(
         estimate=estimate,
         known=known,
         error=wall_error(estimate.resection, known),
-        rule=params.gates(),
+        params=params,
         search_radius_px=_search_radius_px(ties, tied.photo.name),
     )
 
 
 def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
     """Call an orientation ok, or say why not."""
-    reason = reason_against(candidate)
+    against = refusal(candidate)
     numbers = photo_numbers(candidate) if candidate.control.any() else None
-    entry: JsonValue = None if numbers is None else numbers_json(candidate, numbers)
-    if reason:
-        return replace(refused(tied, reason), entry=entry)
+    entry: dict[str, JsonValue] = {} if numbers is None else numbers_json(candidate, numbers)
+    if against is not None:
+        entry["refused_by"] = against.gate
+        return replace(refused(tied, against.text), entry=entry)
     result, estimate = candidate.estimate.resection, candidate.estimate
     role = np.where(candidate.checked, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[~estimate.agreeing] = TieRole.REJECTED
@@ -351,13 +345,13 @@ def refused(tied: TiedPhoto, reason: str) -> Oriented:
     )
 
 
-def _usable(ties: Ties, name: str, n_most: int) -> NDArray[np.intp]:
+def _usable(ties: Ties, name: str) -> NDArray[np.intp]:
     """Ties of a photo that may be used: not rejected by the matcher, thinned evenly."""
-    mine = of_photo(ties, name)
+    mine = ties_of_photo(ties, name)
     mine = np.asarray(mine[ties.role[mine] != TieRole.REJECTED], dtype=np.intp)
-    if len(mine) <= n_most:
+    if len(mine) <= _MAX_TIES:
         return mine
-    thinned = np.floor(np.arange(n_most) * len(mine) / n_most).astype(np.intp)
+    thinned = np.floor(np.arange(_MAX_TIES) * len(mine) / _MAX_TIES).astype(np.intp)
     kept = np.asarray(mine[thinned], dtype=np.intp)
     if ties.by_hand is not None:
         kept = np.union1d(kept, mine[ties.by_hand[mine] > 0])

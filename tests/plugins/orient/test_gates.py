@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.acceptance import (
+from orthoflow_plugins.orient.gates import (
+    CONTROL_GATES,
+    GATES_BEFORE_BLOCK,
     Candidate,
-    GateRule,
-    reason_against,
-    reason_to_leave_out,
+    hull_area,
+    refusal,
     too_few,
     warnings_for,
 )
+from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 from scipy import optimize, stats
 
@@ -36,15 +38,7 @@ WALL = KnownWall(
     gsd_m=0.002,
     has_side=True,
 )
-RULE = GateRule(
-    n_control_least=20,
-    n_quadrant_least=2,
-    quadrants_are_strict=False,
-    inlier_share_least=0.3,
-    hull_ratio_least=0.2,
-    sigma_wall_most_gsd=0.5,
-    sigma_corner_most_gsd=1.5,
-)
+PARAMS = OrientParams(min_hull_ratio=0.2, max_sigma_wall_cells=0.5, max_sigma_corner_cells=1.5)
 
 
 def grid(n: int = 10) -> np.ndarray:
@@ -98,9 +92,19 @@ def candidate(**changes: Any) -> Candidate:
         "estimate": estimate,
         "known": (WALL,),
         "error": error,
-        "rule": RULE,
+        "params": PARAMS,
     }
     return Candidate(**{**usual, **changes})
+
+
+def reason_against(judged: Candidate) -> str:
+    found = refusal(judged)
+    return "" if found is None else found.text
+
+
+def reason_to_leave_out(judged: Candidate) -> str:
+    found = refusal(judged, GATES_BEFORE_BLOCK)
+    return "" if found is None else found.text
 
 
 def test_a_good_orientation_is_ok_without_a_note() -> None:
@@ -132,26 +136,30 @@ def gated(**changes: Any) -> str:
     return reason_against(candidate(**changes))
 
 
-def rule(**changes: Any) -> GateRule:
-    return replace(RULE, **changes)
+def params(**changes: Any) -> OrientParams:
+    return PARAMS.model_copy(update=changes)
+
+
+def agreeing(n_control: int, n_check: int) -> np.ndarray:
+    """Whether ties agree: so many control ties, all over the photo, and so many withheld."""
+    is_check = candidate().is_check
+    found = np.zeros(N_TIES, dtype=np.bool_)
+    found[np.flatnonzero(~is_check)[:n_control]] = True
+    found[np.flatnonzero(is_check)[:n_check]] = True
+    return found
 
 
 @pytest.mark.parametrize(
     ("good", "bad", "reason"),
     [
         (
-            {"rule": rule(n_control_least=64)},
-            {"rule": rule(n_control_least=65)},
-            "only 64 of 80 control ties agree with one pose, at least 65 must",
+            {"agreeing": agreeing(12, 16)},
+            {"agreeing": agreeing(11, 16)},
+            "only 11 of 80 control ties agree with one pose, at least 12 must",
         ),
         (
-            {"rule": rule(inlier_share_least=0.79)},
-            {"rule": rule(inlier_share_least=0.81)},
-            "only 80.0% of 100 ties agree with one pose, at least 81.0% must",
-        ),
-        (
-            {"rule": rule(hull_ratio_least=0.8)},
-            {"rule": rule(hull_ratio_least=0.95)},
+            {"params": params(min_hull_ratio=0.8)},
+            {"params": params(min_hull_ratio=0.95)},
             "the control covers .*% of the part of the photo that shows",
         ),
         (
@@ -171,7 +179,7 @@ def rule(**changes: Any) -> GateRule:
         ),
         ({}, {"error": None}, "the photo would show no wall"),
     ],
-    ids=["control", "share", "hull", "error", "worst place", "side", "no wall"],
+    ids=["control", "hull", "error", "worst place", "side", "no wall"],
 )
 def test_each_gate_refuses_what_is_beyond_its_bound(
     good: dict[str, Any], bad: dict[str, Any], reason: str
@@ -274,9 +282,9 @@ def test_quarters_without_ties_must_be_known_from_the_others(quarter: int) -> No
     # Half a cell of 2 mm; what shows no wall needs nothing.
     assert reason(1, 0.00099) == reason(0, 0.0) == ""
     assert reason(1, 0.00101) != ""
-    strict = rule(quadrants_are_strict=True)
-    assert reason(1, 0.0, rule=strict) == "a quarter of the photo has 1 ties, each needs 2"
-    assert reason(2, 0.01, rule=strict) == ""
+    strict = params(quadrants="strict")
+    assert reason(1, 0.0, params=strict) == "a quarter of the photo has 1 ties, each needs 2"
+    assert reason(2, 0.01, params=strict) == ""
     unknown = (replace(WALL, gsd_m=None),)
     assert reason(1, 0.0001, known=unknown).endswith("with a predicted error of 0.1 mm")
     # A quarter that shows no wall is not asked for, whatever is known.
@@ -313,8 +321,8 @@ def test_limits_of_good_orientations_are_said() -> None:
     assert max(candidate(agreeing=in_quarter(0, 3)).quadrant_counts) <= 30
     assert said(agreeing=in_quarter(0, 3)) == []
     ratio = candidate().hull_ratio
-    assert said(rule=rule(hull_ratio_least=ratio / 1.51)) == []
-    covers = said(rule=rule(hull_ratio_least=ratio / 1.49))
+    assert said(params=params(min_hull_ratio=ratio / 1.51)) == []
+    covers = said(params=params(min_hull_ratio=ratio / 1.49))
     assert covers == [f"the control covers {ratio:.0%} of the part that shows the walls"]
     nowhere = candidate(error=None)
     assert (nowhere.hull_ratio, nowhere.worst_in_quarter_m(0)) == (0.0, 0.0)
@@ -334,3 +342,44 @@ def test_a_pose_by_hand_is_held_to_cells_only_where_they_are_known() -> None:
     # Nobody asks for the errors without one tie.
     by_hand.estimate.without_one = (None,)  # type: ignore[misc, assignment]
     assert reason_against(by_hand) == ""
+
+
+@pytest.mark.parametrize(("n_agree", "is_enough"), [(40, True), (39, False)])
+def test_one_tie_in_twenty_five_must_agree(n_agree: int, is_enough: bool) -> None:
+    some = candidate()
+    seen = some.seen.take(np.arange(1000) % N_TIES)
+    is_check = np.arange(1000) % 5 == 0
+    fit = np.arange(1000) < n_agree
+    found = refusal(
+        candidate(
+            seen=seen,
+            is_check=is_check,
+            walls=np.zeros(1000, dtype=np.int32),
+            agreeing=fit,
+        ),
+        CONTROL_GATES[:2],
+    )
+    assert (found is None or found.gate != "share") == is_enough
+    if not is_enough:
+        assert found is not None
+        assert found.values["share"] == pytest.approx(0.039)
+        assert found.text.startswith("only 3.9% of 1000 ties agree")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_area_of_a_hull_is_that_of_its_polygon(seed: int) -> None:
+    # Points within a triangle whose corners are among them.
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(0.0, 30.0, (3, 2))
+    weights = rng.dirichlet(np.ones(3), 60)
+    pixels = np.vstack([weights @ corners, corners, corners])
+    (a, b), (c, d) = corners[1:] - corners[0]
+    assert hull_area(pixels) == pytest.approx(0.5 * abs(a * d - b * c))
+
+
+def test_a_line_and_two_points_have_no_area() -> None:
+    line = np.outer(np.arange(5.0), [2.0, 3.0])
+    assert hull_area(line) == 0.0
+    assert hull_area(np.tile([[1.0, 2.0], [3.0, 9.0]], (4, 1))) == 0.0
+    assert hull_area(np.empty((0, 2))) == 0.0
+    assert hull_area(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]])) == pytest.approx(3.0)

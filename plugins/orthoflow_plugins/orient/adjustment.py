@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -22,37 +22,35 @@ from orthoflow_plugins.orient.block import (
     block_covariance,
 )
 from orthoflow_plugins.orient.colmap import solve
-from orthoflow_plugins.orient.estimation import (
+from orthoflow_plugins.orient.lenses import UNKNOWN, LensGroups, focal_sigma
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.photo_ties import PhotoTies
+from orthoflow_plugins.orient.photos import Trusted
+from orthoflow_plugins.orient.pose import (
     SOFT_LIMIT,
     Estimate,
     posed,
     unit_deviation,
     without_chance,
 )
-from orthoflow_plugins.orient.lenses import UNKNOWN, LensGroups, focal_sigma, intrinsics_of
-from orthoflow_plugins.orient.photo_ties import PhotoTies
-from orthoflow_plugins.orient.single_photo import ByHand, TiedPhoto
 
 _ROUNDS: Final = 5
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
 # Scan ties of several photos at one place of the wall are one point of the scan.
 _SAME_PLACE_M: Final = 1e-6
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trusted:
-    """A photo whose own ties orient it beyond chance.
-
-    Attributes:
-        tied: its ties.
-        estimate: its orientation by itself.
-        hand: what the ties that a person measured make of it.
-    """
-
-    tied: TiedPhoto
-    estimate: Estimate
-    hand: ByHand
+# Of photos without EXIF nobody knows whether one lens took them. A person who takes a series seldom
+# changes it, and a lens that many photos share is known far better than that of any of them. But a
+# lens may have zoomed, and a program may have turned a picture. So each photo's own ties are asked.
+# One photo in a thousand is given a lens of its own although it shares that of the others.
+_CHANCE: Final = 1e-3
+# A camera has one lens. A series that zoomed differs by more than this share of the focal length;
+# what errors of the scan that neighbouring ties have in common do to the focal length of one photo
+# is less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
+_ZOOM_LEAST: Final = 0.02
+_ZOOM_SIGMAS: Final = 5.0
+# Those that contradict most bend the lens, so that others contradict it, too: these leave first.
+_OF_MOST: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,13 +100,16 @@ class _State:
     tie_sigma: float
 
 
-def adjust_block(photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups) -> Adjusted:
+def adjust_block(
+    photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups, params: OrientParams
+) -> Adjusted:
     """Adjust photos and lenses together.
 
     Args:
         photos: the photos.
         ties: between them, in the world.
         groups: the lenses of the photos.
+        params: what is rejected.
 
     Raises:
         GeometryError: the ties do not determine the block.
@@ -124,7 +125,7 @@ def adjust_block(photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups)
             for item, camera in zip(photos, block.cameras, strict=True)
         ]
         before = state
-        state, limits = _weighed(photos, ties, block, fits, before)
+        state, limits = _weighed(photos, ties, (block, fits, before), params.rejection_sigma)
         if nth >= 1 and _same(before, state):
             break
     covariance = block_covariance(block, soft_limit=SOFT_LIMIT)
@@ -143,6 +144,32 @@ def adjust_block(photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups)
         n_tie_points=len(np.unique(ties.point[before.tie_active])),
         n_tie_observations=int(before.tie_active.sum()),
     )
+
+
+def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
+    """Find the photos that cannot have the lens that they share by their size alone.
+
+    Args:
+        photos: of the block.
+        adjusted: the block.
+
+    Returns:
+        Indices of those that contradict it most; of the others another adjustment tells.
+    """
+    lens_of = adjusted.block.lens_of
+    asked = [
+        at
+        for at, lens in enumerate(lens_of)
+        if adjusted.block.lenses[lens].source == UNKNOWN and lens_of.count(lens) > 1
+    ]
+    usual = _usual_widening(photos)
+    excesses = {
+        at: _excess(photos[at], adjusted.estimates[at], usual)
+        for at in asked
+        if _zoomed(photos[at].estimate.resection, adjusted.estimates[at].resection)
+    }
+    most = max(excesses.values(), default=0.0)
+    return frozenset(at for at, excess in excesses.items() if excess > max(1.0, _OF_MOST * most))
 
 
 def _start(
@@ -183,7 +210,7 @@ def _best_known(photos: Sequence[Trusted], groups: LensGroups, at: int) -> int:
 def _with_lens(item: Trusted, lens: ViewingCamera) -> ViewingCamera:
     """Pose of a photo with another lens: with another focal length it stands elsewhere."""
     estimate = item.estimate
-    control = item.tied.seen.take(estimate.agreeing & ~item.tied.is_check)
+    control = item.tied.control(estimate.agreeing)
     start = posed(lens, estimate.resection.camera)
     try:
         return fitted(control, start)
@@ -242,16 +269,16 @@ def _block(
 def _weighed(
     photos: Sequence[Trusted],
     ties: PhotoTies,
-    block: Block,
-    fits: Sequence[Misfit],
-    state: _State,
+    found: tuple[Block, Sequence[Misfit], _State],
+    rejection_sigma: float,
 ) -> tuple[_State, list[float]]:
     """Reject what disagrees with the block, and estimate how exact the rest is."""
+    block, fits, state = found
     agreeing, units, limits = [], [], []
     for item, fit, used in zip(photos, fits, state.agreeing, strict=True):
         is_check = item.tied.is_check
         unit = unit_deviation(fit.normalised[used])
-        limit = without_chance(fit.normalised[~is_check], item.tied.rule.rejection_sigma * unit)
+        limit = without_chance(fit.normalised[~is_check], rejection_sigma * unit)
         agreeing.append((fit.normalised <= limit) & ~is_check)
         units.append(unit)
         limits.append(limit)
@@ -263,8 +290,7 @@ def _weighed(
         left = np.maximum(2 * per_point[per_point > 0] - 3, 1).sum() / (2 * active.sum())
         sigma = float(np.median(lengths[active]) / MEDIAN_LENGTH / math.sqrt(left))
         sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
-        rejection = photos[0].tied.rule.rejection_sigma
-        active = _in_several(ties.point, lengths <= rejection * sigma)
+        active = _in_several(ties.point, lengths <= rejection_sigma * sigma)
     return (
         _State(
             cameras=block.cameras,
@@ -331,9 +357,53 @@ def _estimate(
     return replace(
         item.estimate,
         resection=resection,
-        intrinsics=intrinsics_of(resection, lens.source),
         source=lens.source,
         fit=fit,
         agreeing=fit.normalised <= limit,
         limit=limit,
     )
+
+
+def _zoomed(alone: Resection, shared: Resection) -> bool:
+    """Whether a photo's own ties ask for another focal length than the shared one, by far."""
+    off = abs(math.log(alone.camera.fx / shared.camera.fx))
+    return off > max(_ZOOM_LEAST, _ZOOM_SIGMAS * focal_sigma(alone))
+
+
+def _excess(item: Trusted, shared: Estimate, usual_widening: float) -> float:
+    """How much worse a photo's ties fit the shared lens, at any pose, than chance has it.
+
+    The likelihood ratio of the photo's own lens and the shared one, as chi-square over its limit.
+    """
+    from scipy.special import chdtri  # scipy.stats would take seconds to import
+
+    alone = item.estimate.resection
+    n_free = alone.lens.sigmas.size
+    if not n_free:
+        return 0.0
+    control = item.tied.control(item.estimate.agreeing)
+    limit = SOFT_LIMIT * alone.sigma0
+    try:
+        camera = fitted(control, shared.resection.camera, soft_limit=limit)
+    except GeometryError:
+        return math.inf
+    own = _loss(misfit(control, alone.camera).normalised, limit)
+    excess = _loss(misfit(control, camera).normalised, limit) - own
+    widening = max(_widening(alone), usual_widening)
+    return excess / (alone.sigma0**2 * widening * float(chdtri(n_free, _CHANCE)))
+
+
+def _widening(alone: Resection) -> float:
+    """By how much a photo's variances grow because residuals of neighbouring ties agree."""
+    return alone.variance_factor / alone.sigma0**2
+
+
+def _usual_widening(photos: Sequence[Trusted]) -> float:
+    """Median over the photos whose ties lie in enough places to tell it."""
+    told = [_widening(item.estimate.resection) for item in photos]
+    return float(np.median([each for each in told if each > 1.0] or [1.0]))
+
+
+def _loss(lengths: NDArray[np.float64], limit: float) -> float:
+    """Sum of squares, of those beyond a limit less (Huber)."""
+    return float(np.where(lengths <= limit, lengths**2, limit * (2.0 * lengths - limit)).sum())

@@ -7,27 +7,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient import estimation
-from orthoflow_plugins.orient.estimation import (
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.pose import (
     Estimate,
-    EstimationRule,
+    TiedPhoto,
     estimate_pose,
     expected_px,
+    image_cells,
     metres_per_pixel,
     posed,
+    robust_start,
     undistorted_pixels,
     unit_deviation,
     without_chance,
 )
 
-from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
 from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
-RULE = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=1000, seed=1)
+PARAMS = OrientParams()
 
 
 def camera() -> ViewingCamera:
@@ -58,6 +59,18 @@ def photo_by(viewer: ViewingCamera) -> Photo:
         width=viewer.width,
         height=viewer.height,
         intrinsics=Intrinsics.of(viewer),
+    )
+
+
+def tied(photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_]) -> TiedPhoto:
+    nobody = np.zeros(len(seen), dtype=np.bool_)
+    return TiedPhoto(
+        photo=photo,
+        chosen=np.arange(len(seen)),
+        seen=seen,
+        is_check=is_check,
+        by_hand=nobody,
+        seed=1,
     )
 
 
@@ -204,7 +217,7 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
     # Wide enough that no tie is rejected for the wrong focal length.
     seen = seen_by(true, n_ties, sigma_px=6.0)
     is_check = np.zeros(n_ties, dtype=np.bool_)
-    found = estimate_pose(photo_by(claimed), seen, is_check, RULE)
+    found = estimate_pose(tied(photo_by(claimed), seen, is_check), PARAMS)
     if not is_doubted:
         assert isinstance(found, Estimate)
         return
@@ -219,7 +232,7 @@ def test_ties_at_four_places_make_no_pose() -> None:
     seen = seen_by(true, 5)
     for n_places in (4, 5):
         places = seen.take(np.arange(40) % n_places)
-        start = estimation.robust_start(photo_by(true), places, np.zeros(40, dtype=np.bool_), RULE)
+        start = robust_start(tied(photo_by(true), places, np.zeros(40, dtype=np.bool_)), PARAMS)
         assert (start is not None) == (n_places == 5)
 
 
@@ -228,7 +241,7 @@ def test_withheld_ties_have_no_say_in_the_start() -> None:
     seen = seen_by(true, 60)
     is_check = np.arange(60) % 2 == 0
     wrong = replace(seen, pixels_photo=np.where(is_check[:, None], 10.0, seen.pixels_photo))
-    start = estimation.robust_start(photo_by(true), wrong, is_check, RULE)
+    start = robust_start(tied(photo_by(true), wrong, is_check), PARAMS)
     assert start is not None
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.source == "calibration"
@@ -243,7 +256,9 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     wrong = np.arange(300) % 10 == 0
     pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
     is_check = np.arange(300) % 4 == 0
-    found = estimate_pose(photo_by(true), replace(seen, pixels_photo=pixels), is_check, RULE)
+    found = estimate_pose(
+        tied(photo_by(true), replace(seen, pixels_photo=pixels), is_check), PARAMS
+    )
     assert isinstance(found, Estimate)
     assert found.limit == pytest.approx(3.5 * times, rel=0.2)
     assert found.agreeing[~wrong].mean() > 0.98
@@ -251,16 +266,8 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     np.testing.assert_array_equal(found.agreeing, found.fit.normalised <= found.limit)
 
 
-def test_ties_that_determine_no_camera_make_no_pose_and_no_doubt(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise GeometryError("the ties do not determine the camera")
-
-    true, nobody = camera(), np.zeros(60, dtype=np.bool_)
-    with monkeypatch.context() as patched:
-        patched.setattr(estimation, "first_step", fail)
-        assert isinstance(estimate_pose(photo_by(true), seen_by(true, 60), nobody, RULE), Estimate)
-    monkeypatch.setattr(estimation, "adjusted", fail)
-    said = estimate_pose(photo_by(true), seen_by(true, 60), nobody, RULE)
-    assert said == "no pose agrees with enough of its 60 ties"
+def test_cells_are_numbered_row_by_row_and_hold_what_lies_beside_the_image() -> None:
+    pixels = np.array([[0.0, 0.0], [99.9, 0.0], [100.0, 0.0], [0.0, 50.0], [299.0, 149.0]])
+    np.testing.assert_array_equal(image_cells(pixels, (300, 150), 3), [0, 0, 1, 3, 8])
+    beside = np.array([[-5.0, -5.0], [400.0, -5.0], [-5.0, 200.0], [300.0, 150.0]])
+    np.testing.assert_array_equal(image_cells(beside, (300, 150), 3), [0, 2, 6, 8])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -26,22 +26,34 @@ from orthoflow.geometry.resection import (
     stated,
 )
 from orthoflow.geometry.robust import MEDIAN_LENGTH
-from orthoflow.products import Intrinsics, Photo
-from orthoflow_plugins.orient.layout import GROUPS, image_cells
+from orthoflow.products import Intrinsics, Photo, Ties
 from orthoflow_plugins.orient.lenses import UNKNOWN, focal_sigma, intrinsics_of, lens_prior
+from orthoflow_plugins.orient.parameters import OrientParams
 
+MAX_ROUNDS: Final = 8
+"""An adjustment and its rejections take turns at most so often."""
+SOFT_LIMIT: Final = 3.0
+"""Residuals beyond so many standard deviations pull less (Huber).
+
+One normal tie in a hundred does; at 2, one in seven did, which cost exactness and understated the
+error by another tenth.
+"""
+PLACES_A_SIDE: Final = 5
+"""Cells a side of a photo within which ties may err together.
+
+On simulated rooms ties agree in their errors up to some 60 px of 1200: with 6 cells more of that
+crosses the borders, with 4 too few are left to learn from (error over stated, pooled over 94
+photos: 1.39 with 6, 1.34 with 5).
+"""
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
-_ROUNDS: Final = 8
+_MAX_TRIALS: Final = 20_000
 # A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _CHANCE_SHARE_MOST: Final = 0.1
 _TIGHTENING: Final = 0.8
 _TIGHTENED_MOST: Final = 7
-# Residuals beyond so many standard deviations pull less (Huber). One normal tie in a hundred does;
-# at 2, one in seven did, which cost exactness and understated the error by another tenth.
-SOFT_LIMIT: Final = 3.0
 # What is known of a lens beforehand keeps it in bounds; so many ties make the equations solvable.
 _LEAST_FOR_LENS: Final = 8
 # A calibration that is off by more than both is another lens's.
@@ -58,21 +70,28 @@ _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimationRule:
-    """How a photo is oriented.
+class TiedPhoto:
+    """A photo with the ties it is oriented by.
 
     Attributes:
-        rejection_sigma: ties beyond so many standard deviations are rejected.
-        threshold_px: ties agree with a sampled pose up to this distance; None derives it from
-            their sigmas.
-        n_trials_most: samples drawn at most.
+        photo: the photo.
+        chosen: (n,) index into all ties.
+        seen: these ties as an adjustment takes them.
+        is_check: (n,) withheld from every estimation.
+        by_hand: (n,) measured by a person.
         seed: of the samples.
     """
 
-    rejection_sigma: float
-    threshold_px: float | None
-    n_trials_most: int
+    photo: Photo
+    chosen: NDArray[np.intp]
+    seen: SeenPoints
+    is_check: NDArray[np.bool_]
+    by_hand: NDArray[np.bool_]
     seed: int
+
+    def control(self, agreeing: NDArray[np.bool_]) -> SeenPoints:
+        """Return the ties that agree (n,) and are not withheld."""
+        return self.seen.take(agreeing & ~self.is_check)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +100,6 @@ class Estimate:
 
     Attributes:
         resection: the adjusted camera.
-        intrinsics: its interior orientation.
         source: what was known of the lens before: `calibration`, `exif`, `none` ...
         fit: of all the photo's ties, control and check.
         agreeing: (n,) bool, ties within the limit.
@@ -93,7 +111,6 @@ class Estimate:
     """
 
     resection: Resection
-    intrinsics: Intrinsics
     source: str
     fit: Misfit
     agreeing: NDArray[np.bool_]
@@ -101,6 +118,15 @@ class Estimate:
     notes: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     without_one: tuple[Resection, ...] = ()
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Its interior orientation."""
+        return intrinsics_of(self.resection, self.source)
+
+
+Estimator = Callable[[TiedPhoto, OrientParams], Estimate | str]
+"""Orients one photo by its control ties, or says why it cannot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,49 +150,39 @@ class Start:
     n_least_for_lens: int = _LEAST_FOR_LENS
 
 
-def estimate_pose(
-    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
-) -> Estimate | str:
-    """Orient a photo by its control ties, or say why not.
-
-    Args:
-        photo: the photo.
-        seen: its ties.
-        is_check: (n,) ties withheld from everything but the final fit.
-        rule: how.
-    """
-    start = robust_start(photo, seen, is_check, rule)
+def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
+    """Orient a photo by its control ties, each by its own sigmas, or say why not."""
+    start = robust_start(tied, params)
     if start is None:
-        return no_pose(seen)
+        return no_pose(tied.seen)
     try:
-        found = adjusted(photo, seen, is_check, start, rule)
+        found = adjusted(tied, start, params)
     except GeometryError:
-        return no_pose(seen)
-    return _calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
+        return no_pose(tied.seen)
+    return _calibration_doubt(found, tied.control(found.agreeing)) or found
 
 
-def focal_without_exif(
-    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
-) -> float | None:
+def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
     """Return the focal length in pixels that a photo's ties ask for where EXIF's contradicts them.
 
     Returns:
         None where they do not contradict it, or say too little of it.
     """
-    if photo.intrinsics is not None or photo.exif_focal_px is None or len(seen) < _LEAST_FOR_FOCAL:
+    exif_px = tied.photo.exif_focal_px
+    if tied.photo.intrinsics is not None or exif_px is None or len(tied.seen) < _LEAST_FOR_FOCAL:
         return None
-    unknown = replace(photo, exif_focal_px=None)
-    start = robust_start(unknown, seen, is_check, rule)
+    unknown = replace(tied, photo=replace(tied.photo, exif_focal_px=None))
+    start = robust_start(unknown, params)
     if start is None or start.agreeing.sum() < _LEAST_FOR_FOCAL:
         return None
-    by_exif = robust_start(photo, seen, is_check, rule)
+    by_exif = robust_start(tied, params)
     if by_exif is not None and start.agreeing.sum() < _MANY_MORE * by_exif.agreeing.sum():
         return None
     try:
-        found = adjusted(unknown, seen, is_check, start, rule).resection
+        found = adjusted(unknown, start, params).resection
     except GeometryError:
         return None
-    off = abs(math.log(found.camera.fx / photo.exif_focal_px))
+    off = abs(math.log(found.camera.fx / exif_px))
     sigma = focal_sigma(found)
     return found.camera.fx if off > max(_EXIF_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma) else None
 
@@ -176,51 +192,45 @@ def no_pose(seen: SeenPoints) -> str:
     return f"no pose agrees with enough of its {len(seen)} ties"
 
 
-def robust_start(
-    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
-) -> Start | None:
+def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     """Find the pose that most control ties agree with; None when there is none."""
-    prior, control = lens_prior(photo), seen.take(~is_check)
-    if rule.threshold_px is None:
+    prior, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
+    threshold_px = params.threshold_px
+    if threshold_px is None:
         # A lens known only roughly misplaces even right ties.
         slack = 1.0 if prior.source not in ("exif", UNKNOWN) else 2.0
-        rule = replace(rule, threshold_px=slack * rule.rejection_sigma * expected_px(control))
-    best: _RobustPose | None = None
+        threshold_px = slack * params.rejection_sigma * expected_px(control)
+    best: tuple[ViewingCamera, NDArray[np.bool_]] | None = None
     for intrinsics in prior.guesses:
-        pose = _robust_pose(control, intrinsics.posed(), rule)
-        if pose is not None and (best is None or pose.agreeing.sum() > best.agreeing.sum()):
+        pose = _robust_pose(control, intrinsics.posed(), threshold_px, tied.seed)
+        if pose is not None and (best is None or pose[1].sum() > best[1].sum()):
             best = pose
     if best is None:
         return None
-    agreeing = np.zeros(len(seen), dtype=np.bool_)
-    agreeing[~is_check] = best.agreeing
+    agreeing = np.zeros(len(tied.seen), dtype=np.bool_)
+    agreeing[~tied.is_check] = best[1]
     # Points that appear twice say nothing new to a pose of six unknowns.
-    if len(set(map(tuple, seen.points_world[agreeing].round(4).tolist()))) < 5:
+    if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     return Start(
-        camera=best.camera,
-        prior=best.camera,
+        camera=best[0],
+        prior=best[0],
         agreeing=agreeing,
         freedom=prior.freedom,
         source=prior.source,
     )
 
 
-def adjusted(
-    photo: Photo,
-    seen: SeenPoints,
-    is_check: NDArray[np.bool_],
-    start: Start,
-    rule: EstimationRule,
-) -> Estimate:
+def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
     """Adjust and reject in turns until the control ties stay the same.
 
     Raises:
         GeometryError: the ties that agree do not determine the camera.
     """
+    seen, is_check = tied.seen, tied.is_check
     camera, agreeing = start.camera, start.agreeing
     unit = unit_deviation(misfit(seen, camera).normalised[agreeing & ~is_check])
-    for _ in range(_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         used = agreeing & ~is_check
         lens = start.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), SOFT_LIMIT * unit
@@ -229,7 +239,7 @@ def adjusted(
         camera = fitted(control, begin, prior=start.prior, lens=lens, soft_limit=soft_limit)
         fit = misfit(seen, camera)
         before, unit = unit, unit_deviation(fit.normalised[used])
-        limit = without_chance(fit.normalised[~is_check], rule.rejection_sigma * unit)
+        limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
         again = fit.normalised <= limit
         if np.array_equal(again & ~is_check, used) and abs(unit / before - 1.0) < _SETTLED_SHARE:
             break
@@ -239,17 +249,32 @@ def adjusted(
         camera,
         prior=start.prior,
         lens=lens,
-        groups=image_cells(control.pixels_photo, (photo.width, photo.height), GROUPS),
+        groups=places_in_photo(control.pixels_photo, camera),
         soft_limit=soft_limit,
     )
-    return Estimate(
-        resection=resection,
-        intrinsics=intrinsics_of(resection, start.source),
-        source=start.source,
-        fit=fit,
-        agreeing=again,
-        limit=limit,
-    )
+    return Estimate(resection=resection, source=start.source, fit=fit, agreeing=again, limit=limit)
+
+
+def ties_of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
+    """Index of the ties of a photo."""
+    if name not in ties.photo_names:
+        return np.empty(0, dtype=np.intp)
+    return np.flatnonzero(ties.photo == ties.photo_names.index(name))
+
+
+def image_cells(
+    pixels_photo: NDArray[np.float64], size_px: tuple[int, int], side: int
+) -> NDArray[np.intp]:
+    """Cell (n,) of each pixel in a grid of side x side cells over an image (width, height)."""
+    scaled = np.floor(pixels_photo * side / np.array(size_px)).astype(np.intp)
+    scaled = np.clip(scaled, 0, side - 1)
+    cells: NDArray[np.intp] = scaled[:, 1] * side + scaled[:, 0]
+    return cells
+
+
+def places_in_photo(pixels_photo: NDArray[np.float64], camera: ViewingCamera) -> NDArray[np.intp]:
+    """Number (n,) the cells of a photo within which ties may err together."""
+    return image_cells(pixels_photo, (camera.width, camera.height), PLACES_A_SIDE)
 
 
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
@@ -309,19 +334,6 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
     return rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _RobustPose:
-    """A pose and the ties that agree with it.
-
-    Attributes:
-        camera: the camera at that pose.
-        agreeing: (n,) bool.
-    """
-
-    camera: ViewingCamera
-    agreeing: NDArray[np.bool_]
-
-
 def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
     """Say that a calibrated photo was taken with another focal length; empty when it may be right.
 
@@ -334,7 +346,7 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
         step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
         if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
             return ""
-        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
+        cells = places_in_photo(control.pixels_photo, camera)
         free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
     except GeometryError:
         return ""
@@ -349,16 +361,19 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
     )
 
 
-def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) -> _RobustPose | None:
+def _robust_pose(
+    seen: SeenPoints, lens: ViewingCamera, threshold_px: float, seed: int
+) -> tuple[ViewingCamera, NDArray[np.bool_]] | None:
     """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
 
     Args:
         seen: the ties.
         lens: the camera's interior orientation; its pose is ignored.
-        rule: how samples are drawn; its `threshold_px` is known.
+        threshold_px: ties agree up to this distance.
+        seed: of the samples.
 
     Returns:
-        None when no pose is found.
+        The camera at that pose and the ties (n,) that agree with it; None when no pose is found.
     """
     import cv2
 
@@ -369,11 +384,19 @@ def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) ->
     middle = seen.points_world.mean(axis=0)
     pixels = np.ascontiguousarray(to_opencv(usable[inside]))
     points = np.ascontiguousarray(seen.points_world[inside] - middle)
+    usac: Any = cv2.UsacParams()
+    usac.threshold = threshold_px
+    usac.maxIterations = _MAX_TRIALS
+    usac.confidence = _CONFIDENCE
+    usac.randomGeneratorState = seed
+    # Several threads give another result each time.
+    usac.isParallel = False
+    usac.score = cv2.SCORE_METHOD_MSAC
+    # The adjustment that follows does what a local optimisation would do in thrice the time.
+    usac.loMethod = cv2.LOCAL_OPTIM_NULL
     call: Any = cv2.solvePnPRansac
     try:
-        found, _, turn, shift, agreed = call(
-            points, pixels, opencv_matrix(lens), None, params=_usac(rule)
-        )
+        found, _, turn, shift, agreed = call(points, pixels, opencv_matrix(lens), None, params=usac)
     except cv2.error:  # no sample has a solution
         return None
     if not found or agreed is None:
@@ -382,20 +405,4 @@ def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) ->
     local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
     agreeing = np.zeros(len(inside), dtype=np.bool_)
     agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
-    return _RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
-
-
-def _usac(rule: EstimationRule) -> Any:
-    """OpenCV's universal sampling, one thread: several give another result each time."""
-    import cv2
-
-    params: Any = cv2.UsacParams()
-    params.threshold = rule.threshold_px
-    params.maxIterations = rule.n_trials_most
-    params.confidence = _CONFIDENCE
-    params.randomGeneratorState = rule.seed
-    params.isParallel = False
-    params.score = cv2.SCORE_METHOD_MSAC
-    # The adjustment that follows does what a local optimisation would do in thrice the time.
-    params.loMethod = cv2.LOCAL_OPTIM_NULL
-    return params
+    return local.shifted(-middle), agreeing
