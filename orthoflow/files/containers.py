@@ -10,15 +10,19 @@ import io
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, Literal
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.rasterio_guard import let_go_of_foreign_text
+from orthoflow.geometry.levels import Colours
+
 if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
+    from rasterio.io import DatasetReader
 
 # What can be decoded; HEIC and AVIF where Pillow can.
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
@@ -53,14 +57,20 @@ _HEIC_BRANDS: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"
 _AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
 
 _SUBFILE_TAG: Final = 254
-_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG, _ORIENTATION_TAG = 256, 257, 258, 262, 274
+_PREVIEW, _MASK = 1, 4
+_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG = 256, 257, 258, 262
+# Grey, RGB, palette, CMYK (which GDAL turns into RGB) and YCbCr.
+_WHITE_IS_ZERO, _PALETTE = 0, 3
+_COLOURS_OF_TIFF: Final = (_WHITE_IS_ZERO, 1, 2, _PALETTE, 5, 6)
 _SUB_IFDS_TAG: Final = 330
 _DNG_TAG: Final = 50706
 _COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
 _MAX_PAGES: Final = 200
-# What libjpeg says of data that end, or whose codes make no sense; the rest of the photo is noise.
-_LOST_DATA: Final = ("premature end", "bad huffman code", "invalid component", "corrupt")
-_EXTRA_BYTES: Final = "extraneous bytes"
+# What libjpeg says of headers that cost no pixel; of anything else the rest of the photo is noise.
+_HARMLESS: Final = ("jfif revision", "adobe color transform", "icc marker")
+_EXTRA_BYTES: Final = "extraneous bytes before marker 0xd9"
+_PADDING: Final = b"\0\xff"
+_FEW_BYTES: Final = 8
 _ANY_SIZE: Final = threading.Lock()
 
 
@@ -105,9 +115,8 @@ def _raw_in_tiff(encoded: bytes) -> str | None:
         if page.get(_PHOTOMETRIC_TAG) == _COLOUR_FILTER_ARRAY:
             return "camera raw"
     # NEF, ARW, PEF: only previews in the pages, the picture itself below them.
-    if pages and all(_is_reduced(page) and _SUB_IFDS_TAG in page for _, page in pages[:1]):
-        return None if any(not _is_reduced(page) for _, page in pages) else "camera raw"
-    return None
+    is_below = bool(pages) and _SUB_IFDS_TAG in pages[0][1]
+    return "camera raw" if is_below and not any(_is_photo(page) for _, page in pages) else None
 
 
 def tiff_pages(encoded: bytes) -> list[tuple[int, ImageFileDirectory_v2]]:
@@ -135,79 +144,127 @@ def tiff_pages(encoded: bytes) -> list[tuple[int, ImageFileDirectory_v2]]:
     return pages
 
 
-def _is_reduced(page: ImageFileDirectory_v2) -> bool:
-    kind = page.get(_SUBFILE_TAG)
-    return isinstance(kind, int) and bool(kind & 1)
-
-
 def _number(page: ImageFileDirectory_v2, tag: int) -> int:
     value = page.get(tag)
     first = value[0] if isinstance(value, tuple) and value else value
     return int(first) if isinstance(first, int) else 0
 
 
+def _is_photo(page: ImageFileDirectory_v2) -> bool:
+    return not _number(page, _SUBFILE_TAG) & (_PREVIEW | _MASK)
+
+
 def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
     """Return the page of a TIFF file that holds the photo: the largest that is no preview."""
     pages = tiff_pages(encoded)
-    whole = [item for item in pages if not _is_reduced(item[1])] or pages
     return max(
-        whole,
+        [item for item in pages if _is_photo(item[1])] or pages,
         key=lambda item: _number(item[1], _WIDTH_TAG) * _number(item[1], _HEIGHT_TAG),
         default=None,
     )
 
 
 def count_pages(encoded: bytes) -> int:
-    """Return how many pages of a TIFF file are no previews; 1 for another format."""
+    """Return how many pages of a TIFF file are no previews or masks; 1 for another format."""
     if encoded[:4] not in _TIFF_MAGICS:
         return 1
-    return max(1, sum(not _is_reduced(page) for _, page in tiff_pages(encoded)))
+    return max(1, sum(_is_photo(page) for _, page in tiff_pages(encoded)))
 
 
-def as_decoded(encoded: bytes, *, is_upright: bool = True) -> bytes:
-    """Return a TIFF file that begins with the page of the photo; others as they are.
-
-    Decoders take the first page, which may be a preview, and OpenCV and Pillow turn TIFF images by
-    their orientation even when they are not asked to.
-
-    Args:
-        encoded: the file's bytes.
-        is_upright: whether to set the orientation to 1, so that nobody turns it.
-    """
-    if encoded[:4] not in _TIFF_MAGICS:
-        return encoded
-    found = photo_page(encoded)
-    if found is None:
-        return encoded
-    start, page = found
+def _from_page(encoded: bytes, start: int) -> bytes:
+    """Return a TIFF file that begins with one of its pages: decoders take the first."""
     order: Literal["little", "big"] = "little" if encoded[:2] == b"II" else "big"
-    is_big = encoded[2:4] in (b"+\0", b"\0+")
-    place, size = (8, 8) if is_big else (4, 4)
-    changed = bytearray(encoded)
-    changed[place : place + size] = start.to_bytes(size, order)
-    if is_upright and _number(page, _ORIENTATION_TAG) > 1:
-        _stand_upright(changed, start, order, is_big=is_big)
-    return bytes(changed)
-
-
-def _stand_upright(
-    content: bytearray, start: int, order: Literal["little", "big"], *, is_big: bool
-) -> None:
-    """Set the orientation in the directory of a TIFF file to 1."""
-    count_size, entry_size, value_at = (8, 20, 12) if is_big else (2, 12, 8)
-    first = start + count_size
-    last = first + entry_size * int.from_bytes(content[start:first], order)
-    for entry in range(first, min(last, len(content) - entry_size + 1), entry_size):
-        if int.from_bytes(content[entry : entry + 2], order) == _ORIENTATION_TAG:
-            content[entry + value_at : entry + value_at + 2] = (1).to_bytes(2, order)
-            return
+    place, size = (8, 8) if encoded[2:4] in (b"+\0", b"\0+") else (4, 4)
+    return encoded[:place] + start.to_bytes(size, order) + encoded[place + size :]
 
 
 @contextmanager
-def opened(encoded: bytes, *, is_upright: bool = True) -> Iterator[Image | None]:
-    """Open a photo by Pillow, without decoding it; None where it cannot. As for `as_decoded`."""
+def _tiff_page(encoded: bytes, start: int) -> Iterator[DatasetReader]:
+    """Open a page of a TIFF file by GDAL, which knows more layouts than OpenCV and Pillow.
+
+    Raises:
+        ValueError: it cannot be opened or read.
+    """
+    from rasterio.errors import RasterioError, RasterioIOError
+    from rasterio.io import MemoryFile
+
+    let_go_of_foreign_text()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with (
+                MemoryFile(_from_page(encoded, start)) as memory,
+                memory.open(driver="GTiff") as page,
+            ):
+                yield page
+        except (RasterioError, RasterioIOError) as error:
+            raise ValueError(str(error.__cause__ or error)) from error
+
+
+def tiff_pixels(encoded: bytes) -> Colours:
+    """Decode the photo of a TIFF file, (rows, cols, 3) of 8 or 16 bits.
+
+    Raises:
+        ValueError: it is damaged, or of a kind that is no photo.
+    """
+    found = photo_page(encoded)
+    if found is None:
+        raise ValueError("it has no page that can be read")
+    start, tags = found
+    kind = tags.get(_PHOTOMETRIC_TAG)
+    if kind not in _COLOURS_OF_TIFF:
+        raise ValueError(f"its colours (photometric {kind}) are not read: save it as RGB")
+    with _tiff_page(encoded, start) as page:
+        if page.dtypes[0] not in ("uint8", "uint16"):
+            raise ValueError(f"its samples are {page.dtypes[0]}: save it with 8 or 16 bits")
+        bands: NDArray[Any] = page.read([1, 2, 3] if page.count > 2 else [1])
+        most = (1 << min(_number(tags, _BITS_TAG) or 1, 16)) - 1
+        if kind == _PALETTE:
+            table = page.colormap(1)
+            shades = [table.get(at, (0, 0, 0))[:3] for at in range(256)]
+            palette: Colours = np.array(shades, dtype=np.uint8)
+            return palette[bands[0]]
+    full = np.iinfo(bands.dtype).max
+    if most < full:
+        bands = (bands.astype(np.float32) * (full / most)).round().clip(0, full).astype(bands.dtype)
+    if kind == _WHITE_IS_ZERO:
+        bands = full - bands
+    return np.ascontiguousarray(np.broadcast_to(np.moveaxis(bands, 0, 2), (*bands.shape[1:], 3)))
+
+
+def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
+    """Which pixels of a TIFF file are opaque, by its alpha or by a page that is a mask."""
+    from rasterio.enums import ColorInterp
+
+    found = photo_page(encoded)
+    if found is None:
+        return None
+    start, photo = found
+    size = [_number(photo, tag) for tag in (_WIDTH_TAG, _HEIGHT_TAG)]
+    masks = [
+        at
+        for at, page in tiff_pages(encoded)
+        if _number(page, _SUBFILE_TAG) & _MASK
+        and [_number(page, tag) for tag in (_WIDTH_TAG, _HEIGHT_TAG)] == size
+    ]
+    opaque: NDArray[np.bool_] | None = None
+    with _tiff_page(encoded, start) as page:
+        if ColorInterp.alpha in page.colorinterp:
+            alpha = page.read(page.colorinterp.index(ColorInterp.alpha) + 1)
+            opaque = alpha > np.iinfo(alpha.dtype).max // 2
+    for at in masks:
+        with _tiff_page(encoded, at) as page:
+            shown: NDArray[np.bool_] = page.read(1) > 0
+        opaque = shown if opaque is None else opaque & shown
+    return opaque
+
+
+@contextmanager
+def opened(encoded: bytes) -> Iterator[Image | None]:
+    """Open a photo by Pillow, without decoding it; None where it cannot."""
     from PIL import Image
 
+    found = photo_page(encoded) if encoded[:4] in _TIFF_MAGICS else None
     if photo_format(encoded) == "HEIC":
         _register_heic()
     with warnings.catch_warnings():
@@ -216,7 +273,9 @@ def opened(encoded: bytes, *, is_upright: bool = True) -> Iterator[Image | None]
             # Pillow refuses less than `MOST_PIXELS`, which all who decode look at.
             most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
-                image = Image.open(io.BytesIO(as_decoded(encoded, is_upright=is_upright)))
+                image = Image.open(
+                    io.BytesIO(encoded if found is None else _from_page(encoded, found[0]))
+                )
             except Exception:  # noqa: BLE001 - Pillow's plugins raise anything on damaged files
                 image = None
             finally:
@@ -272,15 +331,16 @@ def icc_profile(encoded: bytes) -> bytes | None:
 
 def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
     """Return which pixels (height, width) are not transparent; None where all are opaque."""
-    with opened(encoded) as image:
-        if image is None or not image.has_transparency_data:
-            return None
-        try:
-            alpha = np.asarray(image.convert("RGBA").getchannel("A"))
-        except Exception:  # noqa: BLE001 - damage is found by whoever decodes the colours
-            return None
-    opaque: NDArray[np.bool_] = alpha >= 128
-    return None if opaque.all() else opaque
+    opaque: NDArray[np.bool_] | None = None
+    # Damage is found by whoever decodes the colours.
+    if encoded[:4] in _TIFF_MAGICS:
+        with suppress(ValueError):
+            opaque = _tiff_alpha(encoded)
+    else:
+        with opened(encoded) as image, suppress(Exception):
+            if image is not None and image.has_transparency_data:
+                opaque = np.asarray(image.convert("RGBA").getchannel("A")) > 127
+    return None if opaque is None or opaque.all() else opaque
 
 
 def is_whole_png(encoded: bytes) -> bool:
@@ -298,7 +358,10 @@ def damage(encoded: bytes) -> tuple[str, bool]:
 
     Returns:
         What was found, empty for a sound file; True where a part of the photo is missing or noise.
+        Of TIFF files nothing: `tiff_pixels` raises.
     """
+    if encoded[:4] in _TIFF_MAGICS:
+        return "", False
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
         # It is not decoded, here or later.
@@ -313,11 +376,9 @@ def damage(encoded: bytes) -> tuple[str, bool]:
             simplejpeg.decode_jpeg(encoded, colorspace=space, **smallest)
         except ValueError as error:
             text = str(error)
-            if _EXTRA_BYTES in text:
-                return text, False
-            # Others are oddities that cost nothing.
-            is_lost = any(part in text.lower() for part in _LOST_DATA)
-            return (text, True) if is_lost else ("", False)
+            if any(part in text.lower() for part in _HARMLESS):
+                return "", False
+            return text, not _is_padded(encoded, text)
         except KeyError:
             # It names the kinds of sub-sampling that it knows; Pillow sees truncation.
             pass
@@ -333,3 +394,17 @@ def damage(encoded: bytes) -> tuple[str, bool]:
             except Exception as error:  # noqa: BLE001 - Pillow's plugins raise anything
                 found = str(error) or type(error).__name__
     return found, bool(found)
+
+
+def _is_padded(encoded: bytes, text: str) -> bool:
+    """Whether libjpeg only passed over bytes between the scan and the end, as cameras write them.
+
+    These are a few of any kind, or many of padding; where it took a part of the padding for
+    pixels, that stands in the place of the scan.
+    """
+    if _EXTRA_BYTES not in text:
+        return False
+    passed_over = int(text.partition(_EXTRA_BYTES)[0].split()[-1])
+    scan = encoded[: encoded.rfind(b"\xff\xd9")]
+    n_padding = len(scan) - len(scan.rstrip(_PADDING))
+    return abs(passed_over - n_padding) <= _FEW_BYTES

@@ -110,7 +110,7 @@ class FocalLength:
 
 def read_exif(encoded: bytes) -> Exif:
     """Read the EXIF data of a photo; without any, everything is absent."""
-    with opened(encoded, is_upright=False) as image:
+    with opened(encoded) as image:
         if image is None:
             return Exif()
         found, is_damaged = _tags(image)

@@ -18,11 +18,11 @@ from orthoflow.files.containers import (
     HOW_TO_READ_HEIC,
     MOST_PIXELS,
     READABLE,
-    as_decoded,
     is_whole_png,
     opened,
     photo_format,
     stated_size,
+    tiff_pixels,
 )
 from orthoflow.geometry.levels import Colours, eight_bits
 
@@ -37,8 +37,6 @@ RAW_SUFFIXES: Final = frozenset(
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# How far 8 bits lie apart that are cut off, or rounded.
-_ROUNDED_LEVELS: Final = 2
 # Larger images are averaged before they are shrunk, so many rows of the result at a time.
 _IN_MEMORY_PX: Final = 1 << 26
 _BAND_PX: Final = 64
@@ -61,34 +59,20 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
     Raises:
         InputError: the bytes are no JPEG, PNG, TIFF or WebP, or cut off, or too many pixels.
     """
-    image = _decoded(encoded, name, is_deep=False)
-    return np.ascontiguousarray(image).astype(np.uint8, copy=False)
+    return eight_bits(_decoded(encoded, name, is_deep=False))
 
 
 def decode_levels(encoded: bytes, name: str = "image") -> Colours:
-    """Decode as `decode_image`, but into uint16 where a PNG or TIFF file has 16 bits per channel.
+    """Decode as `decode_image`, but into uint16 where a PNG or TIFF file has more than 8 bits.
 
     Raises:
-        InputError: as `decode_image`, or the 16 bits cannot be decoded faithfully.
+        InputError: as `decode_image`.
     """
-    plain = decode_image(encoded, name)
-    image = _decoded(encoded, name, is_deep=True)
-    if image.dtype != np.uint16:
-        return plain
-    # OpenCV 5.0 gives noise for TIFF of 16 bits that is wanted as RGB, or has separate planes, and
-    # says nothing; 8 bits go another way through libtiff.
-    deep = np.ascontiguousarray(image[..., ::-1]).astype(np.uint16, copy=False)
-    apart = np.abs(eight_bits(deep).astype(np.int16) - plain)
-    if apart.max(initial=0) > _ROUNDED_LEVELS:
-        raise InputError(
-            f"{name} has 16 bits per channel in a layout that is not decoded faithfully: save it "
-            "again as TIFF with interleaved channels, not separate planes, or as PNG"
-        )
-    return deep
+    return _decoded(encoded, name, is_deep=True)
 
 
-def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]:
-    """Decode an image: RGB of 8 bits, or BGR of its own depth."""
+def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
+    """Decode an image into RGB; of a PNG of 16 bits only 8 unless it is to be deep."""
     import cv2
 
     kind = photo_format(encoded)
@@ -101,28 +85,23 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]
             f"{name} is too large: {size[0]} x {size[1]} pixels, at most {MOST_PIXELS} are "
             "decoded; make it smaller or cut it into parts"
         )
-    if kind in ("HEIC", "AVIF"):
-        return _decoded_by_pillow(encoded, name, is_deep=is_deep)
     try:
-        depth = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH if is_deep else cv2.IMREAD_COLOR_RGB
-        flags = depth | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(as_decoded(encoded), dtype=np.uint8), flags)
-    except cv2.error as error:
-        raise InputError(_not_an_image(encoded, name)) from error
-    if image is None:
+        if kind in ("TIFF", "BigTIFF"):
+            return tiff_pixels(encoded)
+        if kind in ("HEIC", "AVIF"):
+            with opened(encoded) as image:
+                if image is None:
+                    raise InputError(_not_an_image(encoded, name))
+                return np.asarray(image.convert("RGB"))
+        depth = cv2.IMREAD_ANYDEPTH if is_deep else 0
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | depth
+        decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+    except (cv2.error, ValueError, OSError, SyntaxError) as error:
+        reason = str(error) if kind in ("TIFF", "BigTIFF") else ""
+        raise InputError(_not_an_image(encoded, name, reason)) from error
+    if decoded is None:
         raise InputError(_not_an_image(encoded, name))
-    return np.asarray(image)
-
-
-def _decoded_by_pillow(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]:
-    with opened(encoded) as image:
-        if image is None:
-            raise InputError(_not_an_image(encoded, name))
-        try:
-            colours = np.asarray(image.convert("RGB"))
-        except Exception as error:
-            raise InputError(_not_an_image(encoded, name)) from error
-    return colours[..., ::-1] if is_deep else colours
+    return np.ascontiguousarray(decoded)
 
 
 def encode_png(image: Colours) -> bytes:
@@ -337,13 +316,14 @@ def _encode(suffix: str, image: Colours, options: list[int]) -> bytes:
     return encoded.tobytes()
 
 
-def _not_an_image(encoded: bytes, name: str) -> str:
+def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
     kind = photo_format(encoded)
     if kind == "HEIC":
         return f"{name} is a HEIC file: {HOW_TO_READ_HEIC}"
     if kind is not None and kind not in READABLE:
         return f"{name} is a {kind} file: expected JPEG, PNG or TIFF; convert it"
     return (
-        f"{name} cannot be decoded as an image ({len(encoded)} bytes): expected a whole JPEG, PNG "
-        "or TIFF file; open it in an image viewer, or copy it again from the camera"
+        f"{name} cannot be decoded as an image ({len(encoded)} bytes"
+        f"{f': {reason}' if reason else ''}): expected a whole JPEG, PNG or TIFF file; open it in "
+        "an image viewer, or copy it again from the camera"
     )

@@ -129,6 +129,39 @@ def test_the_photo_of_a_tiff_is_its_largest_page_that_is_no_preview(
     np.testing.assert_array_equal(decode_image(encoded), PICTURE)
 
 
+@pytest.mark.parametrize("order", [(0, 4), (4, 0), (1, 4, 0)], ids=["last", "first", "preview"])
+def test_a_page_of_a_tiff_that_is_a_mask_is_its_alpha(order: tuple[int, ...]) -> None:
+    mask = np.full(PICTURE.shape[:2], 255, dtype=np.uint8)
+    mask[:, 100:] = 0
+    images = {0: PICTURE, 1: np.ascontiguousarray(PICTURE[::8, ::8]), 4: mask}
+    encoded = pages(*(images[kind] for kind in order), subfiles=order)
+    assert count_pages(encoded) == 1
+    np.testing.assert_array_equal(decode_image(encoded), PICTURE)
+    np.testing.assert_array_equal(opaque_pixels(encoded), mask > 0)
+
+
+def test_the_internal_mask_that_gdal_writes_is_the_alpha() -> None:
+    shown = np.zeros(PICTURE.shape[:2], dtype=np.bool_)
+    shown[10:60, 20:90] = True
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.MemoryFile() as memory:
+        size = {"height": 96, "width": 128, "count": 3, "dtype": "uint8"}
+        with memory.open(driver="GTiff", transform=Affine.scale(2, -2), **size) as out:
+            out.write(np.moveaxis(PICTURE, -1, 0))
+            out.write_mask(shown)
+        encoded = bytes(memory.getbuffer())
+    np.testing.assert_array_equal(opaque_pixels(encoded), shown)
+    assert count_pages(encoded) == 1
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "CMYK"])
+def test_the_colours_of_a_tiff_are_those_that_pillow_sees(mode: str) -> None:
+    picture = Image.fromarray(PICTURE).convert(mode)
+    stream = io.BytesIO()
+    picture.save(stream, "TIFF")
+    expected = np.asarray(picture.convert("RGB")).astype(int)
+    assert np.abs(decode_image(stream.getvalue()) - expected).max() <= 1
+
+
 def test_whole_pages_of_a_tiff_are_counted() -> None:
     encoded = pages(PICTURE, PICTURE, subfiles=(0, 0))
     assert count_pages(encoded) == 2
@@ -168,8 +201,11 @@ def test_a_photo_without_transparency_is_opaque(kind: str) -> None:
     assert opaque_pixels(saved(kind)) is None
 
 
-PHOTO = cv2.GaussianBlur(
-    np.random.default_rng(1).integers(0, 256, (400, 600, 3)).astype(np.uint8), (0, 0), 2
+PHOTO: NDArray[np.uint8] = np.asarray(
+    cv2.GaussianBlur(
+        np.random.default_rng(1).integers(0, 256, (400, 600, 3)).astype(np.uint8), (0, 0), 2
+    ),
+    dtype=np.uint8,
 )
 
 
@@ -200,32 +236,52 @@ def test_sound_photos_are_not_called_damaged(encoded: bytes) -> None:
     assert not damage(encoded + b"video of a phone")[1]
 
 
-def _zeros(encoded: bytes) -> bytes:
+def _replaced(encoded: bytes, content: bytes) -> bytes:
     at = len(encoded) // 2
-    return encoded[:at] + bytes(2000) + encoded[at + 2000 :]
+    return encoded[:at] + content + encoded[at + len(content) :]
 
 
+NOISE = np.random.default_rng(4).bytes(1500)
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "cut": lambda encoded: encoded[: len(encoded) * 6 // 10],
     "cut with an end marker": lambda encoded: encoded[: len(encoded) * 6 // 10] + b"\xff\xd9",
-    "zeros in the scan": _zeros,
+    "zeros": lambda encoded: _replaced(encoded, bytes(2000)),
     "zeros to the end": lambda encoded: encoded[: len(encoded) // 2] + bytes(len(encoded) // 2),
+    "ones": lambda encoded: _replaced(encoded, b"\xff" * 300),
+    "noise": lambda encoded: _replaced(encoded, NOISE),
+    "noise without markers": lambda encoded: _replaced(encoded, NOISE.replace(b"\xff", b"\x7f")),
+    "a hole": lambda encoded: encoded[: len(encoded) // 2] + encoded[len(encoded) // 2 + 4096 :],
 }
 
 
 @pytest.mark.parametrize("harm", DAMAGES.values(), ids=DAMAGES)
-@pytest.mark.parametrize("kind", ["baseline", "optimised", "grey", "cmyk"])
+@pytest.mark.parametrize("kind", JPEGS)
 def test_damage_in_the_scan_of_a_jpeg_is_found(kind: str, harm: Callable[[bytes], bytes]) -> None:
     found, is_lost = damage(harm(JPEGS[kind]))
     assert found
     assert is_lost
 
 
+@pytest.mark.parametrize("padding", [bytes(7), bytes(500), b"\x12\x34\x56"])
+def test_padding_behind_the_scan_of_a_jpeg_costs_nothing(padding: bytes) -> None:
+    whole = JPEGS["baseline"]
+    found, is_lost = damage(whole[:-2] + padding + whole[-2:])
+    assert "extraneous" in found
+    assert not is_lost
+    # Padding in the place of a scan that was cut is none.
+    assert damage(whole[:9000] + bytes(9000) + whole[-2:])[1]
+
+
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
 def test_other_formats_that_are_cut_off_are_found(kind: str) -> None:
     encoded = saved(kind, PHOTO)
     assert damage(encoded) == ("", False)
-    assert damage(encoded[: len(encoded) * 6 // 10])[1]
+    cut = encoded[: len(encoded) * 6 // 10]
+    if kind == "TIFF":
+        with pytest.raises(InputError, match="cannot be decoded as an image"):
+            decode_image(cut)
+    else:
+        assert damage(cut)[1]
 
 
 def test_a_flipped_bit_in_a_png_is_found() -> None:

@@ -270,18 +270,3 @@ def test_levels_are_as_deep_as_the_file_and_in_the_order_of_colours() -> None:
     found = images.decode_levels(images.encode_png(plain))
     np.testing.assert_array_equal(found, plain)
     assert found.dtype == np.uint8
-
-
-@pytest.mark.parametrize(("apart", "is_read"), [(0, True), (2, True), (-2, True), (3, False)])
-def test_sixteen_bits_are_believed_where_they_are_the_eight_but_for_rounding(
-    monkeypatch: pytest.MonkeyPatch, apart: int, is_read: bool
-) -> None:
-    plain = np.full((2, 3, 3), 100, dtype=np.uint8)
-    plain[1, 2, 0] = 100 + apart
-    deep = np.full((2, 3, 3), 100 * 257, dtype=np.uint16)
-    monkeypatch.setattr(images, "_decoded", lambda *_, is_deep: deep if is_deep else plain)
-    if is_read:
-        np.testing.assert_array_equal(images.decode_levels(b"", "a.tif"), deep)
-        return
-    with pytest.raises(InputError, match=r"a\.tif has 16 bits per channel in a layout that is"):
-        images.decode_levels(b"", "a.tif")

@@ -78,7 +78,7 @@ class ReadPhotos(Method):
     """
 
     id = "read.photos"
-    result_version = 4
+    result_version = 5
     repeatable: ClassVar[tuple[str, ...]] = ("calibration", "cameras", "masks")
     determinism = "exact"
     metrics = (
