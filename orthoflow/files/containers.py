@@ -222,8 +222,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
         if kind == _PALETTE:
             table = page.colormap(1)
             shades = [table.get(at, (0, 0, 0))[:3] for at in range(256)]
-            palette: Colours = np.array(shades, dtype=np.uint8)
-            return palette[bands[0]]
+            return np.asarray(np.array(shades, dtype=np.uint8)[bands[0]])
     full = np.iinfo(bands.dtype).max
     if most < full:
         bands = (bands.astype(np.float32) * (full / most)).round().clip(0, full).astype(bands.dtype)
