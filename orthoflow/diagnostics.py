@@ -60,6 +60,7 @@ class DiagnosticSpec:
             `-` before it smaller is worse.
         settled_by: method ids or codes: a later step of such a method, or one that reports such a
             code, settles it.
+        is_summary: it sums up what the step did: printed when it is reported, also as a note.
     """
 
     code: str
@@ -68,6 +69,7 @@ class DiagnosticSpec:
     remedy: str = ""
     rank_by: str = ""
     settled_by: tuple[str, ...] = ()
+    is_summary: bool = False
 
     def __post_init__(self) -> None:
         if not _CODE.fullmatch(self.code):
@@ -108,6 +110,7 @@ class DiagnosticSpec:
             remedy=_line(remedy),
             rank_by=self.rank_by,
             settled_by=self.settled_by,
+            is_summary=self.is_summary,
         )
 
 

@@ -125,7 +125,11 @@ def _add_hierarchy(file: Any, levels: list[int], entries: list[bytes]) -> None:
 
 
 def write_e57(
-    path: Path, scans: Sequence[Mapping[str, Any]], images: Sequence[Mapping[str, Any]] = ()
+    path: Path,
+    scans: Sequence[Mapping[str, Any]],
+    images: Sequence[Mapping[str, Any]] = (),
+    *,
+    coordinate_metadata: str = "",
 ) -> Path:
     """Write scans, each with `fields` (name -> values) and optional `rotation` and `translation`.
 
@@ -137,7 +141,21 @@ def write_e57(
         import pye57
         from pye57 import libe57
 
-    with pye57.E57(str(path), mode="w") as file:
+    class File(pye57.E57):
+        def write_default_header(self) -> None:
+            """As pye57 does, which leaves the metadata empty and can set them but once."""
+            image, root = self.image_file, self.root
+            image.extensionsAdd("", libe57.E57_V1_0_URI)
+            texts = {"formatName": "ASTM E57 3D Imaging Data File", "guid": "{file}"}
+            texts["coordinateMetadata"] = coordinate_metadata
+            for name, text in texts.items():
+                root.set(name, libe57.StringNode(image, text))
+            for name, number in {"versionMajor": 1, "versionMinor": 0}.items():
+                root.set(name, libe57.IntegerNode(image, number))
+            for name in ("data3D", "images2D"):
+                root.set(name, libe57.VectorNode(image, True))
+
+    with File(str(path), mode="w") as file:
         image = file.image_file
         for index, scan in enumerate(scans):
             node = libe57.StructureNode(image)
@@ -213,7 +231,7 @@ def _set_points(libe57: Any, file: Any, node: Any, fields: Mapping[str, Any]) ->
         kept.append(array)
         if name.startswith(("cartesianX", "cartesianY", "cartesianZ")):
             # Scaled integers, as most scanners write them.
-            raw = libe57.ScaledIntegerNode(image, 0, -(2**40), 2**40, 1e-6, 0.0)
+            raw = libe57.ScaledIntegerNode(image, 0, -(2**44), 2**44, 1e-6, 0.0)
         elif name.startswith(("spherical", "intensity")) and not name.endswith("State"):
             raw = libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e9, 1e9)
         else:

@@ -93,8 +93,10 @@ class RunState:
                     return
 
     def news(self, event: CellReported) -> str:
-        """A diagnostic in a line; empty for notes, and where its code was reported before."""
+        """A diagnostic in a line; empty for plain notes, and for codes reported before."""
         one = event.diagnostic
+        if one.is_summary:
+            return f"{event.address}: {one.text}"
         key = (one.code, one.text if one.code == PLAIN_WARNING.code else "")
         with self._lock:
             is_new = one.severity != "note" and key not in self._reported

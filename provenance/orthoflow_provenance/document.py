@@ -133,6 +133,7 @@ class RecordedDiagnostic:
         rank_by: name of the value by which the worst of several is chosen, larger is worse; with
             `-` before it smaller is worse.
         settled_by: methods or codes of later steps that settle it.
+        is_summary: it sums up what the step did.
     """
 
     code: str
@@ -143,6 +144,7 @@ class RecordedDiagnostic:
     remedy: str = ""
     rank_by: str = ""
     settled_by: tuple[str, ...] = ()
+    is_summary: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

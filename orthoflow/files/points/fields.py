@@ -44,6 +44,9 @@ _STAND_INS: Final = (
     *("remission", "scalarremission", "intensity16", "returnintensity", "signalstrength"),
     "laserintensity",
 )
+_INTENSITY_PARTS: Final = re.compile(
+    "intens|reflect|amplitud|remission|signal|echo|power|grey|gray|luminance|bright"
+)
 _MEANINGS: Final = {alias: name for name, text in _ALIASES.items() for alias in text.split()}
 # Looking for brackets takes time with the square of it.
 _LONGEST_NAME: Final = 200
@@ -116,6 +119,11 @@ def meaning_of(name: str) -> str:
         return _MEANINGS[plain]
     base, unit = _split_unit(name)
     return _MEANINGS.get(plain_name(base), IGNORED) if unit else IGNORED
+
+
+def may_be_intensity(name: str) -> bool:
+    """Whether a field's name sounds like a measure of the returned light."""
+    return _INTENSITY_PARTS.search(plain_name(name)) is not None
 
 
 def columns_of_names(
@@ -195,7 +203,8 @@ def columns_of_values(
     n_columns = samples.shape[1]
     lead: tuple[str, ...] = ()
     first = samples[:, 0]
-    counts = np.all(np.diff(first) == 1.0) and np.all(first == np.round(first))
+    is_whole = np.isfinite(first).all() and np.all(first == np.round(first))
+    counts = is_whole and np.all(np.diff(first) == 1.0)
     if n_columns > 3 and len(samples) >= 5 and counts:
         lead = ("number",)
     rest = samples[:, len(lead) + 3 :]

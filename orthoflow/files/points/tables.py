@@ -20,12 +20,16 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import BLOCK_POINTS, MOST_LINE_BYTES, short_file_error
 
 _NUMBER: Final = re.compile(
-    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)",
+    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?"
+    r"|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)|n/a|na|null|#(num!|n/a|value!|div/0!|ref!)",
     re.IGNORECASE,
 )
-# How C libraries print what is not finite: `nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`.
+# How C libraries print what is not finite: `nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`; and
+# how spreadsheets do.
 _NOT_A_NUMBER: Final = re.compile(
-    rb"[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)(?![\w(])", re.IGNORECASE
+    rb"(?:[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)|(?<![^\s,;])(?:n/a|na|null))"
+    rb"(?![\w(])|#(?:num!|n/a|value!|div/0!|ref!)",
+    re.IGNORECASE,
 )
 _COMMENTS: Final = (b"#", b"//")
 _SCAN_BYTES: Final = 1 << 24
@@ -59,6 +63,12 @@ def split_fields(line: str) -> tuple[list[str], str]:
     if "," in line and not (len(words) >= 3 and _are_numbers(words)):
         return _split(line, ","), ","
     return words, r"\s+"
+
+
+def is_comment(line: bytes) -> bool:
+    """Whether a line is no data: it begins with `#` or `//`, and not with `#NUM!` or the like."""
+    start = line.lstrip()
+    return start.startswith(_COMMENTS) and not _NOT_A_NUMBER.match(start)
 
 
 def find_data(line: str) -> Layout | None:
@@ -151,11 +161,7 @@ def read_table(
     try:
         return _parse(lines, layout, columns)
     except ValueError as error:
-        kept = [
-            _NOT_A_NUMBER.sub(b"nan", line)
-            for line in lines
-            if not line.lstrip().startswith(_COMMENTS)
-        ]
+        kept = [_NOT_A_NUMBER.sub(b"nan", line) for line in lines if not is_comment(line)]
         try:
             return _parse(kept, layout, columns)
         except ValueError:
@@ -218,6 +224,7 @@ def _parse(lines: list[bytes], layout: Layout, columns: Sequence[int]) -> NDArra
                 low_memory=False,
                 dtype=dict.fromkeys(columns, np.float64),
                 skipinitialspace=True,
+                encoding_errors="replace",
                 quoting=0 if b'"' in lines[0] else 3,
             )
         except pd.errors.ParserWarning as warning:
@@ -231,7 +238,7 @@ def _bad_line(
 ) -> InputError:
     for offset, line in enumerate(lines):
         text = line.decode("utf-8", "replace").strip()
-        if not line.lstrip().startswith(_COMMENTS) and not _fits(text, layout, columns):
+        if not is_comment(line) and not _fits(text, layout, columns):
             return InputError(
                 f"{path.name}, line {first_line + offset}: expected {layout.n_columns} numbers as "
                 f"in the lines before, got {text[:60]!r}; correct the line or export the file again"
@@ -252,7 +259,8 @@ def _fits(text: str, layout: Layout, columns: Sequence[int]) -> bool:
 
 def _number(text: str) -> float:
     """Number of a text; NaN where it has a decimal comma that the first lines do not have."""
-    return math.nan if "," in text or _NOT_A_NUMBER.fullmatch(text.encode()) else float(text)
+    is_none = "," in text or _NOT_A_NUMBER.fullmatch(text.encode())
+    return math.nan if is_none else float(text)
 
 
 def _fields(line: str, layout: Layout) -> list[str]:

@@ -31,6 +31,7 @@ from orthoflow.files.points.tables import (
     Layout,
     count_lines,
     find_data,
+    is_comment,
     numbers_of,
     read_tables,
     split_fields,
@@ -124,7 +125,7 @@ def _read_head(path: Path, columns: Columns | None, intensity_field: str | None)
     comments: list[str] = []
     headers: list[str] = []
     for index, line in enumerate(lines[:HEADER_LINES]):
-        layout = None if line.startswith(("#", "//")) else find_data(line)
+        layout = None if is_comment(line.encode()) else find_data(line)
         if layout is None:
             if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
                 n_stated = int(line)
@@ -185,20 +186,36 @@ def _columns_of_header(
         fits = len(labels) == layout.n_columns
         if found is not None and fits:
             return found
-        is_comment = header != header.lstrip(_COMMENT)
+        is_remark = header != header.lstrip(_COMMENT)
         known = [label for label in labels if meaning_of(label) != IGNORED]
         names_something = bool(known) or any(_NO_WORD.fullmatch(label) for label in labels)
-        if found is not None or (fits and (not is_comment or names_something)):
-            raise InputError(
-                f"{path.name} has the header {header[:120]!r}, which does not name x, y and z for "
-                f"the {layout.n_columns} columns below it (first line {line[:80]!r}): name them "
-                "with cloud.columns, e.g. --set 'cloud.columns="
-                f"[{', '.join(('x', 'y', 'z', 'intensity', *'_' * 96)[: layout.n_columns])}]', "
-                "with _ for one to skip"
-            )
-        if not is_comment and not fits:
-            continue
+        if found is not None or (fits and (not is_remark or names_something)):
+            raise _unknown_columns(path, header, labels, line, layout)
     return None
+
+
+def _unknown_columns(
+    path: Path, header: str, labels: list[str], line: str, layout: Layout
+) -> InputError:
+    text = (
+        f"{path.name} has the header {header[:120]!r}, which does not name x, y and z for the "
+        f"{layout.n_columns} columns below it (first line {line[:80]!r})"
+    )
+    if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
+        text += ": geographic degrees are no lengths, project them to a plane system in metres, or"
+    # What is known stays, and x, y, z that are missing are as like to be the last of the others.
+    names = [meaning_of(label) for label in labels] if len(labels) == layout.n_columns else []
+    missing = [axis for axis in "xyz" if axis not in names]
+    others = [place for place, name in enumerate(names) if name == IGNORED]
+    if len(others) >= len(missing):
+        for place, axis in zip(others[len(others) - len(missing) :], missing, strict=True):
+            names[place] = axis
+    else:
+        names = [*"xyz", *[IGNORED] * layout.n_columns][: layout.n_columns]
+    return InputError(
+        f"{text}: name the columns with cloud.columns, e.g. --set "
+        f"'cloud.columns=[{', '.join(names)}]', with {IGNORED} for one to skip"
+    )
 
 
 def _labels(header: str) -> list[str]:

@@ -23,14 +23,21 @@ _WIDTHS: Final[dict[RgbScale, int]] = {"0..1": 0, "8 bit": 1, "16 bit": 2, "stat
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
 # lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
-# 532..1550 nm stays far below.
-LUMINANCE_CORRELATION: Final = 0.999
+# 532..1550 nm stays far below, unless a scene has two colours only. What two roundings to 8 bits
+# leave between the two is 0.4 grey levels.
+_LUMINANCE_CORRELATION: Final = 0.999
+_ROUNDING_LEVELS: Final = 0.7
 # Values are extreme that lie farther beyond these percentiles than these are apart.
 _PERCENTILES: Final = (2.0, 98.0)
-# Stated limits of which the data take a smaller part are the sensor's: the picture would be black.
-_SMALLEST_PART: Final = 0.1
+# Stated limits of which the data of all scans take a smaller part are the sensor's: the picture
+# would be black.
+_SMALLEST_PART: Final = 0.25
 # Scans whose ranges overlap by more of both share one scale, so that equal surfaces stay equal.
 _COMMON_PART: Final = 0.4
+# Ranges that scanners and programs write, for scans that state none and differ from others: a scan
+# is in the first that holds its data, if these take so much of it.
+_NOMINAL: Final = ((0.0, 1.0), (0.0, 255.0), (-2048.0, 2047.0), (0.0, 4095.0), (0.0, 65535.0))
+_NOMINAL_PART: Final = 0.4
 # A smaller share of colours beyond a scale does not change it.
 _STRAY_SHARE: Final = 0.001
 
@@ -42,13 +49,13 @@ class IntensityScale:
     Attributes:
         low: what becomes 0.
         high: what becomes 1.
-        rule: where the two come from: `intensity_max`, `stated`, `data`.
+        rule: where the two come from: `intensity_max`, `stated`, `nominal`, `data`.
         stated: limits that the scan states and that are not used, since its data do not fit them.
     """
 
     low: float
     high: float
-    rule: Literal["intensity_max", "stated", "data"]
+    rule: Literal["intensity_max", "stated", "nominal", "data"]
     stated: tuple[float, float] | None = None
 
 
@@ -78,36 +85,53 @@ def choose_scales(
 
     Returns:
         The user's; else the stated limits, where the data keep to them and take more than a small
-        part; else the range of the data, common to those scans whose ranges are similar.
+        part; else the range of the data, common to those scans whose ranges are similar. Where
+        scans differ, the usual range that their data take most of stands for that of the data.
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
+    known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
+    largest_part = max(
+        (_part(seen, one) for seen, one in known if _is_within(seen, one)), default=0
+    )
     groups: list[tuple[list[int], tuple[float, float]]] = []
     for k, (seen, limits) in enumerate(zip(ranges, stated, strict=True)):
         if seen is None:
             continue
         if intensity_max is not None:
             scales[k] = IntensityScale(low=0.0, high=intensity_max, rule="intensity_max")
-        elif limits is not None and _fits(seen, limits):
+        elif limits is not None and _is_within(seen, limits) and largest_part >= _SMALLEST_PART:
             scales[k] = IntensityScale(low=limits[0], high=limits[1], rule="stated")
         else:
             _join(groups, k, seen)
-    for members, (lowest, highest) in groups:
-        has_range = highest > lowest
+    differ = len(groups) + any(scale is not None for scale in scales) > 1
+    for members, seen in groups:
+        low, high = seen if seen[1] > seen[0] else (min(0.0, seen[0]), max(seen[1], 0.0))
+        nominal = _nominal(seen) if differ else None
         for k in members:
             scales[k] = IntensityScale(
-                low=lowest if has_range else min(0.0, lowest),
-                high=highest if has_range else max(highest, 0.0),
-                rule="data",
+                low=low if nominal is None else nominal[0],
+                high=high if nominal is None else nominal[1],
+                rule="data" if nominal is None else "nominal",
                 stated=stated[k],
             )
     return scales
 
 
-def _fits(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
-    low, high = limits
-    slack = 1e-6 * (high - low)
-    is_within = low - slack <= seen[0] and seen[1] <= high + slack
-    return is_within and seen[1] - low >= _SMALLEST_PART * (high - low)
+def _nominal(seen: tuple[float, float]) -> tuple[float, float] | None:
+    for low, high in _NOMINAL:
+        if low <= seen[0] and seen[1] <= high:
+            return (low, high) if seen[1] - seen[0] >= _NOMINAL_PART * (high - low) else None
+    return None
+
+
+def _is_within(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
+    slack = 1e-6 * (limits[1] - limits[0])
+    return limits[0] - slack <= seen[0] and seen[1] <= limits[1] + slack
+
+
+def _part(seen: tuple[float, float], limits: tuple[float, float]) -> float:
+    """Where the largest value lies between limits, 0..1."""
+    return (seen[1] - limits[0]) / (limits[1] - limits[0])
 
 
 def _join(
@@ -157,15 +181,25 @@ def correlation_with_grey(
     intensity: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     has_rgb: NDArray[np.bool_] | None = None,
-) -> float:
-    """Correlation of intensity with the grey of the colours, on a sample; 0 where undefined."""
+) -> float | None:
+    """Correlation of intensity with the grey of the colours, where it is nothing but that grey.
+
+    Returns:
+        None where more lies between the two than roundings, or too few points have both.
+    """
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
     colours = rgb[::step].astype(np.float64)
     has_both = np.isfinite(values) if has_rgb is None else np.isfinite(values) & has_rgb[::step]
     values, colours = values[has_both], colours[has_both]
     greys = (colours @ REC_601, colours.mean(axis=1))
-    return max(_correlation(values, grey) for grey in greys)
+    correlation, grey = max(
+        ((_correlation(values, grey), grey) for grey in greys), key=lambda item: item[0]
+    )
+    if correlation < _LUMINANCE_CORRELATION:
+        return None
+    apart_levels = float(grey.std()) * float(np.sqrt(max(0.0, 1.0 - correlation**2)))
+    return correlation if apart_levels <= _ROUNDING_LEVELS else None
 
 
 def is_grey(rgb: NDArray[np.uint8]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -19,20 +18,27 @@ from orthoflow.files.points.fields import Columns, columns_of_user, plain_name
 from orthoflow.files.points.formats import LAS, TEXT
 from orthoflow.files.points.units import UNITS_M, refuse_degrees
 from orthoflow.geometry import UpDirection, up_vector
-from orthoflow.geometry.frames import FARTHEST_M
-from orthoflow.products import InputFiles, JsonValue, PointCloud
+from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.assembly import (
-    COARSE_M,
-    FINE_M,
-    CloudAssembly,
-    ScanCount,
-    resolution_m,
-)
+from orthoflow_plugins.read.assembly import CloudAssembly
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.quality import judge_quality, report_quality, warn_of_up
+from orthoflow_plugins.read.reporting import (
+    COLOUR_LIMIT,
+    COLOURS_GREY,
+    COLOURS_ZERO,
+    INTENSITY_LUMINANCE,
+    INTENSITY_ZERO,
+    NO_EFFECT,
+    report_fields,
+    report_notes,
+    report_precision,
+    report_scales,
+    report_stations,
+    report_summary,
+    scan_json,
+)
 from orthoflow_plugins.read.scales import (
-    LUMINANCE_CORRELATION,
     IntensityScale,
     choose_scales,
     correlation_with_grey,
@@ -40,16 +46,10 @@ from orthoflow_plugins.read.scales import (
     normalise,
     robust_range,
 )
-from orthoflow_plugins.read.stations import ScanSummary, Stations, choose_stations
+from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 Unit = Literal["m", "cm", "mm", "ft", "us-ft", "in", "km"]
 Corner = tuple[float, float, float]
-
-# Where two sides of a scan are shorter, it is rather in another unit than of a wall.
-_SMALL_M: Final = 1.0
-
-# Where two sides of a scan are longer, it is rather in millimetres than of a building.
-_LARGE_M: Final = 1000.0
 _PERCENTILES: Final = (0.5, 99.5)
 _SAMPLE: Final = 200_000
 
@@ -157,14 +157,13 @@ class ReadScan(Method):
             raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
         box_m = None if params.box is None else np.array(params.box)
         files = [_opened(path, columns, box_m, params) for path in inputs.files.paths]
-        _warn_of_settings(ctx, files, params)
+        _check_settings(ctx, files, params)
         assembly = CloudAssembly(ctx, files, partial(_unit_m, params=params), box_m)
         for file in files:
             # Damaged numbers overflow on their way; what is not finite is dropped and counted.
             with np.errstate(all="ignore"):
                 assembly.add_file(file)
-            for note in file.notes:
-                ctx.warn(note)
+            report_notes(ctx, file)
         assembly.require_points()
         cloud = _finish(ctx, assembly, params)
         ctx.figure(
@@ -228,14 +227,17 @@ def _unit_m(scan: Scan, params: ReadScan.Params) -> NDArray[np.float64]:
     return np.ones(3) if scan.unit is None else np.array(scan.unit.metres)
 
 
-def _warn_of_settings(ctx: StepContext, files: list[ScanFile], params: ReadScan.Params) -> None:
+def _check_settings(ctx: StepContext, files: list[ScanFile], params: ReadScan.Params) -> None:
     formats = {file.format_name for file in files}
-    if params.gsd_m is not None and not any(file.is_chosen for file in files):
-        ctx.warn("gsd_m only concerns COPC files, and none was read; it has no effect")
-    if params.classes and LAS.name not in formats:
-        ctx.warn("classes only concerns LAS and LAZ files, and none was read; it has no effect")
-    if params.columns is not None and TEXT.name not in formats:
-        ctx.warn("columns only concerns text files, and none was read; it has no effect")
+    is_idle = {
+        ("gsd_m", "COPC"): params.gsd_m is not None and not any(file.is_chosen for file in files),
+        ("classes", "LAS and LAZ"): params.classes and LAS.name not in formats,
+        ("columns", "text"): params.columns is not None and TEXT.name not in formats,
+    }
+    for (setting, kind), is_so in is_idle.items():
+        if is_so:
+            why = f"it only concerns {kind} files, and none was read"
+            ctx.report(NO_EFFECT, setting=setting, why=why)
     wanted = params.intensity_field
     if wanted is not None:
         found = {name for file in files for scan in file.scans for name in scan.fields_used}
@@ -254,8 +256,8 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
     intensity, intensity_source = _judged_intensity(ctx, intensity, rgb, has_rgb)
     summaries = _summaries(assembly)
     stations = choose_stations(summaries, params.view_from)
-    _warn_of_stations(ctx, stations, len(summaries), params)
-    precision = _precision(ctx, assembly, summaries)
+    report_stations(ctx, stations, len(summaries), has_view=params.view_from is not None)
+    precision = report_precision(ctx, assembly, summaries, params.unit)
     x, y, z = assembly.offsets
     cloud = PointCloud(
         origin=assembly.origin,
@@ -275,14 +277,14 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
             "up": params.up,
             "intensity_source": intensity_source,
             "scans": [
-                _scan_json(count, scale, params)
+                scan_json(count, scale, params.unit)
                 for count, scale in zip(assembly.counts, scales, strict=True)
             ],
             **precision,
         },
     )
-    _report_fields(ctx, assembly, cloud)
-    _report_summary(ctx, assembly, cloud, params)
+    report_fields(ctx, assembly.counts, cloud)
+    report_summary(ctx, assembly, cloud, up=params.up, unit=params.unit)
     quality = judge_quality(assembly.offsets, assembly.array("scan"))
     report_quality(quality, ctx)
     warn_of_up(quality, params.up, ctx)
@@ -300,18 +302,18 @@ def _colours(
         if colours is None or not count.n_kept:
             continue
         if not rgb[part].any():
-            ctx.warn(
-                f"{count.title}: the colours of all points are zero: they are taken as absent, "
-                "not as black"
-            )
+            ctx.report(COLOURS_ZERO, subject=count.title)
             count.n_without_rgb = count.n_kept
             if has_rgb is None:
                 has_rgb = assembly.with_all_colours()
             has_rgb[part] = False
         elif colours.misfit is not None:
-            ctx.warn(
-                f"{count.title}: it states that colours reach {colours.misfit:g}, but they reach "
-                f"{colours.largest:g}: the limit does not fit and they are read as {colours.scale}"
+            ctx.report(
+                COLOUR_LIMIT,
+                subject=count.title,
+                limit=colours.misfit,
+                largest=colours.largest,
+                scale=colours.scale,
             )
     if has_rgb is not None and not has_rgb.any():
         return None, None
@@ -329,28 +331,17 @@ def _intensity(
         values = intensity[count.start : count.stop]
         seen = robust_range(values)
         if seen == (0.0, 0.0) and not np.nan_to_num(values).any():
-            ctx.warn(f"{count.title}: the intensity of all points is zero: it is taken as absent")
+            ctx.report(INTENSITY_ZERO, subject=count.title)
             values[:] = np.nan
             seen = None
         ranges.append(seen)
     stated = [count.scan.intensity_limits for count in assembly.counts]
     scales = choose_scales(ranges, stated, params.intensity_max)
-    for count, scale in zip(assembly.counts, scales, strict=True):
-        values = intensity[count.start : count.stop]
-        if scale is None:
-            continue
-        n_clipped = normalise(values, scale)
-        if n_clipped:
-            ctx.warn(
-                f"{count.title}: {n_clipped} intensities lie beyond {scale.low:g} to "
-                f"{scale.high:g} ({_RULES[scale.rule]}) and were clipped"
-            )
-        if scale.stated is not None:
-            ctx.warn(
-                f"{count.title}: it states intensities from {scale.stated[0]:g} to "
-                f"{scale.stated[1]:g}, which its data do not fit: they are scaled from "
-                f"{scale.low:g} to {scale.high:g}"
-            )
+    clipped = [
+        0 if scale is None else normalise(intensity[count.start : count.stop], scale)
+        for count, scale in zip(assembly.counts, scales, strict=True)
+    ]
+    report_scales(ctx, assembly.counts, scales, clipped)
     if all(scale is None for scale in scales):
         return None, scales
     return intensity, scales
@@ -368,17 +359,14 @@ def _judged_intensity(
     if rgb is None:
         return intensity, "laser"
     correlation = correlation_with_grey(intensity, rgb, has_rgb)
-    if correlation < LUMINANCE_CORRELATION:
+    if correlation is None:
         return intensity, "laser"
     if is_grey(rgb):
-        ctx.warn("the colours are all grey and follow the intensity: they are no photographs")
+        ctx.report(COLOURS_GREY)
         return intensity, "laser"
     if has_rgb is not None:
         return intensity, "luminance"
-    ctx.warn(
-        f"the intensity is not the laser's but the luminance of the colours (correlation "
-        f"{correlation:.5f}): it is left out, the colours hold it"
-    )
+    ctx.report(INTENSITY_LUMINANCE, correlation=correlation)
     return None, "luminance"
 
 
@@ -404,173 +392,3 @@ def _summaries(assembly: CloudAssembly) -> list[ScanSummary]:
             )
         )
     return found
-
-
-def _report_fields(ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud) -> None:
-    """Report which scans lack what others have, and which fields are not used."""
-    counts = [count for count in assembly.counts if count.n_kept]
-    for title, is_there, missing in (
-        ("colour", cloud.rgb is not None, [count.n_without_rgb for count in counts]),
-        (
-            "intensity",
-            cloud.intensity is not None,
-            [_n_without_intensity(cloud, count) for count in counts],
-        ),
-    ):
-        without = [c for c, n in zip(counts, missing, strict=True) if n == c.n_kept]
-        if is_there and without:
-            n_points = sum(count.n_kept for count in without)
-            names = ", ".join(count.title for count in without[:3])
-            more = f" and {len(without) - 3} more" if len(without) > 3 else ""
-            ctx.warn(f"{names}{more} has no {title}: its {n_points} points have a position only")
-        n_invalid = sum(n for c, n in zip(counts, missing, strict=True) if n < c.n_kept)
-        if is_there and n_invalid:
-            ctx.warn(f"{n_invalid} points have no valid {title}: they have a position only")
-    unused = list(dict.fromkeys(n for count in counts for n in count.scan.fields_not_used))
-    if unused:
-        shown = ", ".join(unused[:12]) + (" ..." if len(unused) > 12 else "")
-        text = f"fields not used: {shown}"
-        if cloud.intensity is None:
-            ctx.warn(f"{text}; one of them can be the intensity: cloud.intensity_field={unused[0]}")
-        else:
-            ctx.log(f"{text}; cloud.intensity_field=NAME takes one as the intensity")
-
-
-def _n_without_intensity(cloud: PointCloud, count: ScanCount) -> int:
-    if cloud.intensity is None:
-        return count.n_kept
-    return int(np.count_nonzero(np.isnan(cloud.intensity[count.start : count.stop])))
-
-
-def _warn_of_stations(
-    ctx: StepContext, stations: Stations, n_scans: int, params: ReadScan.Params
-) -> None:
-    if stations.source == "file" and not stations.per_scan and stations.positions is not None:
-        ctx.warn(
-            f"only {len(stations.positions)} of {n_scans} scans state where the scanner "
-            "stood; the nearest station decides the front of a wall"
-        )
-    if stations.source == "file" and params.view_from is not None:
-        ctx.warn("view_from has no effect: the files state where the scanner stood")
-
-
-def _precision(
-    ctx: StepContext, assembly: CloudAssembly, summaries: list[ScanSummary]
-) -> dict[str, JsonValue]:
-    farthest_m = max(float(np.abs(values).max()) for values in assembly.offsets)
-    resolution = resolution_m(farthest_m)
-    if resolution > FINE_M:
-        ctx.warn(
-            f"the points reach {farthest_m:.0f} m from the origin of the cloud, where coordinates "
-            f"are kept to {1000 * resolution:.2f} mm only: check unit, or cut stray points off"
-        )
-    roundings = {count.file: count.rounding_m for count in assembly.counts}
-    for name, rounding in roundings.items():
-        if rounding >= COARSE_M:
-            ctx.warn(
-                f"the coordinates of {name} are rounded to {1000 * rounding:g} mm: "
-                "planes and depths cannot be finer, and a grid may show"
-            )
-    low = np.min([summary.low for summary in summaries], axis=0)
-    high = np.max([summary.high for summary in summaries], axis=0)
-    _warn_of_size(ctx, assembly, high - low)
-    return {"resolution_m": resolution, "rounding_m": max(roundings.values())}
-
-
-def _warn_of_size(ctx: StepContext, assembly: CloudAssembly, sides_m: NDArray[np.float64]) -> None:
-    side_m = float(np.median(sides_m))
-    if _SMALL_M <= side_m <= _LARGE_M:
-        return
-    size = " x ".join(f"{side:.3g}" for side in sides_m)
-    units, sources = zip(*(_unit_and_source(count, None) for count in assembly.counts), strict=True)
-    other = "mm" if side_m > _LARGE_M else "km"
-    stated = "no file states a unit" if set(sources) == {"assumed"} else f"unit {units[0]}"
-    ctx.warn(
-        f"the scan is {size} m ({stated}): is that right? Set cloud.unit={other} if it is in "
-        f"{other}, or cm, ft, us-ft, in"
-    )
-
-
-def _unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
-    if unit is not None:
-        return unit, "cloud.unit"
-    stated = count.scan.unit
-    return ("m", "assumed") if stated is None else (stated.name, stated.source)
-
-
-def _scan_json(
-    count: ScanCount, scale: IntensityScale | None, params: ReadScan.Params
-) -> dict[str, JsonValue]:
-    unit, unit_from = _unit_and_source(count, params.unit)
-    left_out: dict[str, JsonValue] = {c: n for c, n in sorted(count.left_out.items()) if n}
-    return {
-        "file": count.file,
-        "scan": count.index,
-        "name": count.scan.name,
-        "format": count.format_name,
-        "n_points": count.n_kept,
-        "n_read": count.n_read,
-        "fields_used": list(count.scan.fields_used),
-        "fields_not_used": list(count.scan.fields_not_used),
-        "unit": unit,
-        "unit_m": count.unit_m.tolist(),
-        "unit_from": unit_from,
-        "left_out": left_out,
-        "n_without_colour": count.n_without_rgb,
-        "intensity": None
-        if scale is None
-        else {"low": scale.low, "high": scale.high, "rule": scale.rule},
-        "rgb_scale": None if count.colours is None else count.colours.scale,
-        "rounding_m": count.rounding_m,
-    }
-
-
-def _report_summary(
-    ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud, params: ReadScan.Params
-) -> None:
-    """Report counts and extent as metrics, and everything in one line."""
-    counts = assembly.counts
-    left_out = Counter({c: n for c, n in sum((k.left_out for k in counts), Counter()).items() if n})
-    ctx.metric("n_points", len(cloud), "1")
-    ctx.metric("n_points_left_out", left_out.total(), "1")
-    for cause, n_points in sorted(left_out.items()):
-        ctx.metric(f"n_left_out_{cause}", n_points, "1")
-    ctx.metric("n_invalid", left_out["invalid"] + left_out["no_return"], "1")
-    ctx.metric("n_withheld", left_out["withheld"], "1")
-    ctx.metric("n_not_finite", left_out["not_finite"] + left_out["too_far"], "1")
-    ctx.metric("n_scans", len(counts), "1")
-    ctx.metric("n_stations", 0 if cloud.stations is None else len(cloud.stations), "1")
-    sides_m = [float(values.max() - values.min()) for values in assembly.offsets]
-    for side_m, name in zip(sides_m, "xyz", strict=True):
-        ctx.metric(f"extent_{name}_m", side_m, "m")
-    for count in counts:
-        if count.left_out["too_far"]:
-            place = " ".join(f"{value:g}" for value in count.first_far_m)
-            ctx.warn(
-                f"{count.title}: {count.left_out['too_far']} points lie farther than "
-                f"{FARTHEST_M:g} m from the origin, the first at {place}, and were left out: check "
-                "the file and unit"
-            )
-    n_void = left_out["no_return"]
-    if n_void > 1:
-        ctx.warn(f"{n_void} points at 0 0 0 are no returns of the scanner and were left out")
-    n_lost = left_out["not_finite"]
-    if n_lost:
-        ctx.warn(f"{n_lost} points with coordinates that are not finite were left out")
-    units = dict.fromkeys(_unit_and_source(count, params.unit) for count in counts)
-    fields = dict.fromkeys(name for count in counts for name in count.scan.fields_used)
-    causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in sorted(left_out.items()))
-    formats = ", ".join(dict.fromkeys(count.format_name for count in counts))
-    ctx.log(
-        f"{formats}: {len(counts)} scan{'s' * (len(counts) != 1)}, {len(cloud)} points; fields "
-        f"{' '.join(fields)}; unit {', '.join(f'{u} ({source})' for u, source in units)}; up "
-        f"{params.up}; extent {' x '.join(f'{side_m:.3f}' for side_m in sides_m)} m; left out "
-        f"{causes or 'none'}"
-    )
-
-
-_RULES: Final = {
-    "intensity_max": "intensity_max",
-    "stated": "limits that the scan states",
-    "data": "range of its data",
-}

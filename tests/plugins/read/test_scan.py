@@ -167,7 +167,7 @@ def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
     assert scan_of(cloud)["n_read"] == 800
     assert "gsd_m only concerns" not in read.warnings
     read(scan_files.write_las(tmp_path / "b.laz", points), gsd_m=0.1)
-    assert "gsd_m only concerns COPC files" in read.warnings
+    assert "gsd_m has no effect: it only concerns COPC files" in read.warnings
 
 
 def test_a_box_without_an_inside_is_refused() -> None:
@@ -186,7 +186,7 @@ def test_classes_choose_points_of_las_files(
     with pytest.raises(InputError, match="400 are of other classes than those asked for; change"):
         read(path, classes=[9])
     read(write_text(tmp_path / "a.xyz", points), classes=[2])
-    assert "classes only concerns LAS and LAZ files" in read.warnings
+    assert "classes has no effect: it only concerns LAS and LAZ files" in read.warnings
 
 
 def test_a_shift_by_whole_metres_changes_the_origin_only(
@@ -294,7 +294,7 @@ def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
     read(write_text(tmp_path / "a.xyz", points))
     assert "is that right?" not in read.warnings
     read(write_text(tmp_path / "b.xyz", points), unit="mm")
-    assert "m (no file states a unit): is that right?" in read.warnings
+    assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
 
 
 def test_rounding_is_told_in_metres_whatever_the_unit(
@@ -652,7 +652,7 @@ def test_columns_without_a_text_file_are_said_to_do_nothing(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
     read(scan_files.write_las(tmp_path / "a.laz", points), columns="x y z")
-    assert "columns only concerns text files" in read.warnings
+    assert "columns has no effect: it only concerns text files" in read.warnings
     text = write_text(tmp_path / "a.xyz", points)
     for columns in ("x y z", None):
         read(text, columns=columns)

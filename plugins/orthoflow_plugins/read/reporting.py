@@ -1,0 +1,364 @@
+"""What is reported of scans that were read: what limits them, and a summary of each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.points import ScanFile
+from orthoflow.files.points.fields import may_be_intensity
+from orthoflow.geometry.frames import FARTHEST_M
+from orthoflow.products import JsonValue, PointCloud
+from orthoflow.sdk import DiagnosticSpec, StepContext
+from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
+from orthoflow_plugins.read.scales import IntensityScale
+from orthoflow_plugins.read.stations import ScanSummary, Stations
+
+# Where two sides of a scan are shorter, or longer, it is rather in another unit than of a wall or a
+# building.
+_SMALL_M: Final = 1.0
+_LARGE_M: Final = 1000.0
+# Names that a sentence lists.
+_MOST_NAMES: Final = 12
+
+SUMMARY: Final = DiagnosticSpec(
+    code="scan-summary",
+    severity="note",
+    is_summary=True,
+    text="{format}: {n_scans} scan{plural}, {n_points:,} points; fields used {used}; not used "
+    "{not_used}; unit {unit}; up {up}; extent {extent} m; left out {left_out}",
+)
+NO_EFFECT: Final = DiagnosticSpec(
+    code="scan-setting-without-effect",
+    severity="warning",
+    text="{step}.{setting} has no effect: {why}",
+)
+FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", severity="warning", text="{text}")
+COLOURS_ZERO: Final = DiagnosticSpec(
+    code="scan-colours-zero",
+    severity="warning",
+    text="{subject}: the colours of all points are zero: they are taken as absent, not as black",
+)
+COLOUR_LIMIT: Final = DiagnosticSpec(
+    code="scan-colour-limit-misfit",
+    severity="warning",
+    text="{subject}: it states that colours reach {limit:g}, but its colours reach {largest:g}: "
+    "they are read as {scale}",
+)
+COLOURS_GREY: Final = DiagnosticSpec(
+    code="scan-colours-grey",
+    severity="warning",
+    text="the colours are all grey and follow the intensity: they are no photographs",
+)
+INTENSITY_ZERO: Final = DiagnosticSpec(
+    code="scan-intensity-zero",
+    severity="warning",
+    text="{subject}: the intensity of all points is zero: it is taken as absent",
+)
+INTENSITY_LIMITS: Final = DiagnosticSpec(
+    code="scan-intensity-limits-misfit",
+    severity="warning",
+    text="{subject}: it states intensities from {stated_low:g} to {stated_high:g}, which its data "
+    "do not fit: they are scaled from {low:g} to {high:g}",
+    remedy="{step}.intensity_max=NUMBER says what is white",
+)
+INTENSITY_CLIPPED: Final = DiagnosticSpec(
+    code="scan-intensity-clipped",
+    severity="warning",
+    text="{subject}: {n_points} intensities lie beyond {low:g} to {high:g} ({rule}) and were "
+    "clipped",
+    rank_by="n_points",
+)
+INTENSITY_RANGES: Final = DiagnosticSpec(
+    code="scan-intensity-ranges-differ",
+    severity="warning",
+    text="the scans have intensities of different range and state none: {ranges}; each is scaled "
+    "by its own, so equal surfaces may differ in brightness",
+    remedy="{step}.intensity_max=NUMBER sets one for all",
+)
+INTENSITY_LUMINANCE: Final = DiagnosticSpec(
+    code="scan-intensity-is-luminance",
+    severity="warning",
+    text="the intensity is not the laser's but the luminance of the colours (correlation "
+    "{correlation:.5f}): it is left out, the colours hold it",
+)
+SCAN_WITHOUT: Final = DiagnosticSpec(
+    code="scan-without-field",
+    severity="warning",
+    text="{subject} has no {field}: its {n_points} points have a position only",
+    rank_by="n_points",
+)
+POINTS_WITHOUT: Final = DiagnosticSpec(
+    code="points-without-field",
+    severity="warning",
+    text="{n_points} points have no valid {field}: they have a position only",
+    rank_by="n_points",
+)
+NO_INTENSITY: Final = DiagnosticSpec(
+    code="scan-intensity-not-chosen",
+    severity="warning",
+    text="the scans have no intensity; fields not used: {names}",
+    remedy="{step}.intensity_field={candidate} takes one as the intensity",
+)
+FEW_STATIONS: Final = DiagnosticSpec(
+    code="scan-stations-missing",
+    severity="warning",
+    text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest station "
+    "decides the front of a wall",
+)
+COARSE_OFFSETS: Final = DiagnosticSpec(
+    code="scan-offsets-coarse",
+    severity="warning",
+    text="the points reach {farthest_m:.0f} m from the origin of the cloud, where coordinates are "
+    "kept to {resolution_mm:.2f} mm only",
+    remedy="check {step}.unit, or cut stray points off with {step}.box",
+)
+ROUNDED: Final = DiagnosticSpec(
+    code="scan-coordinates-rounded",
+    severity="warning",
+    text="the coordinates of {subject} are rounded to {rounding_mm:g} mm: planes and depths cannot "
+    "be finer, and a grid may show",
+    rank_by="rounding_mm",
+)
+SIZE: Final = DiagnosticSpec(
+    code="scan-size-implausible",
+    severity="warning",
+    text="the scan is {size} m ({unit}): is that right?",
+    remedy="set {step}.unit={other} if it is in {other}, or to cm, ft, us-ft, in",
+)
+TOO_FAR: Final = DiagnosticSpec(
+    code="points-too-far",
+    severity="warning",
+    text="{subject}: {n_points} points lie farther than {farthest_m:g} m from the origin, the "
+    "first at {place}, and were left out",
+    remedy="check the file and {step}.unit",
+    rank_by="n_points",
+)
+NO_RETURN: Final = DiagnosticSpec(
+    code="points-without-return",
+    severity="warning",
+    text="{n_points} points at 0 0 0 are no returns of the scanner and were left out",
+    rank_by="n_points",
+)
+NOT_FINITE: Final = DiagnosticSpec(
+    code="points-not-finite",
+    severity="warning",
+    text="{n_points} points with coordinates that are not finite were left out",
+    rank_by="n_points",
+)
+RULES: Final = {
+    "intensity_max": "intensity_max",
+    "stated": "limits that the scan states",
+    "nominal": "usual range of such data",
+    "data": "range of its data",
+}
+
+
+def report_notes(ctx: StepContext, file: ScanFile) -> None:
+    """Report what the reader noticed."""
+    for note in file.notes:
+        ctx.report(FILE_NOTE, subject=file.name, text=note)
+
+
+def report_scales(
+    ctx: StepContext,
+    counts: Sequence[ScanCount],
+    scales: Sequence[IntensityScale | None],
+    clipped: Sequence[int],
+) -> None:
+    """Report where intensities do not fit what the scans state, or each other."""
+    for count, scale, n_clipped in zip(counts, scales, clipped, strict=True):
+        if scale is None:
+            continue
+        low, high = scale.low, scale.high
+        if n_clipped:
+            ctx.report(
+                INTENSITY_CLIPPED,
+                subject=count.title,
+                n_points=n_clipped,
+                low=low,
+                high=high,
+                rule=RULES[scale.rule],
+            )
+        if scale.stated is not None:
+            ctx.report(
+                INTENSITY_LIMITS,
+                subject=count.title,
+                stated_low=scale.stated[0],
+                stated_high=scale.stated[1],
+                low=low,
+                high=high,
+            )
+    known = [(c, s) for c, s in zip(counts, scales, strict=True) if s is not None]
+    ranges: dict[str, str] = {}
+    for count, scale in known:
+        ranges.setdefault(f"{scale.low:g} to {scale.high:g}", count.title)
+    if len(ranges) > 1 and any(scale.rule in ("data", "nominal") for _, scale in known):
+        texts = [f"{title} {text}" for text, title in ranges.items()]
+        ctx.report(INTENSITY_RANGES, ranges=_listed(texts))
+
+
+def report_fields(ctx: StepContext, counts: Sequence[ScanCount], cloud: PointCloud) -> None:
+    """Report which scans lack what others have, and fields that could be the intensity."""
+    counts = [count for count in counts if count.n_kept]
+    without = {"colour": [count.n_without_rgb for count in counts]}
+    if cloud.intensity is not None:
+        without["intensity"] = [
+            int(np.count_nonzero(np.isnan(cloud.intensity[count.start : count.stop])))
+            for count in counts
+        ]
+    if cloud.rgb is None:
+        del without["colour"]
+    for name, missing in without.items():
+        n_invalid = 0
+        for count, n_missing in zip(counts, missing, strict=True):
+            if n_missing == count.n_kept:
+                ctx.report(SCAN_WITHOUT, subject=count.title, field=name, n_points=n_missing)
+            else:
+                n_invalid += n_missing
+        if n_invalid:
+            ctx.report(POINTS_WITHOUT, field=name, n_points=n_invalid)
+    unused = _names(count.scan.fields_not_used for count in counts)
+    candidates = [name for name in unused if may_be_intensity(name)]
+    if cloud.intensity is None and candidates:
+        ctx.report(NO_INTENSITY, names=_listed(unused), candidate=candidates[0])
+
+
+def report_stations(ctx: StepContext, stations: Stations, n_scans: int, *, has_view: bool) -> None:
+    """Report that only some scans have a station, or that one that was given is not used."""
+    if stations.source != "file" or stations.positions is None:
+        return
+    if not stations.per_scan:
+        ctx.report(FEW_STATIONS, n_stations=len(stations.positions), n_scans=n_scans)
+    if has_view:
+        why = "the files state where the scanner stood"
+        ctx.report(NO_EFFECT, setting="view_from", why=why)
+
+
+def report_precision(
+    ctx: StepContext, assembly: CloudAssembly, summaries: Sequence[ScanSummary], unit: str | None
+) -> dict[str, JsonValue]:
+    """Report coordinates that are coarse, and a size that no wall or building has."""
+    farthest_m = max(float(np.abs(values).max()) for values in assembly.offsets)
+    resolution = resolution_m(farthest_m)
+    if resolution > FINE_M:
+        ctx.report(COARSE_OFFSETS, farthest_m=farthest_m, resolution_mm=1000 * resolution)
+    roundings = {count.file: count.rounding_m for count in assembly.counts}
+    for name, rounding in roundings.items():
+        if rounding >= COARSE_M:
+            ctx.report(ROUNDED, subject=name, rounding_mm=1000 * rounding)
+    low = np.min([summary.low for summary in summaries], axis=0)
+    high = np.max([summary.high for summary in summaries], axis=0)
+    side_m = float(np.median(high - low))
+    if not _SMALL_M <= side_m <= _LARGE_M:
+        units = [unit_and_source(count, unit) for count in assembly.counts]
+        is_assumed = {source for _, source in units} == {"assumed"}
+        ctx.report(
+            SIZE,
+            size=_size(high - low),
+            unit="no file states a unit" if is_assumed else f"unit {units[0][0]}",
+            other="mm" if side_m > _LARGE_M else "m" if units[0][0] in ("mm", "cm") else "km",
+        )
+    return {"resolution_m": resolution, "rounding_m": max(roundings.values())}
+
+
+def unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
+    """Unit of a scan and where it is from; `unit` is what the user says, or None."""
+    if unit is not None:
+        return unit, "cloud.unit"
+    stated = count.scan.unit
+    return ("m", "assumed") if stated is None else (stated.name, stated.source)
+
+
+def scan_json(
+    count: ScanCount, scale: IntensityScale | None, unit: str | None
+) -> dict[str, JsonValue]:
+    """Summary of a scan, as `scans.json` has it."""
+    name, unit_from = unit_and_source(count, unit)
+    return {
+        "file": count.file,
+        "scan": count.index,
+        "name": count.scan.name,
+        "format": count.format_name,
+        "n_points": count.n_kept,
+        "n_read": count.n_read,
+        "fields_used": list(count.scan.fields_used),
+        "fields_not_used": list(count.scan.fields_not_used),
+        "unit": name,
+        "unit_m": count.unit_m.tolist(),
+        "unit_from": unit_from,
+        "left_out": {cause: n for cause, n in sorted(count.left_out.items()) if n},
+        "n_without_colour": count.n_without_rgb,
+        "intensity": None
+        if scale is None
+        else {"low": scale.low, "high": scale.high, "rule": scale.rule},
+        "rgb_scale": None if count.colours is None else count.colours.scale,
+        "rounding_m": count.rounding_m,
+    }
+
+
+def report_summary(
+    ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud, *, up: str, unit: str | None
+) -> None:
+    """Report counts and extent as metrics, and everything in one line."""
+    counts = assembly.counts
+    left_out: Counter[str] = Counter()
+    for count in counts:
+        left_out.update({cause: n for cause, n in count.left_out.items() if n})
+        if count.left_out["too_far"]:
+            ctx.report(
+                TOO_FAR,
+                subject=count.title,
+                n_points=count.left_out["too_far"],
+                farthest_m=FARTHEST_M,
+                place=" ".join(f"{value:g}" for value in count.first_far_m),
+            )
+    for spec, cause in ((NO_RETURN, "no_return"), (NOT_FINITE, "not_finite")):
+        if left_out[cause]:
+            ctx.report(spec, n_points=left_out[cause])
+    ctx.metric("n_points", len(cloud), "1")
+    ctx.metric("n_points_left_out", left_out.total(), "1")
+    for cause, n_points in sorted(left_out.items()):
+        ctx.metric(f"n_left_out_{cause}", n_points, "1")
+    ctx.metric("n_invalid", left_out["invalid"] + left_out["no_return"], "1")
+    ctx.metric("n_withheld", left_out["withheld"], "1")
+    ctx.metric("n_not_finite", left_out["not_finite"] + left_out["too_far"], "1")
+    ctx.metric("n_scans", len(counts), "1")
+    ctx.metric("n_stations", 0 if cloud.stations is None else len(cloud.stations), "1")
+    sides_m = np.array([values.max() - values.min() for values in assembly.offsets])
+    for side_m, name in zip(sides_m, "xyz", strict=True):
+        ctx.metric(f"extent_{name}_m", float(side_m), "m")
+    units = dict.fromkeys(unit_and_source(count, unit) for count in counts)
+    causes = [f"{n} {cause.replace('_', ' ')}" for cause, n in sorted(left_out.items())]
+    ctx.report(
+        SUMMARY,
+        format=", ".join(dict.fromkeys(count.format_name for count in counts)),
+        n_scans=len(counts),
+        plural="" if len(counts) == 1 else "s",
+        n_points=len(cloud),
+        used=_listed(_names(count.scan.fields_used for count in counts)),
+        not_used=_listed(_names(count.scan.fields_not_used for count in counts)) or "none",
+        unit=_listed([f"{name} ({source})" for name, source in units]),
+        up=up,
+        extent=_size(sides_m),
+        left_out=", ".join(causes) or "none",
+    )
+
+
+def _names(groups: Iterable[Sequence[str]]) -> list[str]:
+    return list(dict.fromkeys(name for group in groups for name in group))
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more
+
+
+def _size(sides_m: NDArray[np.float64]) -> str:
+    return " x ".join(
+        f"{side_m:.3f}" if 0.1 < side_m < 1e4 else f"{side_m:.3g}" for side_m in sides_m
+    )

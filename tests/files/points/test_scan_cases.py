@@ -1,0 +1,95 @@
+"""Scan files as they are met in practice, read as a user expects: `tests/scan_cases.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read.scan import ReadScan
+
+from orthoflow.errors import InputError
+from orthoflow.products import InputFiles, PointCloud
+from orthoflow.sdk import StepContext
+from tests.scan_cases import CASES, Case, Draw
+
+SEEDS = range(6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CASES)
+def test_scans_of_other_programs_are_read_right(name: str, seed: int, tmp_path: Path) -> None:
+    case = CASES[name](Draw(seed, tmp_path))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
+    files = ReadScan.In(files=InputFiles(name="scan", paths=tuple(case.paths)))
+    params = ReadScan.Params(**case.params)
+    if case.refusal:
+        with pytest.raises(InputError) as refused:
+            ReadScan().run(files, params, ctx)
+        assert "\n" not in str(refused.value)
+        for part in case.refusal:
+            assert part in str(refused.value)
+        return
+    cloud = ReadScan().run(files, params, ctx).cloud
+    said = "\n".join(ctx.warnings)
+    for part in case.warnings:
+        assert part in said
+    np.testing.assert_allclose(
+        cloud.points_world() - case.shift, case.scene.points, atol=case.atol_m, rtol=0.0
+    )
+    check_colours(cloud, case)
+    check_intensity(cloud, case)
+    check_summary(cloud, case, {metric.name: metric.value for metric in ctx.metrics})
+
+
+def check_colours(cloud: PointCloud, case: Case) -> None:
+    if not case.rgb:
+        assert cloud.rgb is None
+        return
+    assert cloud.rgb is not None
+    has_rgb = all_of(cloud) if case.has_rgb is None else case.has_rgb
+    found = all_of(cloud) if cloud.has_rgb is None else cloud.has_rgb
+    np.testing.assert_array_equal(found, has_rgb)
+    differences = np.abs(cloud.rgb.astype(int) - case.scene.rgb)[has_rgb]
+    assert differences.max() <= 1
+
+
+def check_intensity(cloud: PointCloud, case: Case) -> None:
+    if case.intensity == "none":
+        assert cloud.intensity is None
+        return
+    assert cloud.intensity is not None
+    has_intensity = all_of(cloud) if case.has_intensity is None else case.has_intensity
+    np.testing.assert_array_equal(np.isfinite(cloud.intensity), has_intensity)
+    if case.has_linear is not None:
+        has_intensity = has_intensity & case.has_linear
+    found, right = cloud.intensity[has_intensity], case.scene.reflectance[has_intensity]
+    if case.intensity == "equal":
+        np.testing.assert_allclose(found, right, atol=0.005)
+        return
+    slope, start = np.polyfit(right, found, 1)
+    inside = (found > 0.0) & (found < 1.0)
+    assert inside.mean() > 0.9
+    assert slope > 0.5
+    np.testing.assert_allclose(found[inside], (start + slope * right)[inside], atol=0.03)
+
+
+def check_summary(cloud: PointCloud, case: Case, metrics: Mapping[str, float]) -> None:
+    scans: Any = cloud.source["scans"]
+    assert {scan["unit"] for scan in scans} == {case.unit}
+    left_out: dict[str, int] = {}
+    for scan in scans:
+        for cause, count in scan["left_out"].items():
+            left_out[cause] = left_out.get(cause, 0) + count
+    assert left_out == case.left_out
+    assert metrics["n_points_left_out"] == sum(left_out.values())
+    assert metrics["n_points"] == sum(scan["n_points"] for scan in scans) == len(case.scene)
+
+
+def all_of(cloud: PointCloud) -> NDArray[np.bool_]:
+    return np.ones(len(cloud), dtype=np.bool_)
