@@ -1,4 +1,4 @@
-"""The tables of docs/results.md: the shipped comparisons run, and printed as Markdown.
+"""The tables of docs/choosing.md: the shipped comparisons run, and printed as Markdown.
 
     python benchmarks/method_comparisons.py runs/comparisons
     python benchmarks/method_comparisons.py runs/comparisons --recipe plane-methods

@@ -50,9 +50,6 @@ NOT_OURS: Final[Mapping[str, str]] = {
     "ENV": "a line of a Dockerfile",
     "RUN": "a line of a Dockerfile",
     "cd": "goes elsewhere",
-    "chroot": "another machine",
-    "cp": "the shell's own",
-    "debootstrap": "another machine",
     "lint-imports": "CI runs it",
     "mypy": "CI runs it",
     "ruff": "CI runs it",
@@ -61,7 +58,6 @@ NOT_OURS: Final[Mapping[str, str]] = {
 }
 # Options of programs that are not ours.
 NOT_OUR_OPTIONS: Final[Mapping[str, str]] = {
-    "--long": "of .ci/run",
     "--memory-limit": "of dask worker",
     "--nthreads": "of dask worker",
     "--resources": "of dask worker",
