@@ -38,6 +38,8 @@ from orthoflow.testing.physics import (
     orients_photos,
     planes_follow_a_rigid_motion,
     poses_are_recovered,
+    stated_errors_of_planes_hold,
+    stated_errors_of_poses_hold,
 )
 from orthoflow.testing.witnesses import Subject, require
 
@@ -412,7 +414,9 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(a_huge_coordinate_does_no_harm, _takes_a_cloud, is_quick=False),
     _check(missing_ties_are_told, _takes_ties, is_quick=False),
     _check(planes_follow_a_rigid_motion, finds_planes, is_quick=False),
+    _check(stated_errors_of_planes_hold, finds_planes, is_quick=False),
     _check(poses_are_recovered, orients_photos, is_quick=False),
+    _check(stated_errors_of_poses_hold, _takes_ties, is_quick=False),
     _check(cells_show_their_own_place, lays_onto_walls, is_quick=False),
     _check(mosaics_show_cells_in_place, joins_layers, is_quick=False),
     _check(golden_digest_holds, _always),

@@ -389,8 +389,18 @@ def _checkpoints() -> CheckPoints:
 
 @cache
 def example_ties() -> Ties:
-    """Give ties with 0.3 px of noise, every 25th of them wrong by up to 40 px."""
-    rng = np.random.default_rng(11)
+    """Return ties with 0.3 px of noise, every 25th of them wrong by up to 40 px."""
+    return drawn_ties(11, noise_m=0.0)
+
+
+def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
+    """Return ties as those of the example, drawn anew.
+
+    Args:
+        seed: of places, noise and wrong ties.
+        noise_m: standard deviation of each coordinate of a point; as stated, unless told otherwise.
+    """
+    rng = np.random.default_rng(seed)
     views = list(photographing_cameras().values())
     columns: list[tuple[NDArray[np.float64], ...]] = []
     for index, camera in enumerate(views):
@@ -402,6 +412,8 @@ def example_ties() -> Ties:
         pixels = pixels + _TIE_SIGMA_PX * rng.normal(size=pixels.shape)
         is_wrong = rng.random(len(pixels)) < _WRONG_SHARE
         pixels[is_wrong] += rng.uniform(-40.0, 40.0, (int(is_wrong.sum()), 2))
+        if noise_m:
+            points = points + noise_m * rng.normal(size=points.shape)
         columns.append((np.full(len(wall), float(index)), wall, pixels, points))
     photo, wall, pixels, points = (np.concatenate(column) for column in zip(*columns, strict=True))
     count = len(photo)

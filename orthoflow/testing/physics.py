@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,7 @@ from orthoflow.testing.photographed import (
     PHOTOGRAPHED,
     TexturedWall,
     cloud_of,
+    drawn_ties,
     photographed_scene,
     photographing_cameras,
     places_of_cells,
@@ -41,6 +43,12 @@ _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
 _JOINED_SHARE: Final = 0.97
+# Rooms, or sets of ties, whose errors are compared with what is stated of them.
+_SAME_PLANE_M: Final = 0.02
+_NO_VARIANCE: Final = 1e-30
+_DRAWS: Final = (2, 3, 4)
+# The RMS over what is drawn is known to an eighth; our own methods have 0.82 to 0.93.
+_STATED_LIMITS: Final = (0.1, 2.0)
 
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
@@ -71,6 +79,66 @@ def _match_planes(found: Planes, truth: Planes) -> None:
             f"plane {index} of a moved room is {angles_deg.min():.3f} deg and "
             f"{1000 * gaps_m[np.argmin(angles_deg)]:.2f} mm from the nearest true plane",
         )
+
+
+def stated_errors_of_planes_hold(subject: Subject) -> None:
+    """Planes of drawn rooms are off by a tenth to twice what their covariances state."""
+    ratios: list[float] = []
+    for seed in _DRAWS:
+        cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
+        planes = subject.run_on(f"stated{seed}", cloud=cloud).outputs["planes"]
+        if isinstance(planes, Planes):
+            ratios += _plane_ratios(planes, truth)
+    _check_ratios(ratios, "distances of planes to their true corners")
+
+
+def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
+    """Return errors over their stated standard deviations, at true corners and centres."""
+    ratios = []
+    for index in range(len(found)):
+        nearest = int(np.argmax(truth.normal @ found.normal[index]))
+        corners = truth.corners[nearest]
+        places = np.vstack([corners, corners.mean(axis=0)])
+        off_m = places @ found.normal[index] - found.offset[index]
+        # Of a level method that finds the floor as the ceiling nothing is said here.
+        if np.abs(off_m).max() < _SAME_PLANE_M:
+            at = np.column_stack([places, -np.ones(len(places))])
+            variances = np.einsum("ij,jk,ik->i", at, found.covariance[index], at)
+            ratios += (np.abs(off_m) / np.sqrt(np.maximum(variances, _NO_VARIANCE))).tolist()
+    return ratios
+
+
+def stated_errors_of_poses_hold(subject: Subject) -> None:
+    """Poses from drawn ties are off by a tenth to twice what their covariances state."""
+    ratios: list[float] = []
+    for seed in _DRAWS:
+        outputs = subject.run_on_photographs(f"stated{seed}", ties=drawn_ties(seed)).outputs
+        cameras = outputs["cameras"]
+        for camera in cameras.cameras if isinstance(cameras, Cameras) else ():
+            if camera.status == "ok" and camera.covariance is not None:
+                found, true = camera.viewing(), photographing_cameras()[camera.photo]
+                turn = true.rotation @ found.rotation.T
+                # Half the skew part is the vector of a small turn.
+                turned = 0.5 * (turn - turn.T)[(2, 0, 1), (1, 2, 0)]
+                error = np.concatenate([turned, true.translation - found.translation])
+                scale = np.sqrt(np.maximum(np.diag(camera.covariance), _NO_VARIANCE))
+                correlation = camera.covariance / np.outer(scale, scale)
+                error = error / scale
+                ratios.append(math.sqrt(error @ np.linalg.pinv(correlation) @ error / 6.0))
+    if ratios:
+        _check_ratios(ratios, "poses")
+
+
+def _check_ratios(ratios: list[float], what: str) -> None:
+    require(ratios, "no plane of a drawn room was found")
+    factor = math.sqrt(float(np.mean(np.square(ratios))))
+    low, high = _STATED_LIMITS
+    require(
+        low <= factor <= high,
+        f"{what} are off by {factor:.3g} times what the covariances state (allowed: {low:.2g} to "
+        f"{high:g} times, RMS over {len(ratios)}): state what your fit and the noise that it meets "
+        "give",
+    )
 
 
 def poses_are_recovered(subject: Subject) -> None:

@@ -140,12 +140,14 @@ class Subject:
         changed = replace(trial, inputs={**trial.inputs, **inputs})
         return run_trial(changed, self.folder / name)
 
-    def run_on_photographs(self) -> TrialRun:
-        """Give the run on the suite's own photographs, which most methods had as inputs anyway."""
+    def run_on_photographs(self, name: str = "photographs", **inputs: Product) -> TrialRun:
+        """Run the method on the suite's own photographs, with other inputs on some ports."""
         examples = example_inputs(self.method)
-        if all(self.witness.trial.inputs.get(name) is given for name, given in examples.items()):
+        given = self.witness.trial.inputs
+        if not inputs and all(given.get(port) is one for port, one in examples.items()):
             return self.witness.first.run
-        return run_trial(replace(self.witness.trial, inputs=examples), self.folder / "photographs")
+        changed = replace(self.witness.trial, inputs={**examples, **inputs})
+        return run_trial(changed, self.folder / name)
 
     def run_cancelled(self) -> TrialRun:
         """Run the method in a step that was cancelled before it began."""
