@@ -5,6 +5,8 @@ So 255 of 8 bits are 65535 of 16, and every level of 8 bits is one of 16: times 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -17,6 +19,14 @@ Level: TypeAlias = type[np.uint8] | type[np.uint16]
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # Levels of 16 bits for one of 8.
 DEEPER: Final = 257
+# A picture is of one tone if so much of it is within a level of 256 of its median, or darker than
+# this share of white, or brighter than white less this share.
+_PLAIN_SHARE: Final = 0.98
+_DARK: Final = 0.03
+_LEVEL: Final = 0.5 / 255.0
+_TONE_SAMPLE: Final = 1_000_000
+# Smaller ones are not judged.
+_TONE_CELLS_MIN: Final = 2000
 
 
 def eight_bits(colours: Colours) -> NDArray[np.uint8]:
@@ -41,3 +51,38 @@ def in_levels(colours: Colours, level: Level) -> Colours:
 def level_of(colours: Colours) -> Level:
     """Say in which bits colours are."""
     return np.uint16 if colours.dtype == np.uint16 else np.uint8
+
+
+def plain_tone(
+    picture: NDArray[np.generic], mask: NDArray[np.uint8], shown: Sequence[int], *, white: float
+) -> tuple[str, float] | None:
+    """Whether a picture is nearly all black, white or one value.
+
+    Args:
+        picture: (rows, cols) or (rows, cols, 3); NaN counts for nothing.
+        mask: (rows, cols) states of the cells.
+        shown: states of those that show something.
+        white: the value of full brightness.
+
+    Returns:
+        `black`, `white` or `one value`, and the share of the cells that are; None for a picture
+        with tones, or of few cells.
+
+    >>> ramp, mask = np.linspace(0.0, 1.0, 2000)[None], np.ones((1, 2000), dtype=np.uint8)
+    >>> plain_tone(0.0 * ramp, mask, (1,), white=1.0), plain_tone(ramp, mask, (1,), white=1.0)
+    (('black', 1.0), None)
+    """
+    step = max(1, math.isqrt(mask.size // _TONE_SAMPLE))
+    is_shown = np.isin(mask[::step, ::step], shown)
+    cells = picture[::step, ::step][is_shown].astype(np.float64) / white
+    cells = cells.reshape(len(cells), -1)
+    cells = cells[np.isfinite(cells).all(axis=1)]
+    if len(cells) < _TONE_CELLS_MIN:
+        return None
+    shares: Mapping[str, float] = {
+        "black": float((cells <= _DARK).all(axis=1).mean()),
+        "white": float((cells >= 1.0 - _DARK).all(axis=1).mean()),
+        "one value": float((np.abs(cells - np.median(cells, axis=0)) <= _LEVEL).all(axis=1).mean()),
+    }
+    tone = max(shares, key=lambda name: shares[name])
+    return (tone, shares[tone]) if shares[tone] >= _PLAIN_SHARE else None

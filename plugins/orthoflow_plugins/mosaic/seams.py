@@ -17,7 +17,7 @@ from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
 from orthoflow.files.polygons import NamedPolygon
 from orthoflow.geometry.bands import Allocate, count_cells, holds_cells
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.levels import eight_bits, plain_tone
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -84,6 +84,13 @@ CONTRADICTED: Final = DiagnosticSpec(
     text="{subject}: {share:.1%} of its cells are shown by one photo alone, and the scan has "
     "another colour there: something that passed by may be painted",
     remedy="take a second photo of it, or give the input seams",
+    rank_by="share",
+)
+PLAIN: Final = DiagnosticSpec(
+    code="orthoimage-of-one-tone",
+    severity="warning",
+    text="{subject}: {share:.0%} of its orthoimage is {tone}: so are its sources there ({sources})",
+    remedy="look at these photos, or at the colours of the scan",
     rank_by="share",
 )
 UNCHECKED: Final = DiagnosticSpec(
@@ -421,6 +428,12 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
         ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
     else:
         _tell_of_empty(ctx, image, cameras)
+        white = 255.0 if image.rgb.dtype == np.uint8 else 65535.0
+        shown = (OrthoMask.PAINTED, OrthoMask.FILLED)
+        if (plain := plain_tone(image.rgb, image.mask, shown, white=white)) is not None:
+            sources = ", ".join(image.sources[:3]) + (" ..." if len(image.sources) > 3 else "")
+            tone, share = plain
+            ctx.report(PLAIN, subject=image.name, tone=tone, share=share, sources=sources)
     if len(image.sources) > 1:
         ctx.figure(f"wall_{image.number}_sources", _source_map(image), _caption(image))
 

@@ -32,6 +32,7 @@ from orthoflow_plugins.raster.maps import mapped
 from orthoflow_plugins.raster.reporting import (
     report,
     report_empty,
+    report_tones,
     warn,
     warn_of_covered,
     warn_of_wide_gaps,
@@ -279,6 +280,7 @@ class RasterGrid(Method):
             warn_of_wide_gaps(ctx, walls)
         report(ctx, rasters, planes.up)
         report_empty(ctx, walls, empty)
+        report_tones(ctx, walls, cloud)
         return self.Out(
             walls=Walls(
                 walls=walls,

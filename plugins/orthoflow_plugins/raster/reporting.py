@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
-from orthoflow.products import SurfaceMask, Wall
+from orthoflow.geometry.levels import plain_tone
+from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
@@ -80,6 +81,13 @@ UNSEEN: Final = DiagnosticSpec(
     "what no station sees)",
     rank_by="share",
 )
+PLAIN: Final = DiagnosticSpec(
+    code="wall-of-one-tone",
+    severity="warning",
+    text="{subject}: {share:.0%} of its {what} is {tone}; {cause}",
+    remedy="{way}",
+    rank_by="share",
+)
 _CAUSES: Final = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
@@ -129,6 +137,47 @@ def _least_gsd_m(step_m: float) -> float:
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
     # Rounded up: the nearest number of two digits may be what is too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
+
+
+def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> None:
+    """Report walls whose intensity or colour is nearly all black, white or one value."""
+    scans = cloud.source.get("scans")
+    scales: dict[str, None] = {}
+    colours: dict[str, None] = {}
+    for scan in scans if isinstance(scans, list) else []:
+        if isinstance(scan, dict) and isinstance(scale := scan.get("intensity"), dict):
+            scales[f"{scale['low']} to {scale['high']} ({scale['rule']})"] = None
+        if isinstance(scan, dict) and scan.get("rgb_scale"):
+            colours[str(scan["rgb_scale"])] = None
+    for wall in walls:
+        states = (SurfaceMask.MEASURED, SurfaceMask.RECOVERED)
+        found = None
+        if wall.intensity is not None:
+            found = plain_tone(wall.intensity, wall.mask, states, white=1.0)
+        if found is not None:
+            ctx.report(
+                PLAIN,
+                subject=wall.name,
+                what="intensity",
+                tone=found[0],
+                share=found[1],
+                cause=f"the scans' intensities are scaled from {', '.join(scales) or '0 to 1'}",
+                way="{step[read.scan]}.intensity_max=NUMBER says what is white",
+            )
+        if wall.rgb is None or wall.rgb_mask is None:
+            continue
+        found = plain_tone(wall.rgb, wall.rgb_mask, (1,), white=255.0)
+        if found is not None:
+            read_as = f", read as {', '.join(colours)}" if colours else ""
+            ctx.report(
+                PLAIN,
+                subject=wall.name,
+                what="colour",
+                tone=found[0],
+                share=found[1],
+                cause=f"so are the colours of its points{read_as}",
+                way="look whether the program that wrote the scan exported colours",
+            )
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:

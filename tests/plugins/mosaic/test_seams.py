@@ -447,3 +447,16 @@ def test_gains_and_what_a_lens_loses_in_its_corners_are_told(tmp_path: Path) -> 
         ctx = scenes.context(tmp_path)
         seams._report_gains(ctx, few)
         assert {metric.name for metric in ctx.metrics} == names
+
+
+@pytest.mark.parametrize(("rgb", "tone"), [(2, "black"), (254, "white"), (128, "one value")])
+def test_an_orthoimage_of_one_tone_is_reported(tmp_path: Path, rgb: int, tone: str) -> None:
+    mask = np.full((60, 50), LayerMask.PAINTED, dtype=np.uint8)
+    layer = smooth_layer("dark.jpg", np.ones((60, 50), dtype=np.float32), mask, rgb=rgb)
+    ctx = scenes.context(tmp_path)
+    MosaicSeams().run(
+        MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",))), MosaicSeams.Params(), ctx
+    )
+    (found,) = [one for one in ctx.diagnostics if one.code == "orthoimage-of-one-tone"]
+    assert f"is {tone}" in found.text
+    assert "dark.jpg" in found.text

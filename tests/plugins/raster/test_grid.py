@@ -390,3 +390,40 @@ def test_what_an_adjoining_plane_cuts_off_is_told_of_beyond_a_cell_and_warned_of
     if told == "warn":
         assert "at its left runs askew" in ctx.warnings[0]
         assert "up to 51 mm of its plane are left out" in ctx.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("intensity", "rgb", "what"),
+    [
+        (0.012, None, "intensity is black"),
+        (0.99, None, "intensity is white"),
+        (0.4, 255, "colour is white"),
+        (0.4, 3, "colour is black"),
+        (None, None, ""),
+    ],
+)
+def test_a_wall_of_one_tone_is_reported_with_its_cause(
+    tmp_path: Path, intensity: float | None, rgb: int | None, what: str
+) -> None:
+    known = scenes.leaning_wall(shape=(50, 60))
+    cloud, _ = one_point_per_cell(known)
+    n_points = len(cloud)
+    source = {"scans": [{"intensity": {"low": 0.0, "high": 65535.0, "rule": "stated"}}]}
+    tones = np.linspace(0.0, 1.0, n_points, dtype=np.float32)
+    colours = np.full((n_points, 3), rgb or 0, dtype=np.uint8)
+    cloud = dataclasses.replace(
+        cloud,
+        intensity=tones if intensity is None else tones * 1e-3 + np.float32(intensity - 5e-4),
+        rgb=cloud.rgb if rgb is None else colours,
+        source=source,
+    )
+    ctx = scenes.context(tmp_path)
+    RasterGrid().run(
+        RasterGrid.In(cloud=cloud, planes=known.planes()),
+        RasterGrid.Params(gsd_m=known.gsd_m),
+        ctx,
+    )
+    found = [one for one in ctx.diagnostics if one.code == "wall-of-one-tone"]
+    assert any(what in one.text for one in found) == bool(what)
+    if "intensity" in what:
+        assert "0.0 to 65535.0 (stated)" in found[0].text
