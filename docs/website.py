@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from enum import IntEnum
 from importlib import import_module
 from itertools import chain
@@ -35,10 +35,8 @@ from orthoflow.files.sidecars import (
 )
 from orthoflow.products import LayerMask, OrthoMask, SurfaceMask
 from orthoflow.records import COSTS
-from orthoflow.report.metric_words import metric_words, spelt_out
 from orthoflow.report.rankings import Sense, sense_of
-from orthoflow.sdk import Method, port_specs
-from orthoflow.sdk.units import unit_of
+from orthoflow.sdk import Method, MetricSpec, port_specs
 from orthoflow.workflow.parameters import (
     describe_method,
 )
@@ -240,36 +238,33 @@ def _metrics(catalog: Catalog) -> Iterator[str]:
         "the right, `y` and `v` down, as seen by who stands before it; `u` and `v` of a photo are "
         "its columns and rows.\n"
     )
-    said: dict[str, list[str]] = {}
+    declared: dict[MetricSpec, list[str]] = {}
     for name in sorted(catalog.methods):
-        for metric in (one.name for one in describe_method(catalog, name).method.metric_specs()):
-            said.setdefault(metric, []).append(name)
-    for kind in sorted({name.partition(".")[0] for names in said.values() for name in names}):
+        for spec in describe_method(catalog, name).method.metric_specs():
+            declared.setdefault(replace(spec, needs=()), []).append(name)
+    for kind in sorted({name.partition(".")[0] for names in declared.values() for name in names}):
         yield f"## {kind}\n\n{_METRICS_HEAD}"
-        for metric, names in said.items():
+        for spec, names in declared.items():
             own = [name for name in names if name.partition(".")[0] == kind]
-            if not metric.startswith(("all_", "floor_", "wall_", "*_", "worst_", "surf_floor")):
-                for one in spelt_out(metric) if own else ():
-                    yield from _metric(one, own)
+            if own and not spec.name.startswith(("all_", "floor_", "wall_", "*_")):
+                yield _metric(spec, own)
         yield ""
     yield f"## every step\n\n{_METRICS_HEAD}"
-    for metric in COSTS:
-        yield from _metric(metric, ["all"])
+    for name, cost in COSTS.items():
+        yield f"| `{name}` | {cost.label} | {cost.unit} | {_good(cost.better)} | all |"
     yield ""
 
 
-def _metric(name: str, methods: list[str]) -> Iterator[str]:
-    """Rows of a metric: one for each thing that methods say by its name."""
-    unit = "" if name.startswith("n_") or name.endswith("_sigma") else unit_of(name)
-    if unit == "1":
-        unit = "share" if "share" in name.split("_") else ""
-    sense = sense_of(name)
-    good = "" if sense is Sense.NEITHER else sense.value
-    by_words: dict[str, list[str]] = {}
-    for method in methods:
-        by_words.setdefault(metric_words(name, method), []).append(method)
-    for words, own in by_words.items():
-        yield f"| `{name}` | {words} | {unit} | {good} | {', '.join(own)} |"
+def _metric(spec: MetricSpec, methods: list[str]) -> str:
+    label = re.sub(r"\{\d\}", "...", spec.label) or spec.name
+    words = f"{label}: {spec.description}" if spec.description else label
+    unit = "" if spec.unit == "1" else spec.unit
+    return f"| `{spec.name}` | {words} | {unit} | {_good(spec.better)} | {', '.join(methods)} |"
+
+
+def _good(better: str) -> str:
+    sense = sense_of(better)
+    return "" if sense is Sense.NEITHER else sense.value
 
 
 def _commands() -> Iterator[str]:

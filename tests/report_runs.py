@@ -7,9 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.truth import InspectTruth
+from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS
 from orthoflow_provenance.document import (
     Metric,
     RecordedCell,
@@ -34,6 +38,9 @@ from orthoflow.products.product import Payload, Product
 from orthoflow.records.comparison import ComparedMetric
 from orthoflow.records.distances import Distance, ProductDistance
 from orthoflow.records.runs import Run
+from orthoflow.sdk import Method, MetricSpec
+from orthoflow.sdk.methods import labelled
+from orthoflow.sdk.units import unit_of
 from tests import samples
 
 FRAME = samples.facing_south(0.01, 120, 80, (4.0e5, 5.0e6, 3.0))
@@ -41,6 +48,18 @@ FRAME = samples.facing_south(0.01, 120, 80, (4.0e5, 5.0e6, 3.0))
 ROTATION = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 CENTRE = FRAME.origin_world + np.array([0.6, -2.0, -0.4])
 FOCAL_PX = 1000.0
+
+
+class _Declaring(Method):
+    """A method that may report what some of the built-in methods do."""
+
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("rms_mm", label="points to the first plane, RMS", better="lower", headline=True),
+        *InspectTruth.metrics,
+        *InspectCheckpoints.metrics,
+        *ORIENTATION_METRICS,
+        *DETECTOR_METRICS,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +85,10 @@ class HeldRun(Run):
 _KINDS = {"check": "inspect", "other": "inspect", "first": "orient", "second": "orient"}
 
 
+# What cells of a kind give where a test does not say it.
+_GIVES = {"inspect": "inspection", "orient": "cameras", "raster": "walls"}
+
+
 def cell(address: str, **more: object) -> RecordedCell:
     """A cell that went well, but for what `more` says."""
     step, _, variants = address.partition("#")[0].partition("@")
@@ -83,6 +106,10 @@ def cell(address: str, **more: object) -> RecordedCell:
         "compile_s": 0.25,
         "params_set": more.get("params", {}),
     }
+    type_name = _GIVES.get(str(more.get("method", wanted["method"])).partition(".")[0])
+    if type_name and more.get("status", "ok") == "ok":
+        made = replace(given("", "0", type_name), embedded=False)
+        wanted["outputs"] = {type_name: made}
     return RecordedCell(**{**wanted, **more})  # type: ignore[arg-type]
 
 
@@ -94,12 +121,11 @@ def warned(*texts: str, code: str = "", subject: str = "", remedy: str = "") -> 
 
 
 def metrics(**values: float) -> tuple[Metric, ...]:
-    """Metrics whose unit is what their name ends with."""
-    units = {"mm": "mm", "deg": "deg", "s": "s"}
-    return tuple(
-        Metric(name=name, value=value, unit=units.get(name.rpartition("_")[2], "1"))
-        for name, value in values.items()
-    )
+    """Metrics as built-in methods declare them; others with the unit that their name ends in."""
+    reported = [
+        Metric(name=name, value=value, unit=unit_of(name) or "1") for name, value in values.items()
+    ]
+    return labelled(_Declaring, reported)
 
 
 def given(source: str, digest: str, type_name: str) -> RecordedProduct:

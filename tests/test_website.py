@@ -68,7 +68,7 @@ def test_the_reference_has_every_method_product_metric_and_command(
     assert {name for name in catalog.methods if f"### {name}\n" not in pages["methods"]} == set()
     assert {name for name in catalog.products if f"## {name}\n" not in pages["products"]} == set()
     assert {
-        "| `rmse_v_mm` | error along v (down), RMS | mm | less is better | inspect.truth |",
+        "| `rmse_[uv]_mm` | error along ..., RMS | mm | less is better | inspect.truth |",
         "| `rms_mm` | check points, RMS | mm | less is better | inspect.checkpoints |",
         "| `scale_ppm` | scale, from 1 | ppm |  | register.similarity |",
         "| `peak_rss_mib` | memory | MiB | less is better | all |",

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import json
 import os
+import re
 import traceback
 from collections import Counter
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
 
 if TYPE_CHECKING:
-    from orthoflow.sdk import Method, MethodParams, Ports
+    from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports
 
 _SUMMARIES: Final = {
     "list": "List every method, and what is wrong with plugins that do not load.",
@@ -286,8 +287,6 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
     echo(f"determinism   {method.determinism}, result version {method.result_version}")
     if method.maps_over:
         echo(f"in parts      over {method.maps_over}, where workers of a cluster are idle")
-    if method.metrics:
-        echo(f"metrics       {', '.join(one.name for one in method.metric_specs())}")
     for citation in method.citations:
         echo(f"citation      {citation}")
     echo()
@@ -299,6 +298,12 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
         *(("out", port, type_name, "") for port, type_name, _ in _ports(method.Out)),
     ]
     echo_table(("port", "name", "product", ""), ports)
+    if method.metrics:
+        echo()
+        echo_table(
+            ("metric", "unit", "better", "what it is"),
+            [(one.name, one.unit, one.better, _metric_text(one)) for one in method.metric_specs()],
+        )
     parameters = _parameters(method.Params)
     echo(*([""] if parameters else ["", "no parameters"]))
     echo_table(
@@ -308,6 +313,11 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
             for name, type_, default, unit, text in parameters
         ],
     )
+
+
+def _metric_text(spec: MetricSpec) -> str:
+    label = re.sub(r"\{\d\}", "...", spec.label)
+    return ": ".join(part for part in (label, spec.description) if part)
 
 
 def _docstring(method: type[Method]) -> str:

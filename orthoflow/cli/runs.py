@@ -211,7 +211,7 @@ def print_runs(
     for run in kept:
         if run.n_datasets > 1:
             counts = {name: (run.n_values[name],) for name in names if name in run.n_values}
-            echo_folded(f"{run.folder}: {medians(counts, run.n_datasets)}")
+            echo_folded(f"{run.folder}: {medians(counts, run.n_datasets, run.flags)}")
     n_left_out = len(found) - len(kept)
     others = f", {counted(n_left_out, 'other')} left out" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")

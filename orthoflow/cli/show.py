@@ -26,7 +26,6 @@ from orthoflow.cli.tables import (
     first_rows,
     medians,
     number,
-    quality_places,
     say_more,
     say_verify,
     size,
@@ -197,10 +196,14 @@ def _median(one: MethodOverDatasets) -> str:
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
     told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
-    place = quality_places((cell.step, metric.name) for cell, metric in told)
+    steps = list(dict.fromkeys(cell.step for cell in run.record.cells))
     rows = [
         (cell.address, metric.name, number(metric.value), metric.unit if metric.unit != "1" else "")
-        for cell, metric in first_rows(told, most, lambda one: place((one[0].step, one[1].name)))
+        for cell, metric in first_rows(
+            told,
+            most,
+            lambda one: (not one[1].headline, not one[1].better, -steps.index(one[0].step)),
+        )
     ]
     if rows:
         echo()

@@ -129,7 +129,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
 
 
 def first_rows(
-    rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, int]]
+    rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, ...]]
 ) -> Sequence[Row]:
     """Give the rows of a table that are printed: all, or the first by their place of too many."""
     if most is None or len(rows) <= most:
@@ -151,22 +151,6 @@ def say_verify(*runs: Path) -> str:
     """
     commands = " and ".join(f"`orthoflow verify {shlex.quote(str(run))}`" for run in runs)
     return f"whether all of it is as it was written, says {commands}"
-
-
-def quality_places(
-    rows: Iterable[tuple[str, str]],
-) -> Callable[[tuple[str, str]], tuple[int, int]]:
-    """Give the place of step and metric: by the metric, then of the last step that has it first.
-
-    A later step takes further what an earlier one has begun, as orientations do.
-
-    Args:
-        rows: step and metric of all, in the order of the run.
-    """
-    from orthoflow.report.moved import quality_place
-
-    steps = {step: place for place, step in enumerate(dict.fromkeys(step for step, _ in rows))}
-    return lambda row: (quality_place(row[1]), -steps[row[0]])
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:
@@ -232,23 +216,24 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def medians(counts: Mapping[str, Collection[int]], n_datasets: int) -> str:
+def medians(
+    counts: Mapping[str, Collection[int]], n_datasets: int, flags: Collection[str] = ()
+) -> str:
     """Say of how many datasets medians are.
 
     Args:
         counts: name of a number -> how many datasets have it, in each of its rows.
         n_datasets: of the run.
+        flags: those that are 1 where something is so and 0 where not.
 
     >>> medians({"rms_mm": [2, 2], "depth_rmse_mm": [1, 1], "n_oriented": [0, 2]}, 2)
     'medians of 2 datasets, of fewer where some have no value: depth_rmse_mm 1, n_oriented 0 to 2'
     >>> medians({"rms_mm": [2]}, 2)
     'medians of 2 datasets'
-    >>> medians({"rms_mm": [2], "check.main_found": [2]}, 2)
+    >>> medians({"rms_mm": [2], "check.main_found": [2]}, 2, ["check.main_found"])
     'medians (of check.main_found shares) of 2 datasets'
     """
-    from orthoflow.report.rankings import is_yes_or_no
-
-    shares = ", ".join(name for name in counts if is_yes_or_no(name.rpartition(".")[2]))
+    shares = ", ".join(name for name in counts if name in flags)
     what = f"medians (of {shares} shares)" if shares else "medians"
     ends = {name: (min(found), max(found)) for name, found in counts.items()}
     fewer = [

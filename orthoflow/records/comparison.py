@@ -182,6 +182,8 @@ class ComparedMetric:
         is_cost: a time or memory, which depend on the machine and its load, whoever measured it.
         is_cached: of a cell that an earlier run computed; its cost is that run's.
         environment: id of the environment it was computed in.
+        better: which values are better; empty where none are.
+        headline: it says how good the result is.
     """
 
     value: float
@@ -189,6 +191,8 @@ class ComparedMetric:
     is_cost: bool = field(compare=False)
     is_cached: bool = field(compare=False)
     environment: str = field(compare=False)
+    better: str = field(compare=False, default="")
+    headline: bool = field(compare=False, default=False)
 
     def is_near(self, other: ComparedMetric | None) -> bool:
         """Whether it is equal to another one but for rounding."""
@@ -520,6 +524,8 @@ def _metrics(cell: RecordedCell) -> dict[str, ComparedMetric]:
             is_cost=row.metric in COSTS or row.unit in _COST_UNITS,
             is_cached=bool(cell.cached_from),
             environment=cell.environment,
+            better=row.better,
+            headline=row.headline,
         )
         for row in cell_metrics(cell)
     }

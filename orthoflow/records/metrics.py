@@ -14,6 +14,7 @@ from orthoflow.foreign_text import csv_text
 
 # As of fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
 _ROUNDING: Final = 1e-6
+_UNITLESS: Final = ("1", "yes/no")
 _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
 
 
@@ -30,6 +31,9 @@ class MetricRow:
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
         label: what its method calls it; empty where it declares nothing.
         better: which values are better, `lower`, `higher` or `one`; empty where none are.
+        description: what else to know of it.
+        headline: it is one of the numbers that say how good a result is.
+        counted_by: metric of the same step that says how many items it sums up.
     """
 
     cell: str
@@ -40,6 +44,19 @@ class MetricRow:
     unit: str
     label: str = ""
     better: str = ""
+    description: str = ""
+    headline: bool = False
+    counted_by: str = ""
+
+    @property
+    def title(self) -> str:
+        """Its label; its name where its method declares none."""
+        return self.label or self.metric
+
+    @property
+    def titled(self) -> str:
+        """Its title with the unit; counts, shares and what is yes or no stand alone."""
+        return self.title if self.unit in _UNITLESS else f"{self.title} / {self.unit}"
 
 
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
@@ -59,6 +76,9 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
             unit=metric.unit,
             label=metric.label,
             better=metric.better,
+            description=metric.description,
+            headline=metric.headline,
+            counted_by=metric.counted_by,
         )
         for metric in (*cell.metrics, *cost_metrics(cell))
     )

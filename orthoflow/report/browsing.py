@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,15 +19,14 @@ from orthoflow.files.regular_files import open_file
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.metric_words import words_of
 from orthoflow.report.paired import middle_of
-from orthoflow.report.rankings import Sense, sense_of
-from orthoflow.report.summaries import QUALITY
+from orthoflow.report.rankings import FLAG, Sense, is_flag, sense_of
+from orthoflow.report.summaries import headline_keys
 from orthoflow.workflow.model import (
     DATA,
 )
@@ -81,6 +81,8 @@ class RunSummary:
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
+        headlines: those that say how good the result is, most important first.
+        flags: those that are 1 where something is so and 0 where not.
         facts: what may differ between runs: parameters of the baseline by `step.parameter`, its
             methods by `step.use`, and parameters of other variants by `step.variant.parameter`;
             `seed`, `orthoflow` (its version), and inputs by `input <name>`.
@@ -98,6 +100,8 @@ class RunSummary:
     n_datasets: int = 0
     n_values: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+    headlines: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
     facts: Mapping[str, Fact] = field(default_factory=dict)
     variants: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
@@ -226,13 +230,9 @@ def _sorted_json(value: JsonValue) -> str:
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
     """Names of the numbers that say how good some runs are, those of most of them first."""
-    counts = dict.fromkeys(QUALITY, 0)
-    for run in runs:
-        for name in counts:
-            counts[name] += name in run.metrics
-    known = [name for name, count in counts.items() if count]
-    chosen = sorted(known, key=lambda name: -counts[name])[:most]
-    return [name for name in known if name in chosen]
+    counts = Counter(name for run in runs for name in run.headlines)
+    chosen = sorted(counts, key=lambda name: -counts[name])[:most]
+    return [name for name in counts if name in chosen]
 
 
 def told_apart(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str]:
@@ -296,6 +296,18 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     for one in _alike(record.cells, baseline):
         facts |= one.facts
     values = _values(run)
+    measured = [
+        row
+        for part in parts.values() or (run,)
+        for cell in baseline_cells(part)
+        for row in cell_metrics(cell)
+    ]
+    flags = tuple(
+        name
+        for row in measured
+        if is_flag(row.unit)
+        for name in (row.metric, f"{row.step}.{row.metric}")
+    )
     return RunSummary(
         folder=folder,
         state=record.status,
@@ -304,12 +316,19 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         run_id=record.run_id,
         started=record.started,
         metrics={
-            name: middle_of(np.array(found), name.rpartition(".")[2])
+            name: middle_of(np.array(found), FLAG if name in flags else "")
             for name, found in values.items()
         },
         n_datasets=len(parts),
         n_values={name: len(found) for name, found in values.items()} if parts else {},
-        labels=_labels(run),
+        labels=_labels(measured),
+        headlines=tuple(
+            name
+            for _, name in headline_keys(
+                cell for part in parts.values() or (run,) for cell in baseline_cells(part)
+            )
+        ),
+        flags=flags,
         facts=facts,
         variants=_variants(record.cells),
     )
@@ -403,7 +422,7 @@ def _values(run: Run) -> dict[str, list[float]]:
         own: dict[str, float] = {}
         for cell in baseline_cells(part):
             for row in cell_metrics(cell):
-                is_size = len(parts) > 1 and sense_of(row.metric, row) is Sense.LESS
+                is_size = len(parts) > 1 and sense_of(row.better) is Sense.LESS
                 value = abs(row.value) if is_size else row.value
                 own |= {f"{row.step}.{row.metric}": value, row.metric: value}
         for name, value in own.items():
@@ -411,14 +430,11 @@ def _values(run: Run) -> dict[str, list[float]]:
     return values
 
 
-def _labels(run: Run) -> dict[str, str]:
+def _labels(measured: Iterable[MetricRow]) -> dict[str, str]:
     """What the numbers of the baseline are; of several datasets, as the last has them."""
     found: dict[str, str] = {}
-    for part in parts_of(run).values() or (run,):
-        for cell in baseline_cells(part):
-            for row in cell_metrics(cell):
-                label = words_of(row.metric, row.method, row.label)
-                found |= {f"{row.step}.{row.metric}": label, row.metric: label}
+    for row in measured:
+        found |= {f"{row.step}.{row.metric}": row.title, row.metric: row.title}
     return found
 
 

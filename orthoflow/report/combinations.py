@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from orthoflow.alike import first_few
 from orthoflow.files.json_texts import parse_json
 from orthoflow.geometry import angle_between_deg
+from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
-from orthoflow.report.rankings import Sense, count_of_photos, sense_of
+from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import (
     DATA,
@@ -112,7 +113,7 @@ class Combination:
         values = np.array([row.value for row, _ in found])
         # Their mean would be small where the repeats lie far apart, on both sides of the truth.
         is_of_sizes = (
-            bool(values.min() < 0.0 < values.max()) and sense_of(metric, found[0][0]) is Sense.LESS
+            bool(values.min() < 0.0 < values.max()) and sense_of(found[0][0].better) is Sense.LESS
         )
         if is_of_sizes:
             values = np.abs(values)
@@ -127,10 +128,9 @@ class Combination:
             is_of_sizes=is_of_sizes,
         )
 
-    def n_photos(self, step: str, metric: str) -> float:
-        """How many photos a metric of a step sums up, of repeats their mean; NaN: of none."""
-        name = count_of_photos(metric)
-        count = self.measured(step, name) if name else None
+    def n_items(self, step: str, counted_by: str) -> float:
+        """How many items a metric of a step sums up, of repeats their mean; NaN: nobody counts."""
+        count = self.measured(step, counted_by) if counted_by else None
         return math.nan if count is None else count.value
 
 
@@ -168,7 +168,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class _Wall:
-    """Which wall a step of the kind `raster` reports on."""
+    """Which wall a step that gives walls reports on."""
 
     omega_deg: float
     phi_deg: float
@@ -176,8 +176,8 @@ class _Wall:
 
     @classmethod
     def of(cls, one: Combination) -> _Wall | None:
-        """The first wall of the last such step; None where none says which it is."""
-        steps = [cell.step for cell in one.cells if cell.method.startswith("raster.")]
+        """The first wall of the last step that gives walls; None where none says which it is."""
+        steps = [cell.step for cell in one.cells if gives(cell, Walls.type_name)]
         values = {
             name: found.value
             for name in ("omega_deg", "phi_deg", "area_m2")
@@ -200,6 +200,17 @@ class _Wall:
 
     def __str__(self) -> str:
         return f"{self.area_m2:.3g} m2 at omega {self.omega_deg:.0f}, phi {self.phi_deg:.0f} deg"
+
+
+def gives(cell: RecordedCell, *type_names: str) -> bool:
+    """Whether a cell has given a product of one of these types."""
+    return any(product.type_name in type_names for product in cell.outputs.values())
+
+
+def is_check(cell: RecordedCell) -> bool:
+    """Whether a cell judges the results of others: it gives inspections and nothing else."""
+    types = {product.type_name for product in cell.outputs.values()}
+    return types == {Inspection.type_name}
 
 
 def is_missing(cell: RecordedCell) -> bool:

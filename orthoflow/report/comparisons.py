@@ -20,21 +20,15 @@ from orthoflow.report.combinations import (
     wanted_metrics,
 )
 from orthoflow.report.environments import alike_environments
-from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, cost_share, rank, sense_of
-from orthoflow.report.summaries import QUALITY, is_quality
+from orthoflow.report.summaries import headline_keys
 from orthoflow.workflow.expand import NOT_ASKED_FOR, variants_text
 from orthoflow.workflow.model import (
     DATA,
 )
 
 _NOTHING: Final = "-"
-# Distances to a plane are of the points that its tolerances let in.
-_CUT: Final = frozenset(("rms_mm", "fit_rms_mm"))
-_CUT_BY: Final = ("tolerance_m", "fit_tolerance_m")
-# Of detectors: whether they found what there is, before how well.
-FOUND: Final = ("main_found", "true_planes_found", "label_iou", "label_iou_mean")
 # Seconds of loading and compiling in which a compiler was at work.
 _COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
@@ -53,7 +47,9 @@ class Column:
         metric: name of the metric.
         label: what the metric is, in words, with its unit.
         sense: what makes a value good.
-        is_declared: its method says so itself.
+        unit: of its values.
+        counted_by: metric of the step that says how many items it sums up; empty for none.
+        is_key: it says how good the products are, and stands in tables for a first look.
         is_described: nothing of quality differs, so that what does is shown without a judgement.
     """
 
@@ -61,13 +57,10 @@ class Column:
     metric: str
     label: str
     sense: Sense
-    is_declared: bool = False
+    unit: str = "1"
+    counted_by: str = ""
+    is_key: bool = False
     is_described: bool = False
-
-    @property
-    def is_key(self) -> bool:
-        """It says how good the products are, and stands in tables for a first look."""
-        return self.is_declared or self.metric in QUALITY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,23 +279,13 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         for one in combinations:
             steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
             last |= dict.fromkeys((step, metric) for metric, step in steps.items())
-        # First what a plugin says to have a good side, as on the first screen.
-        wanted = [key for key, row in first.items() if row.better]
-        wanted += [
-            key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
-        ]
-        wanted += [
-            key
-            for name in FOUND
-            for key in last
-            if key[1] == name and first[key].method.startswith("inspect.")
-        ]
+        wanted = headline_keys(cell for one in combinations for cell in one.cells)
         if not any(_differs(key, combinations) for key in wanted):
-            described = _described([key for key in last if key not in wanted], combinations)
-    columns = [_column(first[key], combinations) for key in dict.fromkeys(wanted)]
+            others = [key for key in last if key not in wanted and not cost_share(first[key].unit)]
+            described = _described(others, combinations)
+    columns = [_column(first[key]) for key in dict.fromkeys(wanted)]
     columns += [
-        replace(_column(first[key], combinations), sense=Sense.NEITHER, is_described=True)
-        for key in described
+        replace(_column(first[key]), sense=Sense.NEITHER, is_described=True) for key in described
     ]
     return tuple(columns)
 
@@ -317,28 +300,23 @@ def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
 def _described(
     keys: Iterable[tuple[str, str]], combinations: Sequence[Combination]
 ) -> list[tuple[str, str]]:
-    """Metrics that differ and are no costs, those of the last step first."""
+    """Metrics that differ, those of the last step first."""
     by_step: dict[str, list[tuple[str, str]]] = {}
     for key in keys:
-        if not cost_share(key[1]) and _differs(key, combinations):
+        if _differs(key, combinations):
             by_step.setdefault(key[0], []).append(key)
     return [key for own in reversed(by_step.values()) for key in own][:_DESCRIBED_MOST]
 
 
-def _column(row: MetricRow, combinations: Sequence[Combination]) -> Column:
-    label, sense = label_in_words(row), sense_of(row.metric, row)
-    if row.metric in _CUT and row.method.startswith("plane."):
-        tolerances = {
-            repr([cell.params.get(name) for name in _CUT_BY])
-            for one in combinations
-            for cell in one.cells
-            if cell.step == row.step and cell.status == "ok"
-        }
-        # The smallest tolerance leaves the smallest distances, whatever the plane is like.
-        if len(tolerances) > 1:
-            label, sense = f"{label}, cut at its own tolerance", Sense.NEITHER
+def _column(row: MetricRow) -> Column:
     return Column(
-        step=row.step, metric=row.metric, label=label, sense=sense, is_declared=bool(row.better)
+        step=row.step,
+        metric=row.metric,
+        label=row.titled,
+        sense=sense_of(row.better),
+        unit=row.unit,
+        counted_by=row.counted_by,
+        is_key=row.headline,
     )
 
 
@@ -446,7 +424,7 @@ def _value(measured: Measured | None, one: Combination, origins: Origins, column
         spread=measured.spread,
         group=origins.letters(one, measured.environment),
         note=f"mean and standard deviation of {of_what}" if repeated else "",
-        n_photos=one.n_photos(column.step, column.metric),
+        n_items=one.n_items(column.step, column.counted_by),
     )
 
 
@@ -490,13 +468,13 @@ def _remark(one: Combination) -> str:
 
 def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
     by_column = [
-        rank([row.values[index] for row in rows], column.sense, column.metric)
+        rank([row.values[index] for row in rows], column.sense, column.unit)
         for index, column in enumerate(columns)
     ]
-    times = rank([row.time for row in rows], Sense.LESS, "cpu_s")
+    times = rank([row.time for row in rows], Sense.LESS, "s")
     has_compiler = any(row.has_compiler for row in rows)
     memory_sense = Sense.NEITHER if has_compiler else Sense.LESS
-    memories = rank([row.memory for row in rows], memory_sense, "peak_rss_mib")
+    memories = rank([row.memory for row in rows], memory_sense, "MiB")
     return tuple(
         replace(
             row,

@@ -22,13 +22,14 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import (
     Combination,
     combinations_of,
+    gives,
     unequal_walls,
     wanted_metrics,
 )
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
-from orthoflow.report.rankings import Sense, cost_share, is_yes_or_no
+from orthoflow.report.rankings import Sense, cost_share, is_flag
 from orthoflow.workflow.model import (
     DATA,
 )
@@ -39,7 +40,8 @@ _MOST_LINES: Final = 6
 # What a record of a stranger says may be any number; differences of larger ones are none.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
-_OF_WALLS: Final = ("raster.", "ortho.", "mosaic.", "inspect.")  # what measures them
+# What measures walls gives one of these.
+_OF_WALLS: Final = ("walls", "layers", "orthoimages", "inspection")
 _SHARES: Final = ("main_found", "label_*", "*completeness*", "*_iou*", "*_share*")
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 318.0
@@ -248,11 +250,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
     of_walls = (
-        {
-            cell.step: " Not all are of the same wall."
-            for cell in cells
-            if cell.method.startswith(_OF_WALLS)
-        }
+        {cell.step: " Not all are of the same wall." for cell in cells if gives(cell, *_OF_WALLS)}
         if unequal_walls(combinations)
         else {}
     )
@@ -280,7 +278,7 @@ def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
     """Say where combinations sum up unequal numbers of photos of a dataset; else empty."""
     counts: dict[str, set[float]] = {}
     for one in combinations:
-        n_photos = one.n_photos(column.step, column.metric)
+        n_photos = one.n_items(column.step, column.counted_by)
         if one.failure is None and n_photos > 0.0:
             counts.setdefault(one.assignment.get(DATA, ""), set()).add(n_photos)
     if all(len(found) < 2 for found in counts.values()):
@@ -358,7 +356,7 @@ def _point(x: float, found: Sequence[_Value], *, is_over: bool, column: Column) 
         # A bar over datasets is how far they lie apart, not how far the repeats of one do.
         y, spread = float(numbers[0]), math.nan if is_over else found[0].spread
     else:
-        y, spread = middle_of(numbers, column.metric), spread_of(numbers, column.metric)
+        y, spread = middle_of(numbers, column.unit), spread_of(numbers, column.unit)
     return _Point(x=x, y=y, spread=spread, found=tuple(found), is_baseline=is_baseline)
 
 
@@ -380,14 +378,14 @@ def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
     return f", no line between those of unlike {what}{some}"
 
 
-def _behind(points: Sequence[_Point], n_datasets: int, metric: str) -> str:
+def _behind(points: Sequence[_Point], n_datasets: int, unit: str) -> str:
     """Say how many datasets points over datasets are of: those that failed have no part."""
     least, most = min(point.n for point in points), max(point.n for point in points)
     if most == 1:
         return f"each of the only one of {n_datasets} datasets that has a value, without bars"
     counted = f"{least}" if least == most else f"{least} to {most}"
     of_all = f" of {n_datasets}" if least < n_datasets else ""
-    if is_yes_or_no(metric):
+    if is_flag(unit):
         return (
             f"means of {counted}{of_all} datasets: the share of them, and of their repeats, "
             "where it is so (1)"
@@ -410,14 +408,14 @@ def _curve(
     has_spread = any(math.isfinite(point.spread) for points in lines.values() for point in points)
     if n_datasets > 1:
         every = [point for points in lines.values() for point in points]
-        said = _behind(every, n_datasets, column.metric)
+        said = _behind(every, n_datasets, column.unit)
     elif has_spread:
         said = "means of the repeats, bars their standard deviation"
     else:
         said = "one value each: without repeats nobody knows how far they scatter"
     said += _unlike(lines, is_over=n_datasets > 1)
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
-    if column.sense is Sense.LESS and not cost_share(column.metric):
+    if column.sense is Sense.LESS and not cost_share(column.unit):
         good += ", of signed errors their sizes"
     if any(point.is_level for points in lines.values() for point in points):
         good += "; level lines are of what was not swept"

@@ -12,7 +12,6 @@ from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells, baseline_of, combinations_of, is_missing
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
@@ -95,7 +94,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     wanted = [(column.step, column.metric) for column in columns]
     chosen = [key for key in wanted if key in units and key[1] != _ORIENTED][:_MOST_COLUMNS]
     return DatasetTable(
-        columns=tuple((row.step, label_in_words(row)) for row in (units[key] for key in chosen)),
+        columns=tuple((row.step, row.titled) for row in (units[key] for key in chosen)),
         rows=tuple(
             DatasetRow(
                 name=name,

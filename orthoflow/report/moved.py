@@ -6,15 +6,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from orthoflow.records.comparison import CellFacts, ComparedMetric, Pair
-from orthoflow.report.comparisons import FOUND
-from orthoflow.report.rankings import Sense, sense_of
-from orthoflow.report.summaries import QUALITY
 
 Side = TypeVar("Side")
-_ORDER: Final = (*QUALITY, *FOUND)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,13 +95,13 @@ def moved_first(
     placed = []
     for pair in sorted(pairs, key=lambda pair: -_relative_change(pair)):
         step = step_of.get(pair.cell, pair.cell)
-        place = quality_place(pair.name)
-        group = 0 if place < len(_ORDER) else 1 if sense_of(pair.name) is not Sense.NEITHER else 2
+        facts = pair.right or pair.left
+        group = 2 if facts is None else 0 if facts.headline else 1 if facts.better else 2
         turn = turns[step, pair.name]
         turns[step, pair.name] += 1
         # A later step takes further what an earlier one has begun, as orientations do.
         later = -places.get(step, 0) if group == 0 else 0
-        placed.append(((pair.is_rounded, group, turn, place, later), pair))
+        placed.append(((pair.is_rounded, group, turn, later), pair))
     return [pair for _, pair in sorted(placed, key=lambda one: one[0])]
 
 
@@ -125,11 +121,6 @@ def metric_label(row: Alike[ComparedMetric]) -> str:
     """Name a metric and its cell, and say of how many repeats."""
     repeats = f", {row.n} repeats" if row.n > 1 else ""
     return f"{row.pair.cell}.{row.pair.name}{repeats}"
-
-
-def quality_place(metric: str) -> int:
-    """Where a number stands among those that say how good results are; the others last."""
-    return _ORDER.index(metric) if metric in _ORDER else len(_ORDER)
 
 
 def _relative_change(pair: Pair[ComparedMetric]) -> float:

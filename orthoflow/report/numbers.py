@@ -26,7 +26,13 @@ def number(value: float, *, significant: int = 4) -> str:
 
 
 def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
-    """Print a number and its unit; shares and counts (unit 1) stand alone."""
+    """Print a number and its unit; shares and counts (unit 1) stand alone.
+
+    >>> number_with_unit(2.5, "mm"), number_with_unit(1.0, "yes/no"), number_with_unit(0.4, "1")
+    ('2.5 mm', 'yes', '0.4')
+    """
+    if unit == "yes/no" and value in (0.0, 1.0):
+        return "yes" if value else "no"
     printed = number(value, significant=significant)
     return printed if unit == "1" else f"{printed} {unit}"
 

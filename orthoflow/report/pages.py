@@ -9,7 +9,7 @@ import re
 import secrets
 import shlex
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -48,7 +48,6 @@ from orthoflow.report.figures import (
     write_figures,
 )
 from orthoflow.report.legends import depth_gradient
-from orthoflow.report.metric_words import metric_words, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.overlays import overlays
 from orthoflow.report.paired import MetricOverDatasets, over_datasets, who_leads
@@ -63,8 +62,6 @@ from orthoflow.report.pictures import (
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import (
-    CHECKING,
-    OF_PLANE,
     Answer,
     Limit,
     answers,
@@ -324,8 +321,6 @@ def environment() -> jinja2.Environment:
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
     environment.filters["shell"] = shlex.quote
-    environment.filters["in_words"] = metric_words
-    environment.filters["of_method"] = words_of
     environment.filters["drawing"] = Markup
     environment.globals["costs"] = COSTS
     environment.globals["version"] = __version__
@@ -430,7 +425,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     return _Section(
         run=run,
         prefix=prefix,
-        answers=tuple(_of_the_wall_shown(answers(run), every.of(main))),
+        answers=answers(run),
         is_measured=is_measured,
         uncounted=uncounted_points(run) if on_show and not is_measured else None,
         limits=limits(run, on_show),
@@ -458,27 +453,6 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         whole=place.whole,
         doubt=place.doubts.get(run.path, ""),
     )
-
-
-def _of_the_wall_shown(told: Sequence[Answer], main: _Part) -> Iterator[Answer]:
-    """The numbers of the first screen, as they are on the wall whose picture is beside them."""
-    wall = main.orthoimages[0].name if main.orthoimages else ""
-    check_mm = {one.cell: one.check_rms_mm for one in main.overlays if one.wall == wall}
-    plane_mm = {
-        cell: row.rms_mm
-        for table in main.planes
-        for row in table.rows
-        if row.name == wall
-        for cell in (table.cell, *table.later)
-    }
-    for answer in told:
-        along = check_mm.get(answer.cell) if answer.metric == CHECKING else None
-        if along is not None:
-            yield answer.along(wall, along)
-        elif answer.metric == OF_PLANE and answer.cell in plane_mm:
-            yield answer.of_plane(wall, plane_mm[answer.cell])
-        else:
-            yield answer
 
 
 def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Ground, ...]:

@@ -19,7 +19,7 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments
-from orthoflow.report.rankings import Sense, badness, is_yes_or_no
+from orthoflow.report.rankings import Sense, badness, is_flag
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import (
     DATA,
@@ -112,6 +112,7 @@ class MetricOverDatasets:
         metric: its name.
         label: the metric with its unit.
         sense: what makes a value good.
+        unit: of its values.
         methods: the combinations, the reference first where it is the workflow's.
     """
 
@@ -119,12 +120,13 @@ class MetricOverDatasets:
     metric: str
     label: str
     sense: Sense
+    unit: str
     methods: tuple[MethodOverDatasets, ...]
 
     @property
     def middle(self) -> str:
         """What the medians are, which are shares where the metric is yes or no."""
-        return "share" if is_yes_or_no(self.metric) else "median"
+        return "share" if is_flag(self.unit) else "median"
 
     @property
     def reference(self) -> str:
@@ -152,7 +154,7 @@ class MetricOverDatasets:
         )
 
 
-def middle_of(values: NDArray[np.float64], metric: str) -> float:
+def middle_of(values: NDArray[np.float64], unit: str) -> float:
     """What stands for the values of several datasets; NaN without any.
 
     Their median, but of what is yes or no the mean, the share of yes: the median would hide all
@@ -160,15 +162,15 @@ def middle_of(values: NDArray[np.float64], metric: str) -> float:
     """
     if not values.size:
         return math.nan
-    return float(np.mean(values) if is_yes_or_no(metric) else np.median(values))
+    return float(np.mean(values) if is_flag(unit) else np.median(values))
 
 
-def spread_of(values: NDArray[np.float64], metric: str) -> float:
+def spread_of(values: NDArray[np.float64], unit: str) -> float:
     """How far the values of several datasets lie apart; NaN without any.
 
     A share has none: it says itself how many are the one and how many the other.
     """
-    return math.nan if is_yes_or_no(metric) or not values.size else median_deviation(values)
+    return math.nan if is_flag(unit) or not values.size else median_deviation(values)
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
@@ -199,6 +201,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
             metric=column.metric,
             label=column.label,
             sense=column.sense,
+            unit=column.unit,
             methods=_methods(found, names, partners, column, alike),
         )
         for column in comparison_columns(every)
@@ -373,8 +376,8 @@ def _methods(
                     for name, value in values.items()
                     if value.n_repeats < value.n_all
                 ),
-                median=middle_of(numbers, column.metric),
-                spread=spread_of(numbers, column.metric),
+                median=middle_of(numbers, column.unit),
+                spread=spread_of(numbers, column.unit),
                 paired=_paired(ours, theirs, column),
                 n_unlike=len(both) - len(like),
                 n_other_photos=len(like) - len(ours),
@@ -386,7 +389,7 @@ def _methods(
 
 def _other_photos(one: Combination, other: Combination, column: Column) -> bool:
     """Whether one sums up more photos than the other, which makes its errors no worse ones."""
-    ours, theirs = (each.n_photos(column.step, column.metric) for each in (one, other))
+    ours, theirs = (each.n_items(column.step, column.counted_by) for each in (one, other))
     return abs(ours - theirs) > 0.0
 
 
@@ -411,17 +414,17 @@ def _paired(
         for name, (own, other) in pairs.items()
         if math.isfinite(own - other)
     }
-    return paired_differences(worse, sense, column.metric) if worse else None
+    return paired_differences(worse, sense, column.unit) if worse else None
 
 
-def paired_differences(worse: Mapping[str, float], sense: Sense, metric: str = "") -> Paired:
+def paired_differences(worse: Mapping[str, float], sense: Sense, unit: str = "1") -> Paired:
     """Judge differences of pairs.
 
     Args:
         worse: dataset -> how much worse than the reference the method is there, finite; at least
             one; zero where they are level.
         sense: what makes a value good, for the sign of the differences that are told.
-        metric: its name.
+        unit: of its values.
     """
     sign = -1.0 if sense is Sense.MORE else 1.0
     differences = np.array(list(worse.values()))
@@ -444,7 +447,7 @@ def paired_differences(worse: Mapping[str, float], sense: Sense, metric: str = "
         n=len(worse),
         wins=int((differences < 0).sum()),
         losses=int((differences > 0).sum()),
-        median=sign * middle_of(differences, metric),
+        median=sign * middle_of(differences, unit),
         p=p,
         effect=effect,
         deciding=deciding,

@@ -14,7 +14,6 @@ from orthoflow.records.runs import REPORT_FILE
 from orthoflow.records.unfinished import open_run
 from orthoflow.report.browsing import RunSummary, differing_facts, key_metrics, told_apart
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.metric_words import WORDS
 from orthoflow.report.pages import environment, write_whole
 from orthoflow.report.pictures import thumbnail
 
@@ -45,7 +44,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
         StoreError: it cannot be written.
     """
     facts = differing_facts(among)
-    known = [name for name in WORDS if any(name in run.metrics for run in runs)]
+    known = dict.fromkeys(name for run in runs for name in run.metrics if "." not in name)
     names = {
         name: next(run.labels[name] for run in runs if name in run.labels)
         for name in told_apart(known, runs)

@@ -3,89 +3,41 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.diagnostics import DiagnosticGroup, grouped, standing
-from orthoflow.products import Orthoimages
-from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.products import Cameras, Orthoimages, Walls
+from orthoflow.records import RecordedCell
+from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
-from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
-from orthoflow.report.metric_words import WORDS, words_of
+from orthoflow.report.combinations import (
+    baseline_cells,
+    combinations_of,
+    gives,
+    is_check,
+    unequal_walls,
+)
 from orthoflow.report.numbers import number, number_with_unit
+from orthoflow.report.rankings import is_flag
 from orthoflow.report.ways import improved_on
 from orthoflow.workflow.expand import NOT_ASKED_FOR
 
-# Without photos that show a place, completeness cannot be asked for there.
-_SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
-# Metrics that say how good the products are, in the order in which a reader wants them.
-QUALITY: Final[Mapping[str, str]] = {
-    name: WORDS[name]
-    for name in (
-        "rmse_u_mm",
-        "rmse_v_mm",
-        "nmad_u_mm",
-        "nmad_v_mm",
-        _SHARPER_COMPLETENESS,
-        "n_oriented",
-        "sigma_wall_mm_worst",
-        "check_rmse_mm_worst",
-        "plane_angle_deg",
-        "plane_offset_mm",
-        "depth_rmse_mm",
-        "completeness",
-        "rms_mm",
-    )
-}
-
-_DECLARED_MOST: Final = 3
+_MOST_ANSWERS: Final = 12
 _IMAGE: Final = re.compile(r"/wall_(\d+)_ortho\.tif$")
 _PLACE: Final = re.compile(r"(.*\S) \(([^()]+)\)")
 _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
-CHECKING: Final = "check_rmse_mm_worst"
-OF_PLANE: Final = "rms_mm"
-# What a reader may take such a number for, and it is not.
-_RELIEF_COUNTS: Final = "relief of the wall counts in full: it is no error of the image"
-_NOT_HELD: Final[Mapping[str, str]] = {
-    "sigma_wall_mm_worst": "against the scan; errors of depth and scan add to it",
-    CHECKING: "mean of both axes of the photo; along one of the wall it may be more",
-    "depth_rmse_mm": "cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One number of the first screen: what, how much, from which cell, and what it leaves out."""
+    """One number of the first screen: what, how much, from which cell, and what else to know."""
 
     what: str
     value: str
     cell: str
-    not_held: str = ""
-    metric: str = ""
-
-    def along(self, wall: str, check_rms_mm: tuple[float, float]) -> Answer:
-        """Say of ties that only check what they are along a wall, as their drawing does.
-
-        Args:
-            wall: its name.
-            check_rms_mm: of all photos on it, along u and v.
-        """
-        u, v = check_rms_mm
-        return replace(
-            self,
-            what=f"ties that only check, RMS on {wall} along u / along v",
-            value=f"{u:.2f} / {v:.2f} mm",
-            not_held=(
-                "u: right, v: down; of all photos. In the worst photo it is "
-                f"{self.value} in the mean of the photo's two axes"
-            ),
-        )
-
-    def of_plane(self, wall: str, rms_mm: float) -> Answer:
-        """Say of points to their plane what they are on a wall, not on the first plane."""
-        value = _in_words(self.metric, rms_mm, "mm")
-        return replace(self, what=f"points to the plane of {wall}, RMS", value=value)
+    remark: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,95 +49,74 @@ class Limit:
     is_failure: bool = False
 
 
-def is_quality(row: MetricRow) -> bool:
-    """Whether a number is one of QUALITY; a stranger's kind may mean something else by the name."""
-    return row.metric in QUALITY and words_of(row.metric, row.method, row.label) != row.metric
+def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
+    """Return step and metric of the numbers that say how good results are, as methods declare.
+
+    What checks results stands first, then the last of the other steps; in a step in the order in
+    which its method reports. Of a metric that several steps report the last step's counts: it takes
+    further what an earlier one has begun, as orientations do. Each check has its own.
+    """
+    checks: dict[str, dict[str, None]] = {}
+    others: dict[str, dict[str, None]] = {}
+    for cell in cells:
+        steps = checks if is_check(cell) else others
+        for row in cell_metrics(cell):
+            if row.headline:
+                steps.setdefault(row.step, {})[row.metric] = None
+    found = [(step, metric) for step, metrics in checks.items() for metric in metrics]
+    taken: set[str] = set()
+    for step, metrics in reversed(others.items()):
+        found += [(step, metric) for metric in metrics if metric not in taken]
+        taken |= metrics.keys()
+    return found
 
 
 def answers(run: Run) -> tuple[Answer, ...]:
-    """How good the products are: the quality metrics of the baseline's inspections and planes."""
-    rows = [row for cell in baseline_cells(run) for row in cell_metrics(cell)]
-    values = {(row.cell, row.metric): row.value for row in rows}
-    found: list[Answer] = [
-        Answer(what="main wall of the scene", value="not found", cell=row.cell)
-        for row in rows
-        if row.metric == "main_found" and row.method.startswith("inspect.") and row.value == 0
-    ]
-    # The one number that comes from outside stands before what the run says of itself.
-    at_points = len(found)
-    # What a stranger's method says to be good or bad is what its workflow is about.
-    found += [
-        Answer(what=row.label, value=_in_words(row.metric, row.value, row.unit), cell=row.cell)
-        for row in rows
-        if row.label and row.better
-    ][:_DECLARED_MOST]
-    for wanted in QUALITY:
-        stated = [row for row in rows if row.metric == wanted and is_quality(row)]
-        # Own orthoimages stand behind those of others, whatever the order of the steps.
-        stated.sort(key=lambda row: not _is_of_others(run, row.cell))
-        # A later step of the chain improves on an earlier one: first and final orientation.
-        stated = [row for row in stated if row.step == stated[-1].step]
-        if wanted == "completeness":
-            stated = [row for row in stated if (row.cell, _SHARPER_COMPLETENESS) not in values]
-        for row in stated:
-            value = _in_words(wanted, row.value, row.unit)
-            if wanted == "n_oriented" and (row.cell, "n_photos") in values:
-                value = f"{value} of {number(values[row.cell, 'n_photos'])}"
-            what = words_of(wanted, row.method, row.label)
-            not_held = _NOT_HELD.get(wanted, "")
-            if wanted == OF_PLANE and row.method.startswith("plane."):
-                not_held = _RELIEF_COUNTS
-            n_found = int(values.get((row.cell, "n_found"), 0.0))
-            if wanted == "rms_mm" and n_found and row.method.startswith("inspect."):
-                # Of one point it is no RMS, and of few it says little.
-                what = "check point, residual" if n_found == 1 else what
-                n_points = int(values.get((row.cell, "n_points"), n_found))
-                of_all = f"{n_found} of {n_points}" if n_points > n_found else f"{n_found}"
-                not_held = f"{of_all} {'point' if n_points == 1 else 'points'}"
-            answer = Answer(what=what, value=value, cell=row.cell, not_held=not_held, metric=wanted)
-            if wanted == "rms_mm" and row.method.startswith("inspect."):
-                own = {name: value for (cell, name), value in values.items() if cell == row.cell}
-                of_points = (answer, *_in_space(row.cell, own))
-                found[at_points:at_points] = of_points
-                at_points += len(of_points)
-            else:
-                found.append(answer)
-    return tuple(found)
-
-
-def _in_space(cell: str, values: Mapping[str, float]) -> Iterator[Answer]:
-    """How far check points are off in space, beside how far they are in the plane of the wall."""
-    if "rms_3d_mm" in values:
-        n_found = int(values.get("n_3d", 0.0))
-        yield Answer(
-            what="check point in space, off by" if n_found == 1 else WORDS["rms_3d_mm"],
-            value=_in_words("rms_3d_mm", values["rms_3d_mm"], "mm"),
-            cell=cell,
-            not_held=(
-                "with its depth" if n_found == 1 else f"of {n_found} points, with their depth"
-            ),
-            metric="rms_3d_mm",
+    """Return how good the products are: the headline numbers of the baseline."""
+    cells = {cell.step: cell for cell in baseline_cells(run)}
+    rows = {step: {row.metric: row for row in cell_metrics(cell)} for step, cell in cells.items()}
+    keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
+    # Own orthoimages stand before those of others, whatever the order of the steps.
+    keys.sort(
+        key=lambda key: 1 + _is_of_others(run, cells[key[0]]) if is_check(cells[key[0]]) else 3
+    )
+    chosen = [rows[step][metric] for step, metric in keys]
+    found = []
+    # What is not as it should be stands first; what is so is no news.
+    for row in sorted(chosen, key=lambda row: not is_flag(row.unit)):
+        if is_flag(row.unit) and row.value:
+            continue
+        count = rows[row.step].get(row.counted_by)
+        counted = f"{count.title}: {number(count.value)}" if count else ""
+        found.append(
+            Answer(
+                what=row.title,
+                value=number_with_unit(row.value, row.unit, significant=3),
+                cell=row.cell,
+                remark="; ".join(filter(None, (row.description, counted))),
+            )
         )
+    return tuple(found[:_MOST_ANSWERS])
 
 
 def says_how_far_off(run: Run) -> bool:
-    """Whether an inspection of the baseline measured lengths, by which its pictures are off."""
+    """Whether a check of the baseline measured lengths, by which its pictures are off."""
     return any(
         metric.unit == "mm"
         for cell in baseline_cells(run)
-        if cell.method.startswith("inspect.")
+        if is_check(cell)
         for metric in cell.metrics
     )
 
 
-def _is_of_others(run: Run, address: str) -> bool:
+def _is_of_others(run: Run, cell: RecordedCell) -> bool:
     """Whether a cell looks at orthoimages that were read from files."""
     makers = (
         run.cells.get(given.source.rpartition(".")[0])
-        for given in run.cells[address].inputs.values()
+        for given in cell.inputs.values()
         if given.type_name == Orthoimages.type_name
     )
-    return any(maker is not None and maker.method.startswith("read.") for maker in makers)
+    return any(maker is not None and not maker.inputs for maker in makers)
 
 
 def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
@@ -213,7 +144,7 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
     oriented = [
         cell.address
         for cell in by_baseline
-        if cell.status == "ok" and cell.method.startswith("orient.")
+        if cell.status == "ok" and gives(cell, Cameras.type_name)
     ]
     settled = improved_on(run, oriented)
     groups = sorted(
@@ -229,7 +160,7 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
         ),
     )
     apart = unequal_walls(combinations_of(run))
-    rastered = tuple(one.address for one in by_baseline if one.method.startswith("raster."))
+    rastered = tuple(one.address for one in by_baseline if gives(one, Walls.type_name))
     return (
         *(Limit(text=why, cells=tuple(where), is_failure=True) for why, where in failures.items()),
         *([Limit(text=apart, cells=rastered)] if apart else []),
@@ -252,12 +183,6 @@ def results(run: Run) -> dict[str, tuple[str, ...]]:
         which = "not asked for" if is_unasked else cell.status
         found[which] = (*found[which], cell.address)
     return found
-
-
-def _in_words(metric: str, value: float, unit: str) -> str:
-    if metric.startswith("completeness"):
-        return f"{100 * value:.1f} %"
-    return number_with_unit(value, unit, significant=3 if abs(value) >= 0.01 else 2)
 
 
 def citations(run: Run) -> dict[str, tuple[str, ...]]:

@@ -120,12 +120,17 @@ class MetricSpec:
     Attributes:
         name: of the metric; with the wildcards of file names (`*`, `[xy]`) where a part hangs on
             the data.
-        unit: `mm`, `px`, `s`, ...; `1` for counts and shares; empty where the name ends in it.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares, `yes/no` for 1 and 0; empty where the
+            name ends in it.
         label: what reports call it, e.g. `damp patches`; its name where it is empty. `{0}`, `{1}`
             stand for what the wildcards match.
         better: `lower`, `higher` or `one`: which values are better; empty where none are: then it
             is shown, and nobody is best in it.
-        description: a sentence on how it is measured.
+        description: what else to know of it, e.g. how it is measured: one sentence.
+        headline: it says how good the result is: it stands on the first screen of a report, and
+            comparisons show it unless they ask for others.
+        counted_by: metric of the same step that says how many items (photos, points) it sums up:
+            values over unequal numbers of them are not ranked.
         needs: optional input ports without which it is not reported.
     """
 
@@ -134,6 +139,8 @@ class MetricSpec:
     label: str = ""
     better: Literal["", "lower", "higher", "one"] = ""
     description: str = ""
+    headline: bool = False
+    counted_by: str = ""
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -335,11 +342,21 @@ def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, .
     found = []
     for metric in metrics:
         spec = method.metric_spec(metric.name)
-        if spec is not None and (spec.label or spec.better):
-            label = spec.label.format(*matched(spec.name, metric.name)) or metric.name
-            found.append(replace(metric, label=label, better=spec.better))
-        else:
+        if spec is None:
             found.append(metric)
+            continue
+        label = spec.label.format(*matched(spec.name, metric.name))
+        found.append(
+            replace(
+                metric,
+                unit=spec.unit if spec.unit == "yes/no" else metric.unit,
+                label=label,
+                better=spec.better,
+                description=spec.description,
+                headline=spec.headline,
+                counted_by=spec.counted_by,
+            )
+        )
     return tuple(found)
 
 

@@ -35,8 +35,8 @@ from orthoflow.workflow.parameters import SWEEP, MethodInfo, describe_method
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]
 MOST_CELLS: Final = 20_000
-# The kind whose methods measure how good what others made is.
-_JUDGING: Final = "inspect"
+# The product of methods that measure how good the results of others are.
+_JUDGEMENT: Final = "inspection"
 # How the reason of a cell begins that lacks optional data, unlike one behind a failure.
 NOT_ASKED_FOR: Final = "only "
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
@@ -441,7 +441,7 @@ class _Expansion:
             workflow,
             sum(_count(workflow, steps) * len(outer[name]) for name, steps in relevant.items()),
         )
-        compared = _compared_steps(workflow)
+        compared = _compared_steps(workflow, self.methods)
         repeated = compared | _reached(graph.sources, compared)
         cells: dict[str, Cell] = {}
         for name, steps in relevant.items():
@@ -662,7 +662,7 @@ class _Expansion:
         )
 
 
-def _compared_steps(workflow: Workflow) -> set[str]:
+def _compared_steps(workflow: Workflow, methods: Mapping[str, MethodInfo]) -> set[str]:
     """Return the steps that the workflow compares, which repeats of what lies before them reach.
 
     The steps that `compare.metrics` names and all inspections that its wildcards cover, without
@@ -675,7 +675,10 @@ def _compared_steps(workflow: Workflow) -> set[str]:
         for step in workflow.steps.values()
         if step.name in patterns
         or (
-            any(variant.method.partition(".")[0] == _JUDGING for variant in step.variants)
+            any(
+                {*methods[variant.method].gives.values()} == {_JUDGEMENT}
+                for variant in step.variants
+            )
             and any(fnmatchcase(step.name, pattern) for pattern in patterns)
         )
     }

@@ -70,10 +70,12 @@ class Quantity:
     Attributes:
         label: what tables call it, beside its unit.
         unit: as in metrics.
+        better: likewise.
     """
 
     label: str
     unit: str
+    better: str = ""
 
 
 class PayloadLike(Protocol):
@@ -110,6 +112,10 @@ class Metric:
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
         label: what tables call it, where its method declares that; empty without.
         better: which values are better, `lower`, `higher` or `one`; empty where none are.
+        description: what else to know of it, one sentence.
+        headline: it is one of the numbers that say how good a result is.
+        counted_by: metric of the same step that says how many items it sums up; values over
+            unequal numbers of them are not comparable.
     """
 
     name: str
@@ -117,6 +123,9 @@ class Metric:
     unit: str
     label: str = ""
     better: str = ""
+    description: str = ""
+    headline: bool = False
+    counted_by: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,10 +314,10 @@ class Costs:
             before, in and after the call. It hangs on what ran before, so nothing is ranked by it.
     """
 
-    wall_s: Annotated[float, Quantity(label="time", unit="s")] = 0.0
-    cpu_s: Annotated[float, Quantity(label="processor", unit="s")] = 0.0
-    peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB")] = 0.0
-    stored_mib: Annotated[float | None, Quantity(label="stored", unit="MiB")] = None
+    wall_s: Annotated[float, Quantity(label="time", unit="s", better="lower")] = 0.0
+    cpu_s: Annotated[float, Quantity(label="processor time", unit="s", better="lower")] = 0.0
+    peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB", better="lower")] = 0.0
+    stored_mib: Annotated[float | None, Quantity(label="stored", unit="MiB", better="lower")] = None
     compile_s: Annotated[float | None, Quantity(label="loading and compiling", unit="s")] = None
 
 
@@ -438,7 +447,13 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
     """Return what was measured as metrics, in the order of the fields, without what was not."""
     measured = {name: getattr(costs, name) for name in COSTS}
     return tuple(
-        Metric(name=name, value=float(value), unit=COSTS[name].unit)
+        Metric(
+            name=name,
+            value=float(value),
+            unit=COSTS[name].unit,
+            label=COSTS[name].label,
+            better=COSTS[name].better,
+        )
         for name, value in measured.items()
         if value is not None
     )

@@ -100,12 +100,19 @@ def test_a_metric_has_in_json_what_its_method_says_of_it() -> None:
         "a",
         metrics=(
             Metric(name="rms_mm", value=0.0, unit="mm"),
-            Metric(name="n", value=1.0, unit="1", label="points", better="higher"),
+            Metric(name="n", value=1.0, unit="1", label="points", better="higher", headline=True),
         ),
     )
     first, second = module._cell_json(told)["metrics"]  # type: ignore[misc]
     assert first == {"name": "rms_mm", "value": 0.0, "unit": "mm"}
-    assert second == {"name": "n", "value": 1.0, "unit": "1", "label": "points", "better": "higher"}
+    assert second == {
+        "name": "n",
+        "value": 1.0,
+        "unit": "1",
+        "label": "points",
+        "better": "higher",
+        "headline": True,
+    }
 
 
 def test_only_what_orthoflow_uses_itself_is_named_of_an_environment(

@@ -177,10 +177,3 @@ def test_distances_of_products_are_said_with_their_units(
         "wall.walls different: another shape",
         "2 products: 1 identical, 1 different",
     ]
-
-
-def test_numbers_of_the_last_step_that_has_them_stand_first() -> None:
-    sigma = "sigma_wall_mm_worst"
-    rows = [("first", sigma), ("orient", sigma), ("plane", "rms_mm"), ("first", "n_oriented")]
-    place = tables.quality_places(rows)
-    assert sorted(rows, key=place) == [rows[3], rows[1], rows[0], rows[2]]

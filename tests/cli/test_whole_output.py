@@ -224,8 +224,17 @@ def test_of_a_long_comparison_what_says_how_good_results_are_is_printed(
 ) -> None:
     few = different_runs()
     numbers = [
-        Pair(cell="a", name=name, left=metric(1.0), right=metric(2.0))
-        for name in (*(f"odd_{index}" for index in range(30)), "rms_mm", "rmse_u_mm")
+        Pair(
+            cell="a",
+            name=name,
+            left=dataclasses.replace(metric(1.0), headline=is_headline),
+            right=dataclasses.replace(metric(2.0), headline=is_headline),
+        )
+        for name, is_headline in {
+            **{f"odd_{index}": False for index in range(30)},
+            "rmse_u_mm": True,
+            "rms_mm": True,
+        }.items()
     ]
     _print(dataclasses.replace(few, metrics=tuple(numbers)), most=20)
     lines = printed(capsys)

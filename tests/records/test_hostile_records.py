@@ -304,7 +304,16 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
 def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path) -> None:
     def write(record: hostile.Record) -> None:
         record.cell("paint")["metrics"] = [
-            {"name": name, "value": value, "unit": unit, "label": "", "better": ""}
+            {
+                "name": name,
+                "value": value,
+                "unit": unit,
+                "label": "",
+                "better": "",
+                "description": "",
+                "headline": False,
+                "counted_by": "",
+            }
             for name, value, unit in (("=HYPERLINK(1)", -1.5, "@unit"), ("plain", 2.0, "1"))
         ]
 

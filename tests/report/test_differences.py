@@ -30,7 +30,14 @@ def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
 
 
 def metric(value: float, unit: str = "mm", *, is_cost: bool = False) -> ComparedMetric:
-    return ComparedMetric(value=value, unit=unit, is_cost=is_cost, is_cached=False, environment="e")
+    return ComparedMetric(
+        value=value,
+        unit=unit,
+        is_cost=is_cost,
+        is_cached=False,
+        environment="e",
+        headline=unit == "mm",
+    )
 
 
 def test_metrics_that_differ_say_by_how_much_and_costs_are_left_aside() -> None:

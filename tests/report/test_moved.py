@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,12 @@ def metric(value: float, unit: str = "mm") -> ComparedMetric:
 
 
 def moved(cell: str, name: str, left: float, right: float) -> Pair[ComparedMetric]:
-    return Pair(cell=cell, name=name, left=metric(left), right=metric(right))
+    marks: dict[str, Any] = {
+        "better": "" if name == "odd" else "lower",
+        "headline": name in ("plane_angle_deg", "label_iou_mean"),
+    }
+    sides = (replace(metric(value), **marks) for value in (left, right))
+    return Pair(cell=cell, name=name, left=next(sides), right=next(sides))
 
 
 @pytest.mark.parametrize(
@@ -50,8 +56,8 @@ def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> Non
     ]
     told = moved_first(pairs, dict.fromkeys(rooms, "check"))
     assert [(pair.name, pair.cell[-1]) for pair in told] == [
-        ("plane_angle_deg", "2"),
         ("label_iou_mean", "2"),
+        ("plane_angle_deg", "2"),
         ("plane_angle_deg", "1"),
         ("label_iou_mean", "1"),
         ("plane_angle_deg", "0"),

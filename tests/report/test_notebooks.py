@@ -323,7 +323,12 @@ def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:
         Pair(cell="first", name=f"n_{index}", left=number(1.0), right=number(2.0 + index))
         for index in range(70)
     ]
-    check = Pair(cell="check", name="rmse_u_mm", left=number(2.0), right=number(2.1))
+    check = Pair(
+        cell="check",
+        name="rmse_u_mm",
+        left=replace(number(2.0), headline=True),
+        right=replace(number(2.1), headline=True),
+    )
     html = shown(*counts, check)
     assert html.index("<td>check</td>") < html.index("<td>first</td>")
     assert html.count("<tr") == 61

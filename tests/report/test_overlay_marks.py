@@ -249,12 +249,17 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert [(one.step, one.metric, one.label, one.sense) for one in table.columns] == [
         ("plane", "rms_mm", "points to the first plane, RMS / mm", Sense.LESS),
         ("plane", "omega_deg", "direction of the first normal (omega) / deg", Sense.NEITHER),
-        ("check", "rmse_u_mm", "error along u (right), RMS / mm", Sense.LESS),
-        ("check", "completeness", "painted or filled, of the scanned surface", Sense.MORE),
+        ("check", "rmse_u_mm", "error along u, RMS / mm", Sense.LESS),
+        (
+            "check",
+            "completeness",
+            "painted, not filled, of the surface that is seen at all",
+            Sense.MORE,
+        ),
         ("check", "wall_s", "time / s", Sense.LESS),
         ("check", "cpu_s", "processor time / s", Sense.LESS),
         ("check", "peak_rss_mib", "memory / MiB", Sense.LESS),
-        ("check", "compile_s", "time of loading and compiling / s", Sense.NEITHER),
+        ("check", "compile_s", "loading and compiling / s", Sense.NEITHER),
     ]
     fine, coarse, broken = table.rows
     here = tmp_path.name

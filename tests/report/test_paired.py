@@ -228,12 +228,12 @@ def combination(
     failure: str | None = None,
     *,
     n_repeats: int = 3,
-    n_photos: float = math.nan,
+    n_items: float = math.nan,
 ) -> Any:
     return SimpleNamespace(
         failure=failure,
         cells=(),
-        n_photos=lambda *_: n_photos,
+        n_items=lambda *_: n_items,
         measured=lambda *_: None if value is None else measured(value, n_repeats=n_repeats),
     )
 
@@ -280,7 +280,7 @@ def test_of_what_is_found_or_not_the_share_of_datasets_is_told() -> None:
         "plane=b": dict(zip("xyz", map(combination, (1.0, 0.0, 0.5)), strict=True)),
     }
     partners = {"plane=a": "", "plane=b": "plane=a"}
-    told = Column(step="check", metric="main_found", label="", sense=Sense.MORE)
+    told = Column(step="check", metric="main_found", label="", sense=Sense.MORE, unit="yes/no")
     first, second = module._methods(found, ("x", "y", "z"), partners, told, ALIKE)
     # Their medians would be 1 and 0.5.
     assert (first.median, second.median) == (1.0, 0.5)
@@ -291,8 +291,8 @@ def test_of_what_is_found_or_not_the_share_of_datasets_is_told() -> None:
 
 def test_errors_of_unequal_numbers_of_photos_are_not_paired() -> None:
     found = {
-        "orient=a": {"x": combination(2.0, n_photos=3), "y": combination(2.0, n_photos=3)},
-        "orient=b": {"x": combination(1.0, n_photos=2), "y": combination(3.0, n_photos=3)},
+        "orient=a": {"x": combination(2.0, n_items=3), "y": combination(2.0, n_items=3)},
+        "orient=b": {"x": combination(1.0, n_items=2), "y": combination(3.0, n_items=3)},
     }
     partners = {"orient=a": "", "orient=b": "orient=a"}
     _, second = module._methods(found, ("x", "y"), partners, column(Sense.LESS), ALIKE)
@@ -312,7 +312,7 @@ def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None
 
     def told(*rows: MethodOverDatasets) -> list[tuple[str, str]]:
         metric = MetricOverDatasets(
-            step="check", metric="rms_mm", label="error", sense=Sense.LESS, methods=rows
+            step="check", metric="rms_mm", label="error", sense=Sense.LESS, unit="mm", methods=rows
         )
         return [(one.name, one.against) for one in metric.told]
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from orthoflow_plugins.inspect.truth import InspectTruth
 
 from orthoflow.report.rankings import Sense, Value, badness, rank, sense_of
 
@@ -26,8 +27,8 @@ def test_the_smallest_is_best_and_the_largest_is_worst() -> None:
 
 
 def test_who_sums_up_fewer_photos_is_not_ranked() -> None:
-    def over(sort: float, n_photos: float, group: str = "") -> Value:
-        return Value(text="x", sort=sort, n_photos=n_photos, group=group)
+    def over(sort: float, n_items: float, group: str = "") -> Value:
+        return Value(text="x", sort=sort, n_items=n_items, group=group)
 
     assert marks(over(7.0, 2), over(9.0, 3), over(11.0, 3)) == ["FEWER", "BEST", "WORST"]
     assert marks(over(7.0, 2), over(9.0, 3)) == ["FEWER", "NONE"]
@@ -87,7 +88,7 @@ def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() ->
     assert marks(of(1.238), of(1.239)) == ["NONE", "NONE"]
     assert marks(of(1.238), of(1.239), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0), of(1.011), of(2.0)) == ["BEST", "NONE", "WORST"]
-    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, "peak_rss_mib")
+    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, "MiB")
     assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "NONE"]
 
 
@@ -146,7 +147,7 @@ def test_errors_of_both_signs_are_as_far_apart_as_their_sizes() -> None:
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
     for spread in (math.nan, 0.01):
         times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
-        found = rank(times, Sense.LESS, "detection_cpu_s")
+        found = rank(times, Sense.LESS, "s")
         assert [value.mark.name for value in found] == ["NEAR", "NEAR", "NONE", "WORST"]
 
 
@@ -165,7 +166,7 @@ def test_who_found_something_is_not_worst_where_another_found_nothing() -> None:
         "WORST",
         "NONE",
     ]
-    for cost in ("first_plane_s", "peak_rss_mib"):
+    for cost in ("s", "MiB"):
         found = rank([of(1.0), nothing, of(2.0)], Sense.LESS, cost)
         assert [value.mark.name for value in found] == ["BEST", "NONE", "WORST"]
 
@@ -175,26 +176,14 @@ def test_a_mark_leaves_the_rest_of_a_value_as_it_was() -> None:
     assert (best.text, best.sort, best.spread, best.group) == ("1.0", 1.0, 0.1, "a")
 
 
-@pytest.mark.parametrize(
-    ("metric", "sense"),
-    [
-        ("wall_error_over_sigma", Sense.ONE),
-        ("sigma0_px", Sense.NEITHER),
-        ("sigma_wall_mm", Sense.LESS),
-        ("raw_omega_deg", Sense.NEITHER),
-        ("raw_angle_deg", Sense.LESS),
-        ("compile_s", Sense.NEITHER),
-        ("wall_s", Sense.LESS),
-        ("peak_mib", Sense.LESS),
-        ("label_f1", Sense.MORE),
-        ("completeness_filled", Sense.MORE),
-        ("depth_nmad_mm", Sense.LESS),
-        ("check_rmse_px", Sense.LESS),
-        ("n_points", Sense.NEITHER),
-    ],
-)
-def test_the_first_pattern_that_fits_says_what_is_good(metric: str, sense: Sense) -> None:
-    assert sense_of(metric) is sense
+def test_methods_declare_what_is_good() -> None:
+    found = {spec.name: sense_of(spec.better) for spec in InspectTruth.metric_specs()}
+    assert found["pose_error_over_sigma"] is Sense.ONE
+    assert found["label_f1"] is Sense.MORE
+    assert found["wall_[0-9]*_rmse_[uv]_mm"] is found["rmse_[uv]_mm"] is Sense.LESS
+    assert found["n_photos"] is Sense.NEITHER
+    # A record may hold anything.
+    assert sense_of("sideways") is Sense.NEITHER
 
 
 def test_badness_is_smaller_the_better_a_value_is() -> None:

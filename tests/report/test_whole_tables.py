@@ -21,7 +21,7 @@ from orthoflow.report.combinations import (
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import Difference, ProductRow, differences
 from orthoflow.report.rankings import Sense, Value, badness, rank
-from orthoflow.report.summaries import Answer, Limit, answers, limits
+from orthoflow.report.summaries import Limit, answers, limits
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -222,47 +222,6 @@ def test_the_baseline_is_what_the_workflow_says() -> None:
 
 
 # --- what the first screen says ---
-
-
-def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
-    told = run(
-        cell("plane", metrics=metrics(rms_mm=1.25, completeness=0.5)),
-        cell("first", metrics=metrics(n_oriented=2.0, n_photos=9.0)),
-        cell("second", metrics=metrics(n_oriented=7.0)),
-        cell("check", metrics=metrics(completeness=0.5, completeness_seen_by_both=0.75)),
-        cell("other", metrics=metrics(n_photos=4.0, n_oriented=3.0, depth_rmse_mm=2.0)),
-        cell("orient", metrics=metrics(sigma_wall_mm_worst=1.5)),
-    )
-    assert answers(told) == (
-        Answer(
-            what="painted, of what a station and a photo see",
-            value="75.0 %",
-            cell="check",
-            metric="completeness_seen_by_both",
-        ),
-        Answer(what="photos oriented", value="3 of 4", cell="other", metric="n_oriented"),
-        Answer(
-            what="expected error of the orientation on the wall, worst photo",
-            value="1.5",
-            cell="orient",
-            not_held="against the scan; errors of depth and scan add to it",
-            metric="sigma_wall_mm_worst",
-        ),
-        Answer(
-            what="error of the depth, RMS",
-            value="2 mm",
-            cell="other",
-            not_held="cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
-            metric="depth_rmse_mm",
-        ),
-        Answer(
-            what="points to the first plane, RMS",
-            value="1.25 mm",
-            cell="plane",
-            not_held="relief of the wall counts in full: it is no error of the image",
-            metric="rms_mm",
-        ),
-    )
 
 
 def test_limits_name_all_cells_that_say_the_same() -> None:
@@ -478,3 +437,22 @@ def test_a_box_of_some_cached_cells_is_not_cached() -> None:
     assert state("r0") == "cached"
     assert state("r0", "") == "ok"
     assert run_diagram(run()).startswith('<svg viewBox="0 0 0 0" width="0"')
+
+
+def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:
+    told = run(
+        cell("plane", metrics=metrics(rms_mm=1.25)),
+        cell("first", metrics=metrics(check_rmse_mm_worst=2.0, n_oriented=9.0)),
+        cell("second", metrics=metrics(check_rmse_mm_worst=7.0, n_oriented=8.0)),
+        cell("check", metrics=metrics(completeness_seen_by_both=0.75, main_found=1.0)),
+        cell("other", metrics=metrics(depth_rmse_mm=2.0, main_found=0.0)),
+    )
+    found = answers(told)
+    assert [(one.cell, one.value) for one in found] == [
+        ("other", "no"),
+        ("check", "0.75"),
+        ("other", "2 mm"),
+        ("second", "7 mm"),
+        ("plane", "1.25 mm"),
+    ]
+    assert found[3].remark.endswith("photos oriented: 8")

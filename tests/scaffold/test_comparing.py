@@ -103,8 +103,8 @@ def test_what_a_recipe_does_not_give_installed_methods_make_of_it(catalog: Catal
     assert steps["colour"]["in"]["cameras"] == "orient.cameras"
     # What its sibling says of itself, and no pattern of names.
     assert found["compare"]["design"] == "product"
-    metrics = catalog.method("colour.photos").load().metrics
-    assert found["compare"]["metrics"] == [f"colour.{one}" for one in metrics[:4]]
+    specs = catalog.method("colour.photos").load().metric_specs()
+    assert found["compare"]["metrics"] == [f"colour.{one.name}" for one in specs[:4]]
 
 
 def test_what_no_recipe_gives_is_compared_in_none(catalog: Catalog) -> None:

@@ -18,7 +18,7 @@ from orthoflow.files.clouds.photo_colours import (
     colour_points,
 )
 from orthoflow.products import Cameras, Photos, PointCloud
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 
 class ColourPhotos(Method):
@@ -35,8 +35,8 @@ class ColourPhotos(Method):
     result_version: ClassVar[int] = 3
     determinism = "loose"
     metrics = (
-        "coloured_share",
-        "n_photos",
+        MetricSpec("coloured_share", label="points that got a colour"),
+        MetricSpec("n_photos", label="photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

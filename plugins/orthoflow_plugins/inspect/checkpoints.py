@@ -24,7 +24,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     CAPPED,
@@ -35,6 +35,7 @@ from orthoflow_plugins.inspect.findings import (
     check_findings,
     length_findings,
     of_walls,
+    prefixed,
     report,
     rms,
 )
@@ -70,11 +71,20 @@ class InspectCheckpoints(Method):
     id: ClassVar[str] = "inspect.checkpoints"
     result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "loose"
-    metrics: ClassVar[tuple[str, ...]] = (
-        *("n_points", "n_3d", "rms_3d_mm", "max_3d_mm"),
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_points", label="check points"),
+        MetricSpec("n_3d", label="check points compared in space"),
+        MetricSpec(
+            "rms_3d_mm",
+            label="check points in space, RMS",
+            better="lower",
+            headline=True,
+            counted_by="n_3d",
+        ),
+        MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
         # Those of a class of points have its name before them.
-        *(f"*_{name}" for name in (*CHECK_TABLE, *DISPLACEMENTS)),
+        *prefixed((*CHECK_TABLE, *DISPLACEMENTS), "*_", "{0}"),
         *of_walls(IMAGE_QUALITY),
     )
     citations: ClassVar[tuple[str, ...]] = (

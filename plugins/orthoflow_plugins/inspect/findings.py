@@ -6,8 +6,11 @@ outliers by two rules, and what is left.
 
 from __future__ import annotations
 
+import fnmatch
 import math
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Finding
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import MetricSpec, StepContext
 
 _AXES: Final = ("x", "y")
 # Never are more than so many of the points called outliers.
@@ -30,18 +33,58 @@ _POINTS_MOST: Final = 1000
 CAPPED: Final = "_capped"
 # What displacements, check points and an orthoimage itself add up to, as metrics.
 DISPLACEMENTS: Final = (
-    *("rmse_[xy]_mm", "rmse_[xy]_cells", "mean_[xy]_mm", "nmad_[xy]_mm", "max_[xy]_mm"),
-    *("beyond_2rmse_[xy]_share", "beyond_2rmse_any_share", "p95_mm"),
+    MetricSpec("rmse_[xy]_mm", label="displacement along {0}, RMS", better="lower"),
+    MetricSpec("rmse_[xy]_cells", label="displacement along {0}, RMS", better="lower"),
+    MetricSpec("mean_[xy]_mm", label="displacement along {0}, mean"),
+    MetricSpec("nmad_[xy]_mm", label="typical displacement along {0} (NMAD)", better="lower"),
+    MetricSpec("max_[xy]_mm", label="largest displacement along {0}"),
+    MetricSpec("beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0}"),
+    MetricSpec("beyond_2rmse_any_share", label="beyond twice the RMS along u or v"),
+    MetricSpec("p95_mm", label="displacement, 95th percentile"),
 )
-LENGTHS: Final = ("n_lengths", "length_error_rms_share", "length_error_max_share")
+LENGTHS: Final = (
+    MetricSpec("n_lengths", label="lengths compared"),
+    MetricSpec("length_error_rms_share", label="error of a length over it, RMS", better="lower"),
+    MetricSpec(
+        "length_error_max_share", label="error of a length over it, largest", better="lower"
+    ),
+)
 CHECK_TABLE: Final = (
-    *("n_found", "rms_mm", "sd_mm", "mean_shift_mm", "mean_shift_share"),
-    *("n_outliers_once", "n_outliers_iterated", "n_outliers_iterated_capped"),
-    *("rms_after_once_mm", "rms_after_iterated_mm", "rms_after_iterated_capped_mm"),
+    MetricSpec("n_found", label="check points found"),
+    MetricSpec(
+        "rms_mm", label="check points, RMS", better="lower", headline=True, counted_by="n_found"
+    ),
+    MetricSpec("sd_mm", label="check points, standard deviation"),
+    MetricSpec("mean_shift_mm", label="check points, mean shift"),
+    MetricSpec("mean_shift_share", label="mean shift over the RMS"),
+    MetricSpec("n_outliers_once", label="outliers, rule applied once"),
+    MetricSpec("n_outliers_iterated", label="outliers, rule iterated"),
+    MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated to the cap"),
+    MetricSpec(
+        "rms_after_once_mm", label="RMS without outliers, rule applied once", better="lower"
+    ),
+    MetricSpec(
+        "rms_after_iterated_mm", label="RMS without outliers, rule iterated", better="lower"
+    ),
+    MetricSpec(
+        "rms_after_iterated_capped_mm",
+        label="RMS without outliers, rule iterated to the cap",
+        better="lower",
+    ),
 )
 IMAGE_QUALITY: Final = (
-    *("completeness", "n_edges", "edge_width_cells", "mtf50_per_cell"),
-    *("filled_share", "stretch_share", "smear_share"),
+    MetricSpec(
+        "completeness",
+        label="painted or filled, of the scanned surface",
+        better="higher",
+        headline=True,
+    ),
+    MetricSpec("n_edges", label="edges whose sharpness was measured"),
+    MetricSpec("edge_width_cells", label="width of an edge"),
+    MetricSpec("mtf50_per_cell", label="sharpness (MTF50)"),
+    MetricSpec("filled_share", label="cells filled from neighbours"),
+    MetricSpec("stretch_share", label="cells smeared over steep relief", better="lower"),
+    MetricSpec("smear_share", label="cells smeared along edges", better="lower"),
 )
 # What a comparison asks of every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
@@ -146,7 +189,7 @@ def length_findings(
     values = (float(len(share)), rms(share), float(share.max()))
     return [
         Finding(name=name, value=value, unit="1")
-        for name, value in zip(LENGTHS, values, strict=True)
+        for name, value in zip([spec.name for spec in LENGTHS], values, strict=True)
     ]
 
 
@@ -175,10 +218,35 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
     return n_capped == n_most < n_all
 
 
-def of_walls(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of metrics as `report` gives them: of the main wall, of each, and of all together."""
-    walls = [f"wall_[0-9]*_{name}" for name in _OF_EACH_WALL]
-    return (*names, *walls, *(f"all_{name}" for name in names))
+def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
+    """Return metrics as `report` gives them: of the main wall, of each, and of all together."""
+    of_each = [spec for spec in specs if fnmatch.filter(_OF_EACH_WALL, spec.name)]
+    return (
+        *specs,
+        *prefixed(of_each, "wall_[0-9]*_", "wall {0}{1}"),
+        *prefixed(specs, "all_", "all walls"),
+    )
+
+
+def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
+    """Return the same metrics of something else; on the first screen stand those without prefix.
+
+    Args:
+        specs: the metrics.
+        prefix: of their names, perhaps with wildcards.
+        what: behind their labels, with what the wildcards match.
+    """
+    n_wildcards = len(re.findall(r"\*|\[[^\]]+\]", prefix))
+    return tuple(
+        replace(
+            spec,
+            name=f"{prefix}{spec.name}",
+            label=f"{spec.label.replace('{0}', f'{{{n_wildcards}}}')}; {what}",
+            headline=False,
+            counted_by=spec.counted_by and f"{prefix}{spec.counted_by}" if not n_wildcards else "",
+        )
+        for spec in specs
+    )
 
 
 def rms(values: ArrayLike) -> float:

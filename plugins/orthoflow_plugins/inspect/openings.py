@@ -16,7 +16,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.scenes import Scene, SurfaceRole
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Finding, Inspection, Opening, Openings, OutlineSource, Truth, Walls
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.inspect.findings import rms
 
 if TYPE_CHECKING:
@@ -52,19 +52,31 @@ class InspectOpenings(Method):
     id: ClassVar[str] = "inspect.openings"
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "loose"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_true_openings",
-        "n_found_openings",
-        "n_false_openings",
-        "opening_iou_mean",
-        "opening_iou_min",
-        "opening_depth_error_max_mm",
-        "side_rmse_mm",
-        "side_mean_mm",
-        "side_max_mm",
-        "side_rmse_cells",
-        "side_error_over_sigma",
-        "n_stray_sides",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_true_openings", label="openings of the scene"),
+        MetricSpec(
+            "n_found_openings", label="openings of the scene that were found", better="higher"
+        ),
+        MetricSpec("n_false_openings", label="outlines of no opening", better="lower"),
+        MetricSpec(
+            "opening_iou_mean", label="overlap with the true openings, mean", better="higher"
+        ),
+        MetricSpec(
+            "opening_iou_min", label="overlap with the true openings, least", better="higher"
+        ),
+        MetricSpec(
+            "opening_depth_error_max_mm",
+            label="error of an opening's depth, largest",
+            better="lower",
+        ),
+        MetricSpec("side_rmse_mm", label="error of sides, RMS", better="lower"),
+        MetricSpec("side_mean_mm", label="openings too large (+) or small, mean of sides"),
+        MetricSpec("side_max_mm", label="error of sides, largest"),
+        MetricSpec("side_rmse_cells", label="error of sides, RMS", better="lower"),
+        MetricSpec(
+            "side_error_over_sigma", label="error of sides over the stated one", better="one"
+        ),
+        MetricSpec("n_stray_sides", label="sides with no true one near", better="lower"),
     )
 
     class Params(MethodParams):

@@ -20,13 +20,14 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, Part, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Part, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
     displacement_findings,
     of_walls,
+    prefixed,
     report,
 )
 from orthoflow_plugins.inspect.image_quality import (
@@ -88,13 +89,27 @@ class InspectSurf(Method):
     id: ClassVar[str] = "inspect.surf"
     result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "loose"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_walls_inspected",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_walls_inspected", label="walls inspected"),
         *of_walls(
             (
-                *("n_pairs", "n_key_points", "n_key_points_intensity", "matched_kept_share"),
-                *("floor_n_pairs", "surf_rmse_[xy]_mm", "surf_floor_rmse_[xy]_mm"),
-                *(*DISPLACEMENTS, *(f"floor_{name}" for name in DISPLACEMENTS), *IMAGE_QUALITY),
+                MetricSpec("n_pairs", label="pairs compared"),
+                MetricSpec("n_key_points", label="key points of the orthoimage"),
+                MetricSpec("n_key_points_intensity", label="key points of the intensity"),
+                MetricSpec("matched_kept_share", label="matches kept"),
+                MetricSpec("floor_n_pairs", label="pairs compared of intensity with itself"),
+                MetricSpec(
+                    "surf_rmse_[xy]_mm",
+                    label="displacement along {0} by SURF, RMS",
+                    better="lower",
+                ),
+                MetricSpec(
+                    "surf_floor_rmse_[xy]_mm",
+                    label="displacement along {0} by SURF, intensity with itself, RMS",
+                ),
+                *DISPLACEMENTS,
+                *prefixed(DISPLACEMENTS, "floor_", "intensity with itself"),
+                *IMAGE_QUALITY,
             )
         ),
     )

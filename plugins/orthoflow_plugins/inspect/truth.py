@@ -83,22 +83,94 @@ _BAND_CELLS: Final = 1 << 23
 _DRAWN_CELLS: Final = 1800
 # Of each wall, from its cells and from what photos painted on it.
 _OF_WALLS: Final = (
-    *("rmse_[uv]_mm", "mean_[uv]_mm", "nmad_[uv]_mm", "p99_[uv]_mm", "step_rmse_[uv]_mm"),
-    *("patch_rmse_[uv]_mm", "patch_mean_[uv]_mm", "n_patches", "displaced_share"),
-    *("depth_median_mm", "depth_nmad_mm", "depth_rmse_mm", "depth_step_rmse_mm"),
-    *("depth_within_3sigma", "colour_rmse_grey", "filled_colour_rmse_grey"),
-    *("step_colour_rmse_grey", "gross_colour_share", "ghost_colour_share", "ghost_share"),
-    *("completeness", "completeness_filled", "completeness_seen_by_both", "unseen_painted_share"),
-    *("n_traced", "far_source_share", "n_ghost_cells"),
-    *("within_1_sigma_share", "within_2_sigma_share"),
+    MetricSpec("rmse_[uv]_mm", label="error along {0}, RMS", better="lower", headline=True),
+    MetricSpec("mean_[uv]_mm", label="shift along {0}, mean"),
+    MetricSpec(
+        "nmad_[uv]_mm", label="typical error along {0} (NMAD)", better="lower", headline=True
+    ),
+    MetricSpec("p99_[uv]_mm", label="error along {0}, 99th percentile"),
+    MetricSpec(
+        "step_rmse_[uv]_mm", label="error along {0} beside depth steps, RMS", better="lower"
+    ),
+    MetricSpec(
+        "patch_rmse_[uv]_mm", label="error along {0} as patches show it, RMS", better="lower"
+    ),
+    MetricSpec("patch_mean_[uv]_mm", label="shift along {0} as patches show it"),
+    MetricSpec("n_patches", label="patches compared with the truth"),
+    MetricSpec("displaced_share", label="cells displaced by more than one cell"),
+    MetricSpec("depth_median_mm", label="shift of the depth, median"),
+    MetricSpec("depth_nmad_mm", label="typical error of the depth (NMAD)", better="lower"),
+    MetricSpec(
+        "depth_rmse_mm",
+        label="error of the depth, RMS",
+        better="lower",
+        headline=True,
+        description="cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
+    ),
+    MetricSpec("depth_step_rmse_mm", label="error of the depth beside steps, RMS", better="lower"),
+    MetricSpec("depth_within_3sigma", label="depths within three stated sigmas"),
+    MetricSpec("colour_rmse_grey", label="error of the colour, RMS", better="lower"),
+    MetricSpec(
+        "filled_colour_rmse_grey",
+        label="error of the colour of filled cells, RMS",
+        better="lower",
+    ),
+    MetricSpec(
+        "step_colour_rmse_grey",
+        label="error of the colour beside depth steps, RMS",
+        better="lower",
+    ),
+    MetricSpec("gross_colour_share", label="cells with a grossly wrong colour"),
+    MetricSpec("ghost_colour_share", label="cells with the colour of an occluder"),
+    MetricSpec(
+        "ghost_share",
+        label="share of the cells painted through an occluder",
+        better="lower",
+    ),
+    MetricSpec(
+        "completeness",
+        label="painted, not filled, of the surface that is seen at all",
+        better="higher",
+        headline=True,
+    ),
+    MetricSpec(
+        "completeness_filled",
+        label="painted or filled, of the surface that is seen at all",
+        better="higher",
+    ),
+    MetricSpec(
+        "completeness_seen_by_both",
+        label="painted, of what a station and a photo see",
+        better="higher",
+        headline=True,
+    ),
+    MetricSpec("unseen_painted_share", label="painted cells that no photo sees"),
+    MetricSpec("n_traced", label="cells traced back to their photo"),
+    MetricSpec("far_source_share", label="cells painted from a wrong place", better="lower"),
+    MetricSpec("n_ghost_cells", label="cells painted through an occluder"),
+    MetricSpec(
+        "within_1_sigma_share", label="cells whose error is within what the orthoimage states"
+    ),
+    MetricSpec(
+        "within_2_sigma_share",
+        label="cells whose error is within twice what the orthoimage states",
+    ),
 )
 # Of planes, also where there are no orthoimages.
-_OF_PLANES: Final = ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm")
+_OF_PLANES: Final = (
+    MetricSpec(
+        "plane_angle_deg", label="direction of the main plane, error", better="lower", headline=True
+    ),
+    MetricSpec(
+        "plane_offset_mm", label="position of the main plane, error", better="lower", headline=True
+    ),
+    MetricSpec("plane_corner_max_mm", label="largest error of the main plane at its corners"),
+)
 
 
-def _needing(ports: tuple[str, ...], *names: str) -> tuple[MetricSpec, ...]:
-    """Declare metrics that are reported only where these ports are wired."""
-    return tuple(MetricSpec(name, needs=ports) for name in names)
+def _needing(ports: tuple[str, ...], *specs: MetricSpec) -> tuple[MetricSpec, ...]:
+    """Return metrics as ones that are reported only where these ports are wired."""
+    return tuple(replace(spec, needs=ports) for spec in specs)
 
 
 class InspectTruth(Method):
@@ -126,23 +198,119 @@ class InspectTruth(Method):
     id: ClassVar[str] = "inspect.truth"
     result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "loose"
-    metrics: ClassVar[tuple[str | MetricSpec, ...]] = (
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *_needing(("orthoimages", "walls"), *of_walls(_OF_WALLS), *IMAGE_QUALITY),
         *of_walls(_OF_PLANES),
         *_needing(
             ("cameras", "orthoimages", "walls"),
-            *("n_photos", "n_oriented", "n_misoriented", "pose_error_over_sigma"),
-            *("pose_wall_rms_mm", "pose_centre_max_mm", "pose_centre_median_mm"),
-            *("pose_wall_max_mm", "pose_wall_median_mm", "pose_rotation_max_deg"),
-            *("pose_rotation_median_deg", "match_wrong_share", "match_wrong_share_own_wall"),
-            *("n_ties_kept", "tie_wrong_share", "tie_error_median_cells"),
+            MetricSpec("n_photos", label="photos"),
+            MetricSpec("n_oriented", label="photos oriented", better="higher"),
+            MetricSpec("n_misoriented", label="accepted photos with a wrong pose"),
+            MetricSpec(
+                "pose_error_over_sigma",
+                label="true error over the stated one",
+                better="one",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_wall_rms_mm",
+                label="true error of the photos on the wall, RMS",
+                better="lower",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_centre_max_mm",
+                label="error of the projection centre, worst",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_centre_median_mm",
+                label="error of the projection centre, median",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_wall_max_mm",
+                label="true error on the wall, worst photo",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_wall_median_mm",
+                label="true error on the wall, median photo",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_rotation_max_deg",
+                label="error of the viewing direction, worst",
+                counted_by="n_oriented",
+            ),
+            MetricSpec(
+                "pose_rotation_median_deg",
+                label="error of the viewing direction, median",
+                counted_by="n_oriented",
+            ),
+            MetricSpec("match_wrong_share", label="matches that are wrong", better="lower"),
+            MetricSpec(
+                "match_wrong_share_own_wall",
+                label="matches with the photo's own wall that are wrong",
+                better="lower",
+            ),
+            MetricSpec("n_ties_kept", label="ties that the orientation kept"),
+            MetricSpec("tie_wrong_share", label="kept ties that are wrong", better="lower"),
+            MetricSpec(
+                "tie_error_median_cells", label="error of a kept tie, median", better="lower"
+            ),
         ),
-        *_needing(("planes",), "true_planes", "true_planes_found", "main_found"),
-        *("worst_plane_angle_deg", "worst_plane_offset_mm", "worst_plane_corner_max_mm"),
+        *_needing(
+            ("planes",),
+            MetricSpec("true_planes", label="true planes"),
+            MetricSpec(
+                "true_planes_found",
+                label="true planes that were found",
+                better="higher",
+                headline=True,
+            ),
+            MetricSpec(
+                "main_found", unit="yes/no", label="main wall found", better="higher", headline=True
+            ),
+        ),
+        MetricSpec("worst_plane_angle_deg", label="direction of the worst plane, error"),
+        MetricSpec("worst_plane_offset_mm", label="position of the worst plane, error"),
+        MetricSpec(
+            "worst_plane_corner_max_mm", label="largest error of the worst plane at its corners"
+        ),
         *_needing(
             ("labels",),
-            *("label_precision", "label_recall", "label_f1", "label_iou"),
-            *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
+            MetricSpec(
+                "label_precision",
+                label="labels of the main plane, precision",
+                better="higher",
+            ),
+            MetricSpec(
+                "label_recall",
+                label="labels of the main plane, recall",
+                better="higher",
+            ),
+            MetricSpec("label_f1", label="labels of the main plane, F1", better="higher"),
+            MetricSpec(
+                "label_iou", label="labels of the main plane, IoU", better="higher", headline=True
+            ),
+            MetricSpec(
+                "label_precision_mean",
+                label="label precision, mean over planes",
+                better="higher",
+            ),
+            MetricSpec(
+                "label_recall_mean",
+                label="label recall, mean over planes",
+                better="higher",
+            ),
+            MetricSpec("label_f1_mean", label="label F1, mean over planes", better="higher"),
+            MetricSpec(
+                "label_iou_mean",
+                label="label IoU, mean over planes",
+                better="higher",
+                headline=True,
+            ),
         ),
     )
     citations: ClassVar[tuple[str, ...]] = (

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, Part, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Part, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.hand_ties import (
     is_by_hand_alone,
@@ -55,15 +55,27 @@ class MatchGuided(Method):
     id: ClassVar[str] = "match.guided"
     result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_ties",
-        "rejected_share",
-        "n_photos_matched",
-        "ties_per_photo_median",
-        "held_out_rmse_px_median",
-        "held_out_rmse_px_worst",
-        "sigma_px_median",
-        "n_by_hand",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_ties", label="ties"),
+        MetricSpec("rejected_share", label="share of the ties that is rejected"),
+        MetricSpec("n_photos_matched", label="photos with accepted matches"),
+        MetricSpec("ties_per_photo_median", label="ties per photo, median"),
+        MetricSpec(
+            "held_out_rmse_px_median",
+            label="held-out matches, RMS per axis, median photo",
+            better="lower",
+            counted_by="n_photos_matched",
+        ),
+        MetricSpec(
+            "held_out_rmse_px_worst",
+            label="held-out matches, RMS per axis, worst photo",
+            better="lower",
+            counted_by="n_photos_matched",
+        ),
+        MetricSpec(
+            "sigma_px_median", label="stated sigma of a tie per axis, median", better="lower"
+        ),
+        MetricSpec("n_by_hand", label="ties measured by hand"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.3)",

@@ -24,7 +24,7 @@ from orthoflow.products import (
     SurfaceMask,
     Wall,
 )
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.mixtures import MIXTURES, mixed
@@ -53,10 +53,10 @@ class FaceByPhotos(Method):
     id: ClassVar[str] = "face.photos"
     result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_planes_guessed",
-        "n_planes_seen",
-        "n_planes_turned",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_planes_guessed", label="planes whose side the photos were asked for"),
+        MetricSpec("n_planes_seen", label="planes whose side photos decided"),
+        MetricSpec("n_planes_turned", label="planes turned to the photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Lowe 2004, Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",

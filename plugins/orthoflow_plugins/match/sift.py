@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, Part, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Part, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.hand_ties import (
@@ -62,14 +62,14 @@ class MatchSift(Method):
     id: ClassVar[str] = "match.sift"
     result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_ties",
-        "n_rejected",
-        "rejected_share",
-        "n_photos_matched",
-        "ties_per_photo_median",
-        "n_wall_key_points",
-        "n_by_hand",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_ties", label="ties"),
+        MetricSpec("n_rejected", label="ties rejected"),
+        MetricSpec("rejected_share", label="share of the ties that is rejected"),
+        MetricSpec("n_photos_matched", label="photos with accepted matches"),
+        MetricSpec("ties_per_photo_median", label="ties per photo, median"),
+        MetricSpec("n_wall_key_points", label="key points of the walls"),
+        MetricSpec("n_by_hand", label="ties measured by hand"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.5, 3.6)",

@@ -32,7 +32,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.agreement import (
     SeamSteps,
@@ -127,32 +127,60 @@ class MosaicSeams(Method):
     result_version: ClassVar[int] = 6
     repeatable: ClassVar[tuple[str, ...]] = ("seams",)
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_orthoimages",
-        "n_sources",
-        "none_share",
-        "painted_share",
-        "filled_share",
-        "occluded_share",
-        "no_surface_share",
-        "gain_min",
-        "gain_max",
-        "lens_loss_share",
-        "seam_share",
-        "seam_on_depth_edge_share",
-        "seam_step_rms_grey",
-        "seam_step_mean_delta_e",
-        "seam_step_untouched_delta_e",
-        "n_overlap_patches",
-        "overlap_u_rms_cells",
-        "overlap_v_rms_cells",
-        "overlap_u_rms_mm",
-        "overlap_v_rms_mm",
-        "outvoted_share",
-        "contradicted_share",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_orthoimages", label="orthoimages"),
+        MetricSpec("n_sources", label="photos used"),
+        MetricSpec("none_share", label="empty cells"),
+        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("filled_share", label="cells filled from neighbours"),
+        MetricSpec("occluded_share", label="cells hidden from every photo"),
+        MetricSpec("no_surface_share", label="cells without a surface"),
+        MetricSpec("gain_min", label="smallest gain of a photo"),
+        MetricSpec("gain_max", label="largest gain of a photo"),
+        MetricSpec("lens_loss_share", label="vignetting, largest"),
+        MetricSpec("seam_share", label="cells along seams"),
+        MetricSpec("seam_on_depth_edge_share", label="seams that lie on depth edges"),
+        MetricSpec(
+            "seam_step_rms_grey", label="brightness difference at seams, RMS", better="lower"
+        ),
+        MetricSpec("seam_step_mean_delta_e", label="colour difference at seams, mean"),
+        MetricSpec(
+            "seam_step_untouched_delta_e", label="colour difference at seams before balancing, mean"
+        ),
+        MetricSpec("n_overlap_patches", label="patches compared where photos overlap"),
+        MetricSpec(
+            "overlap_u_rms_cells",
+            label="offset of overlapping photos along u, RMS",
+            better="lower",
+        ),
+        MetricSpec(
+            "overlap_v_rms_cells",
+            label="offset of overlapping photos along v, RMS",
+            better="lower",
+        ),
+        MetricSpec(
+            "overlap_u_rms_mm",
+            label="offset of overlapping photos along u, RMS on the wall",
+            better="lower",
+        ),
+        MetricSpec(
+            "overlap_v_rms_mm",
+            label="offset of overlapping photos along v, RMS on the wall",
+            better="lower",
+        ),
+        MetricSpec("outvoted_share", label="cells whose colour the other photos outvote"),
+        MetricSpec(
+            "contradicted_share", label="cells where photos disagree and none is in the majority"
+        ),
         # Of the walls that were checked, all together.
-        "expected_mm_median",
-        "expected_mm_p95",
+        MetricSpec(
+            "expected_mm_median",
+            label="expected error of a point measured in the orthoimages, median",
+        ),
+        MetricSpec(
+            "expected_mm_p95",
+            label="expected error of a point measured in the orthoimages, 95th percentile",
+        ),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4)",

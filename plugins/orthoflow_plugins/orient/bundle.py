@@ -12,7 +12,7 @@ from pydantic import Field
 
 from orthoflow.errors import GeometryError
 from orthoflow.products import JsonValue, Photo, Ties
-from orthoflow.sdk import Method, StepContext
+from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.adjustment import Adjusted, adjust_block, of_another_lens
 from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
@@ -70,9 +70,12 @@ class OrientColmapBundle(Method):
     id: ClassVar[str] = "orient.colmap-bundle"
     result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = (
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
-        *("n_photo_points", "photo_tie_rmse_px", "sigma0", "redundancy"),
+        MetricSpec("n_photo_points", label="points seen in several photos"),
+        MetricSpec("photo_tie_rmse_px", label="ties between photos, RMS", better="lower"),
+        MetricSpec("sigma0", label="sigma of unit weight"),
+        MetricSpec("redundancy", label="redundancy of the adjustment"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

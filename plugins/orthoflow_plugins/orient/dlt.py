@@ -26,7 +26,7 @@ from orthoflow.geometry.resection import (
     moved_origin,
     predicted_covariances,
 )
-from orthoflow.sdk import Method, StepContext
+from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
@@ -85,7 +85,7 @@ class OrientDlt(Method):
     id: ClassVar[str] = "orient.dlt"
     result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
+    metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Abdel-Aziz, Karara 1971, Direct linear transformation, doi:10.14358/PERS.81.2.103",
         "Hartley 1997, In defense of the eight-point algorithm, doi:10.1109/34.601246",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.resection import SeenPoints, misfit
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, TieWall, Walls
-from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk import Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
 from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientOut, OrientParams
@@ -36,7 +36,7 @@ class OrientGiven(Method):
     id: ClassVar[str] = "orient.given"
     result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
+    metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(OrientParams):

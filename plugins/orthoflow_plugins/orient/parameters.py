@@ -7,15 +7,69 @@ from typing import Final, Literal
 from pydantic import Field
 
 from orthoflow.products import Cameras, Photos, Ties
-from orthoflow.sdk import MethodParams, Ports
+from orthoflow.sdk import MethodParams, MetricSpec, Ports
 
 # What every orientation reports of its photos.
 ORIENTATION_METRICS: Final = (
-    *("n_photos", "n_oriented", "n_refused", "n_ties", "n_control", "n_check", "rejected_share"),
-    *("control_rmse_px_median", "control_rmse_px_worst"),
-    *("check_rmse_px_median", "check_rmse_px_worst"),
-    *("check_rmse_mm_median", "check_rmse_mm_worst"),
-    *("sigma_wall_mm_median", "sigma_wall_mm_worst"),
+    MetricSpec("n_photos", label="photos"),
+    MetricSpec("n_oriented", label="photos oriented", better="higher", headline=True),
+    MetricSpec("n_refused", label="photos refused"),
+    MetricSpec("n_ties", label="ties"),
+    MetricSpec("n_control", label="control points"),
+    MetricSpec("n_check", label="check points"),
+    MetricSpec("rejected_share", label="share of the ties that is rejected"),
+    MetricSpec(
+        "control_rmse_px_median",
+        label="control points, RMS per axis, median photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "control_rmse_px_worst",
+        label="control points, RMS per axis, worst photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "check_rmse_px_median",
+        label="check points, RMS per axis, median photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "check_rmse_px_worst",
+        label="check points, RMS per axis, worst photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "check_rmse_mm_median",
+        label="check points, RMS per axis on the wall, median photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "check_rmse_mm_worst",
+        label="check points, RMS per axis on the wall, worst photo",
+        better="lower",
+        counted_by="n_oriented",
+        headline=True,
+        description="mean of both axes of the photo; along one of the wall it may be more",
+    ),
+    MetricSpec(
+        "sigma_wall_mm_median",
+        label="expected error of the orientation on the wall, median photo",
+        better="lower",
+        counted_by="n_oriented",
+    ),
+    MetricSpec(
+        "sigma_wall_mm_worst",
+        label="expected error of the orientation on the wall, worst photo",
+        better="lower",
+        counted_by="n_oriented",
+        headline=True,
+        description="against the scan; errors of depth and scan add to it",
+    ),
 )
 
 

@@ -13,7 +13,7 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints, misfit, stated
-from orthoflow.sdk import Method, StepContext
+from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
@@ -51,7 +51,7 @@ class OrientPnp(Method):
     id: ClassVar[str] = "orient.pnp"
     result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
+    metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.6, 4.3)",
         "Raguram et al. 2013, USAC, universal random sample consensus, doi:10.1109/TPAMI.2012.257",

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from orthoflow.geometry.bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask
-from orthoflow.sdk import Determinism, Method, Part, StepContext
+from orthoflow.sdk import Determinism, Method, MetricSpec, Part, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
@@ -70,15 +70,15 @@ class DsmBackward(Method):
     id: ClassVar[str] = "ortho.dsm-backward"
     result_version: ClassVar[int] = 7
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_layers",
-        "painted_share",
-        "occluded_share",
-        "photo_gsd_mm",
-        "obliquity_deg",
-        "occluders_s",
-        "decoding_s",
-        "painting_s",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_layers", label="photos projected onto walls"),
+        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("occluded_share", label="cells hidden from the photo"),
+        MetricSpec("photo_gsd_mm", label="size of a photo's pixel on the wall"),
+        MetricSpec("obliquity_deg", label="obliquity of the views"),
+        MetricSpec("occluders_s", label="time of the occlusion test", better="lower"),
+        MetricSpec("decoding_s", label="time of decoding photos", better="lower"),
+        MetricSpec("painting_s", label="time of painting", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7, 4.4)",

@@ -22,7 +22,7 @@ from orthoflow.geometry.bands import (
 )
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask
-from orthoflow.sdk import Determinism, Method, Part, StepContext
+from orthoflow.sdk import Determinism, Method, MetricSpec, Part, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
@@ -63,12 +63,12 @@ class DsmForward(Method):
     id: ClassVar[str] = "ortho.dsm-forward"
     result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_layers",
-        "painted_share",
-        "filled_share",
-        "occluders_s",
-        "painting_s",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_layers", label="photos projected onto walls"),
+        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("filled_share", label="cells filled from neighbours"),
+        MetricSpec("occluders_s", label="time of the occlusion test", better="lower"),
+        MetricSpec("painting_s", label="time of painting", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7)",

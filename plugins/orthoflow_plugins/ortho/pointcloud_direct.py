@@ -21,7 +21,7 @@ from orthoflow.geometry.bands import (
 )
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
     Inpainting,
@@ -64,12 +64,12 @@ class PointcloudDirect(Method):
     id: ClassVar[str] = "ortho.pointcloud-direct"
     result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "painted_share",
-        "filled_share",
-        "void_share",
-        "projection_s",
-        "filling_s",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("filled_share", label="cells filled from neighbours"),
+        MetricSpec("void_share", label="cells that got no colour"),
+        MetricSpec("projection_s", label="time of the projection", better="lower"),
+        MetricSpec("filling_s", label="time of the filling", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

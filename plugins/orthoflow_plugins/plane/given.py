@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import Plane, basis_from_up, plane_through
 from orthoflow.products import PointCloud, PointLabels
-from orthoflow.sdk import Method, MethodParams, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, StepContext
 from orthoflow_plugins.plane.parameters import DetectorIn, DetectorOut
 
 if TYPE_CHECKING:
@@ -92,12 +92,17 @@ class GivenPlane(Method):
     result_version = 2
     determinism = "exact"
     metrics = (
-        "n_planes",
-        "labelled_share",
-        "rms_mm",
-        "omega_deg",
-        "phi_deg",
-        "offset_m",
+        MetricSpec("n_planes", label="planes found"),
+        MetricSpec("labelled_share", label="points that lie on a plane"),
+        MetricSpec(
+            "rms_mm",
+            label="points to the first plane, RMS",
+            headline=True,
+            description="the relief of the wall counts in full: it is no error of the image",
+        ),
+        MetricSpec("omega_deg", label="direction of the first normal (omega)"),
+        MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
+        MetricSpec("offset_m", label="offset of the first plane"),
     )
     citations = (
         (

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import MethodParams, Ports
+from orthoflow.sdk import MethodParams, MetricSpec, Ports
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Family
@@ -16,15 +16,60 @@ if TYPE_CHECKING:
 
 # What every detector reports.
 DETECTOR_METRICS: Final = (
-    *("n_planes", "thinning", "labelled_share", "first_share"),
-    *("tolerance_m", "fit_tolerance_m", "noise_mm"),
-    *("detection_s", "first_plane_s", "next_plane_s"),
-    *("detection_cpu_s", "first_plane_cpu_s", "next_plane_cpu_s"),
-    *("rms_mm", "fit_rms_mm", "omega_deg", "phi_deg", "offset_m", "r_m"),
-    *("sigma_angle_deg", "sigma_offset_mm", "n_independent"),
-    *("skewness", "excess_kurtosis", "within_[123]_sigma"),
-    *("raw_omega_deg", "raw_phi_deg", "raw_r_m", "raw_angle_deg", "raw_offset_mm"),
-    *("thickest_mm", "thickness_mm", "thickness_width_mm", "thickness_scan_steps", "scan_step_mm"),
+    MetricSpec("n_planes", label="planes found"),
+    MetricSpec("thinning", label="points per point that was looked at"),
+    MetricSpec("labelled_share", label="points that lie on a plane"),
+    MetricSpec("first_share", label="points that lie on the first plane"),
+    MetricSpec("tolerance_m", label="distance to a plane within which points belong to it"),
+    MetricSpec("fit_tolerance_m", label="distance to a plane within which points decide its fit"),
+    MetricSpec("noise_mm", label="noise of the scan across its surfaces"),
+    MetricSpec("detection_s", label="time of the detection", better="lower"),
+    MetricSpec("first_plane_s", label="time to the first plane", better="lower"),
+    MetricSpec("next_plane_s", label="time of each further plane", better="lower"),
+    MetricSpec("detection_cpu_s", label="processor time of the detection", better="lower"),
+    MetricSpec("first_plane_cpu_s", label="processor time to the first plane", better="lower"),
+    MetricSpec("next_plane_cpu_s", label="processor time of each further plane", better="lower"),
+    MetricSpec(
+        "rms_mm",
+        label="points to the first plane, RMS",
+        headline=True,
+        description="the relief of the wall counts in full: it is no error of the image",
+    ),
+    MetricSpec("fit_rms_mm", label="points to the first plane, RMS of those fitted"),
+    MetricSpec("omega_deg", label="direction of the first normal (omega)"),
+    MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
+    MetricSpec("offset_m", label="offset of the first plane"),
+    MetricSpec("r_m", label="distance of the first plane (r)"),
+    MetricSpec(
+        "sigma_angle_deg", label="stated sigma of the first plane's direction", better="lower"
+    ),
+    MetricSpec(
+        "sigma_offset_mm", label="stated sigma of the first plane's position", better="lower"
+    ),
+    MetricSpec("n_independent", label="independent points behind the stated sigmas"),
+    MetricSpec("skewness", label="skewness of the distances to the first plane"),
+    MetricSpec("excess_kurtosis", label="excess kurtosis of the distances to the first plane"),
+    MetricSpec("within_[123]_sigma", label="distances to the first plane within {0} sigma"),
+    MetricSpec("raw_omega_deg", label="direction of the first normal (omega); before the fit"),
+    MetricSpec("raw_phi_deg", label="inclination of the first normal (phi); before the fit"),
+    MetricSpec("raw_r_m", label="distance of the first plane (r); before the fit"),
+    MetricSpec(
+        "raw_angle_deg",
+        label="direction against the fitted plane; before the fit",
+        better="lower",
+    ),
+    MetricSpec(
+        "raw_offset_mm",
+        label="position against the fitted plane; before the fit",
+        better="lower",
+    ),
+    MetricSpec("thickest_mm", label="thickness of the cloud where it is thickest"),
+    MetricSpec("thickness_mm", label="thickness of the cloud on the first plane"),
+    MetricSpec(
+        "thickness_width_mm", label="width that holds 95 % of the distances to the first plane"
+    ),
+    MetricSpec("thickness_scan_steps", label="thickness over the point spacing on the first plane"),
+    MetricSpec("scan_step_mm", label="point spacing on the first plane, without relief"),
 )
 
 _FAMILIES: Final[Mapping[str, Family]] = {"any": "any", "vertical": "wall", "horizontal": "level"}

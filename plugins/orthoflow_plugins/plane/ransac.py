@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
-from orthoflow.sdk import Method, StepContext
+from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow_plugins.plane.parameters import (
     DETECTOR_METRICS,
     DetectorIn,
@@ -37,7 +37,10 @@ class Ransac(Method):
     id = "plane.ransac"
     result_version = 5
     determinism = "seeded"
-    metrics = (*DETECTOR_METRICS, "own_tolerance_mm")
+    metrics = (
+        *DETECTOR_METRICS,
+        MetricSpec("own_tolerance_mm", label="tolerance taken from the cloud"),
+    )
     citations = (
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",
         "Torr, Zisserman 2000: MLESAC, doi:10.1006/cviu.1999.0832 (MSAC)",

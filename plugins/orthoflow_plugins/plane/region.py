@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field, model_validator
 
-from orthoflow.sdk import Method, StepContext
+from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow_plugins.plane.parameters import (
     DETECTOR_METRICS,
     DetectorIn,
@@ -57,7 +57,10 @@ class Region(Method):
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,
-        *("n_regions", "neighbourhood_mm", "cell_mm", "normal_scatter_deg"),
+        MetricSpec("n_regions", label="regions grown"),
+        MetricSpec("neighbourhood_mm", label="radius of a neighbourhood"),
+        MetricSpec("cell_mm", label="side of a surface cell"),
+        MetricSpec("normal_scatter_deg", label="scatter of the normals"),
     )
     citations = (
         (

@@ -15,7 +15,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
 from orthoflow_plugins.raster.crops import (
@@ -73,27 +73,29 @@ class RasterGrid(Method):
     id: ClassVar[str] = "raster.grid"
     result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_walls",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_walls", label="walls"),
         # Which wall the first one is.
-        "omega_deg",
-        "phi_deg",
-        "area_m2",
-        "gsd_mm",
-        "n_points_inside",
-        "points_per_cell",
-        "depth_noise_mm",
-        "scan_step_mm",
-        "sigma_median_mm",
+        MetricSpec("omega_deg", label="direction of the first normal (omega)"),
+        MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
+        MetricSpec("area_m2", label="area of the first wall's raster"),
+        MetricSpec("gsd_mm", label="side of a cell"),
+        MetricSpec("n_points_inside", label="points within the walls"),
+        MetricSpec("points_per_cell", label="points per cell"),
+        MetricSpec("depth_noise_mm", label="noise of the depths"),
+        MetricSpec("scan_step_mm", label="point spacing on the first wall"),
+        MetricSpec(
+            "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
+        ),
         # By what causes it, too.
-        "void_share",
-        "void_*_share",
-        "empty*_share",
-        "measured_share",
-        "recovered_share",
-        "intensity_cosine_power",
-        "intensity_range_power",
-        "intensity_scale_spread",
+        MetricSpec("void_share", label="cells without a depth"),
+        MetricSpec("void_*_share", label="cells without a depth, by cause"),
+        MetricSpec("empty*_share", label="cells without a depth, by cause"),
+        MetricSpec("measured_share", label="cells with a measured depth"),
+        MetricSpec("recovered_share", label="cells recovered between measured ones"),
+        MetricSpec("intensity_cosine_power", label="intensity over the angle, power"),
+        MetricSpec("intensity_range_power", label="intensity over the distance, power"),
+        MetricSpec("intensity_scale_spread", label="intensity between stations, spread"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.4, 4.2)",

@@ -18,7 +18,7 @@ from orthoflow.files.panoramas import face_in
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.scan import Unit
 
 _NAMED = 3
@@ -43,11 +43,23 @@ class ReadCameras(Method):
     repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (
-        "n_photos",
-        "n_oriented",
-        "n_refused",
-        "sigma_wall_mm_median",
-        "sigma_wall_mm_worst",
+        MetricSpec("n_photos", label="photos"),
+        MetricSpec("n_oriented", label="photos oriented", better="higher", headline=True),
+        MetricSpec("n_refused", label="photos refused"),
+        MetricSpec(
+            "sigma_wall_mm_median",
+            label="expected error of the orientation on the wall, median photo",
+            better="lower",
+            counted_by="n_oriented",
+        ),
+        MetricSpec(
+            "sigma_wall_mm_worst",
+            label="expected error of the orientation on the wall, worst photo",
+            better="lower",
+            counted_by="n_oriented",
+            headline=True,
+            description="against the scan; errors of depth and scan add to it",
+        ),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

@@ -11,7 +11,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.files.survey_points import SurveyPoint, read_survey_points
 from orthoflow.products import CheckPoints, InputFiles
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.scan import Unit
 
 
@@ -32,9 +32,9 @@ class ReadCheckpoints(Method):
     result_version = 1
     determinism = "exact"
     metrics = (
-        "n_points",
-        "n_measured",
-        "extent_[xyz]_m",
+        MetricSpec("n_points", label="check points"),
+        MetricSpec("n_measured", label="check points measured in pictures"),
+        MetricSpec("extent_[xyz]_m", label="extent along {0} of the world"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

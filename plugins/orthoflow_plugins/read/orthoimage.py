@@ -20,7 +20,7 @@ from orthoflow.files.sidecars import (
 )
 from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.products import InputFiles, Orthoimage, Orthoimages, OrthoMask
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _IMAGES: Final = (".tif", ".tiff")
 
@@ -42,8 +42,8 @@ class ReadOrthoimage(Method):
     repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (
-        "n_orthoimages",
-        "painted_share",
+        MetricSpec("n_orthoimages", label="orthoimages"),
+        MetricSpec("painted_share", label="cells painted"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

@@ -48,7 +48,7 @@ from orthoflow.files.panoramas import PanoramaFace, faces_of
 from orthoflow.files.photo_masks import decode_mask
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.cameras import GivenByName
 from orthoflow_plugins.read.figures import ContactSheet
 from orthoflow_plugins.read.masks import Masks, beside_photos
@@ -82,10 +82,10 @@ class ReadPhotos(Method):
     repeatable: ClassVar[tuple[str, ...]] = ("calibration", "cameras", "masks")
     determinism = "exact"
     metrics = (
-        "n_photos",
-        "n_calibrated",
-        "n_exif_focal",
-        "megapixels",
+        MetricSpec("n_photos", label="photos"),
+        MetricSpec("n_calibrated", label="photos with a calibration"),
+        MetricSpec("n_exif_focal", label="photos with a focal length in EXIF"),
+        MetricSpec("megapixels", label="megapixels in all"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "CIPA DC-008, Exchangeable image file format for digital still cameras, Exif",

@@ -19,7 +19,7 @@ from orthoflow.files.points.formats import LAS, TEXT
 from orthoflow.files.points.units import UNITS_M, refuse_degrees
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import InputFiles, PointCloud
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.assembly import CloudAssembly
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.quality import judge_quality, report_quality, warn_of_up
@@ -61,20 +61,22 @@ class ReadScan(Method):
     result_version = 2
     determinism = "exact"
     metrics = (
-        "n_points",
-        "n_scans",
-        "n_stations",
-        "n_invalid",
-        "n_not_finite",
-        "n_withheld",
-        "n_points_left_out",
-        "n_left_out_*",
-        "extent_[xyz]_m",
-        "thickness_mm",
-        "thickness_width_mm",
-        "thickness_scan_steps",
-        "scan_step_mm",
-        "scans_apart_mm",
+        MetricSpec("n_points", label="points"),
+        MetricSpec("n_scans", label="scans"),
+        MetricSpec("n_stations", label="stations"),
+        MetricSpec("n_invalid", label="points that the scanner marks as invalid"),
+        MetricSpec("n_not_finite", label="points without finite coordinates"),
+        MetricSpec("n_withheld", label="points withheld"),
+        MetricSpec("n_points_left_out", label="points of the files that are not used"),
+        MetricSpec("n_left_out_*", label="points of the files that are not used: {0}"),
+        MetricSpec("extent_[xyz]_m", label="extent along {0} of the world"),
+        MetricSpec("thickness_mm", label="thickness of the cloud in pieces of about 10 cm"),
+        MetricSpec(
+            "thickness_width_mm", label="width that holds 95 % of the distances to the first plane"
+        ),
+        MetricSpec("thickness_scan_steps", label="that thickness over the point spacing"),
+        MetricSpec("scan_step_mm", label="point spacing"),
+        MetricSpec("scans_apart_mm", label="scans apart from each other"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "ASTM E2807, E57 file format for 3D imaging data exchange",

@@ -14,7 +14,7 @@ from orthoflow.files.points.units import UNITS_M
 from orthoflow.files.survey_points import MeasuredTie, read_measured_ties
 from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.products import InputFiles, Photo, Photos, TieRole, Ties
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.scan import Unit
 
 _MOST_PROBLEMS = 20
@@ -32,8 +32,8 @@ class ReadTies(Method):
     result_version = 1
     determinism = "exact"
     metrics = (
-        "n_ties",
-        "n_photos_tied",
+        MetricSpec("n_ties", label="ties"),
+        MetricSpec("n_photos_tied", label="photos with ties"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

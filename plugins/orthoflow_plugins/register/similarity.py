@@ -12,7 +12,7 @@ from pydantic import Field
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, PointCloud
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
 # Lists that fit so many times better as mirror images of each other are that.
@@ -35,13 +35,13 @@ class RegisterSimilarity(Method):
     result_version: ClassVar[int] = 2
     determinism = "loose"
     metrics = (
-        "n_pairs",
-        "sigma0_mm",
-        "rms_mm",
-        "max_mm",
-        "scale",
-        "scale_ppm",
-        "left_out_rms_mm",
+        MetricSpec("n_pairs", label="pairs of points"),
+        MetricSpec("sigma0_mm", label="sigma of a point's coordinate"),
+        MetricSpec("rms_mm", label="residuals of the pairs, RMS", better="lower", headline=True),
+        MetricSpec("max_mm", label="largest residual"),
+        MetricSpec("scale", label="scale of the transformation"),
+        MetricSpec("scale_ppm", label="scale, from 1"),
+        MetricSpec("left_out_rms_mm", label="each point left out once, RMS", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",

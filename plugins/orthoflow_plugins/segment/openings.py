@@ -24,7 +24,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
 from orthoflow_plugins.segment.figures import CAPTION, outline_map
 from orthoflow_plugins.segment.image_edges import moved_to_edges
@@ -61,16 +61,16 @@ class SegmentOpenings(Method):
     id: ClassVar[str] = "segment.openings"
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_openings",
-        "n_through",
-        "n_niche",
-        "n_no_data",
-        "openings_area_m2",
-        "openings_share",
-        "side_sigma_mm",
-        "image_side_share",
-        "n_unbounded",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_openings", label="openings found"),
+        MetricSpec("n_through", label="openings with points behind them"),
+        MetricSpec("n_niche", label="openings with a measured back"),
+        MetricSpec("n_no_data", label="openings without returns"),
+        MetricSpec("openings_area_m2", label="area of the openings"),
+        MetricSpec("openings_share", label="share of the walls that is open"),
+        MetricSpec("side_sigma_mm", label="stated error of a side, median"),
+        MetricSpec("image_side_share", label="sides that a photo placed"),
+        MetricSpec("n_unbounded", label="open areas that are no openings by rim or shape"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Pu and Vosselman 2009, doi:10.1016/j.isprsjprs.2009.04.001 (holes of walls as windows)",

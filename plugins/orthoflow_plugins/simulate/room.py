@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
 from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.simulate.photographs import (
     Film,
     PhotoLayout,
@@ -64,17 +64,17 @@ class SimulateRoom(Method):
     id: ClassVar[str] = "simulate.room"
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "seeded"
-    metrics: ClassVar[tuple[str, ...]] = (
-        "n_points",
-        "n_photos",
-        "n_true_planes",
-        "main_wall_points",
-        "outlier_share",
-        "photo_gsd_mm",
-        "photo_megapixels",
-        "photo_obliquity_max_deg",
-        "scan_step_median_mm",
-        "scan_step_p90_mm",
+    metrics: ClassVar[tuple[MetricSpec, ...]] = (
+        MetricSpec("n_points", label="points"),
+        MetricSpec("n_photos", label="photos"),
+        MetricSpec("n_true_planes", label="true planes"),
+        MetricSpec("main_wall_points", label="points on the main wall"),
+        MetricSpec("outlier_share", label="simulated outliers"),
+        MetricSpec("photo_gsd_mm", label="size of a photo's pixel on the wall"),
+        MetricSpec("photo_megapixels", label="megapixels in all"),
+        MetricSpec("photo_obliquity_max_deg", label="most oblique view of a photo"),
+        MetricSpec("scan_step_median_mm", label="point spacing on the main wall, median"),
+        MetricSpec("scan_step_p90_mm", label="point spacing on the main wall, 90 % are below"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (the kind of room)",
