@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from orthoflow_provenance.document import RecordedFile, RecordedInput
+from orthoflow_provenance.document import Metric, RecordedFile, RecordedInput
 from orthoflow_provenance.record import write_record
 
 from orthoflow.cli import runs as module
