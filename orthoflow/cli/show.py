@@ -255,7 +255,11 @@ def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
     # What a method does not say of its metrics is left out, as in the record.
     values["metrics"] = [
-        {name: value for name, value in dataclasses.asdict(metric).items() if value not in ("", False)}
+        {
+            name: value
+            for name, value in dataclasses.asdict(metric).items()
+            if not (value == "" or value is False)
+        }
         for metric in cell.metrics
     ]
     # The bytes of pictures are in the record and the report; here their names do.
