@@ -10,6 +10,7 @@ from typing import TypeAlias
 from orthoflow_provenance.document import COSTS, RunRecord
 
 from orthoflow.foreign_text import Value, csv_text
+from orthoflow.records.common_points import CommonPoints, common_points
 from orthoflow.records.metrics import write_metrics_csv
 from orthoflow.records.published import METRICS_FILE
 from orthoflow.records.runs import Run
@@ -25,7 +26,8 @@ def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
         folder: existing folder.
 
     Returns:
-        The files: cells, metrics, parameters, inputs, products, environments.
+        The files: cells, metrics, parameters, inputs, products, environments, and where cells of a
+        comparison found the same check points, what each gives over those that all found.
     """
     tables = {
         "cells.csv": _cells(run.record),
@@ -34,6 +36,8 @@ def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
         "products.csv": _products(run.record),
         "environments.csv": _environments(run.record),
     }
+    if shared := common_points(run):
+        tables["common_points.csv"] = _common_points(shared)
     write_metrics_csv(folder / METRICS_FILE, run.metric_rows())
     for name, rows in tables.items():
         (folder / name).write_text(
@@ -77,6 +81,13 @@ def _products(record: RunRecord) -> Iterator[Row]:
             for port, product in products.items():
                 what = (product.type_name, product.encoding_version, product.digest)
                 yield (cell.address, direction, port, *what, product.source)
+
+
+def _common_points(found: Sequence[CommonPoints]) -> Iterator[Row]:
+    numbers = ("n_found", "n_common", "n_lost", "rms_u_mm", "rms_v_mm", "rms_mm")
+    yield ("cell", "step", "class", *numbers)
+    for row in found:
+        yield (row.cell, row.step, row.kind, *(getattr(row, name) for name in numbers))
 
 
 def _environments(record: RunRecord) -> Iterator[Row]:
