@@ -49,13 +49,6 @@ def test_every_module_has_a_noun_for_a_name(module: Path) -> None:
     assert not FORBIDDEN_NAMES & {module.stem, *module.parts}
 
 
-def test_modules_that_the_document_names_exist() -> None:
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"`((?:orthoflow|plugins|provenance|tests)/[\w/]+\.\w+)`", text))
-    assert len(named) > 30
-    assert {path for path in named if not (ROOT / path).is_file()} == set()
-
-
 def test_imports_run_in_no_circle() -> None:
     circles = [
         circle for circle in nx.strongly_connected_components(import_graph()) if len(circle) > 1

@@ -251,6 +251,17 @@ def _of_dask(words: list[str]) -> str:
     return ""
 
 
+def test_every_file_that_a_document_names_exists() -> None:
+    folders = "benchmarks|docs|examples|orthoflow|plugins|provenance|tests|workflows"
+    missing = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in TEXTS
+        for name in re.findall(rf"`((?:{folders})/[\w./-]+)`", path.read_text())
+        if not (ROOT / name).exists()
+    }
+    assert missing == set()
+
+
 def test_every_option_that_a_sentence_names_is_one() -> None:
     known: set[str] = {"--help"}
     targets: set[str] = set()
