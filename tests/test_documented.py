@@ -253,10 +253,11 @@ def _of_dask(words: list[str]) -> str:
 
 def test_every_file_that_a_document_names_exists() -> None:
     folders = "benchmarks|docs|examples|orthoflow|plugins|provenance|tests|workflows"
+    named = rf"`((?:{folders})/[\w./-]+\.\w+|(?:examples|tests)/[\w/-]+)`"
     missing = {
         f"{path.relative_to(ROOT)}: {name}"
         for path in TEXTS
-        for name in re.findall(rf"`((?:{folders})/[\w./-]+)`", path.read_text())
+        for name in re.findall(named, path.read_text())
         if not (ROOT / name).exists()
     }
     assert missing == set()
