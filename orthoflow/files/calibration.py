@@ -19,14 +19,22 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import ErrorDetails
 
 from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.fisheyes import WIDEST_DEG, FisheyeLens, problem_of
@@ -51,18 +59,7 @@ from orthoflow.products import Calibration, Intrinsics
 MOST_BYTES: Final = 400_000
 MOST_CAMERAS: Final = 1000
 MOST_VALUES: Final = 20_000
-_SIZES: Final = ("width", "height")
-_FOCALS: Final = ("fx", "fy")
-_CENTRES: Final = ("cx", "cy")
-_DISTORTION: Final = "distortion"
-_SKEW: Final = "skew"
-_REQUIRED: Final = (*_SIZES, *_FOCALS, *_CENTRES)
-_TERMS: Final = ("k1", "k2", "p1", "p2", "k3")
-_MODEL: Final = "model"
-_FISHEYE: Final = "fisheye"
-_FIELD: Final = "field_of_view_deg"
-_FISHEYE_TERMS: Final = ("k1", "k2", "k3", "k4")
-_COUNTED: Final = {4: "four", 5: "five"}
+_REQUIRED: Final = ("width", "height", "fx", "fy", "cx", "cy")
 _START: Final = Position(line=1, column=1)
 _DIALECT: Final = Dialect(
     is_strict=False,
@@ -129,8 +126,8 @@ def calibration_text(calibration: Calibration) -> str:
             "fy": camera.fy,
             "cx": camera.cx - HALF_PIXEL,
             "cy": camera.cy - HALF_PIXEL,
-            _DISTORTION: list(camera.distortion),
-            **({_SKEW: camera.skew} if camera.skew else {}),
+            "distortion": list(camera.distortion),
+            **({"skew": camera.skew} if camera.skew else {}),
         }
         lines.append(f"  {json.dumps(pattern, ensure_ascii=False)}:")
         lines += [f"    {key}: {json.dumps(value)}" for key, value in values.items()]
@@ -182,26 +179,88 @@ def lens_for(
     )
 
 
-class _Pixels(TypedDict):
-    """What lenses of all models say of their pixels."""
+class _Lens(BaseModel):
+    """An entry of the file; validators know the fields above theirs."""
 
-    width: int
-    height: int
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    model: Literal["fisheye"] | None = None
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1)]
     fx: float
     fy: float
     cx: float
     cy: float
-
-
-def _pixels(sizes: Mapping[str, int], numbers: Mapping[str, float]) -> _Pixels:
-    return _Pixels(
-        width=sizes["width"],
-        height=sizes["height"],
-        fx=numbers["fx"],
-        fy=numbers["fy"],
-        cx=numbers["cx"] + HALF_PIXEL,
-        cy=numbers["cy"] + HALF_PIXEL,
+    skew: float = 0.0
+    field_of_view_deg: float | None = None
+    distortion: Annotated[tuple[float, ...] | None, Field(strict=False, validate_default=True)] = (
+        None
     )
+
+    @field_validator("fx", "fy", "cx", "cy")
+    @classmethod
+    def _is_in_pixels(cls, value: float, info: ValidationInfo) -> float:
+        sides = [info.data.get("width", 0), info.data.get("height", 0)]
+        side = sides[info.field_name == "cy"]
+        if info.field_name in ("fx", "fy") and not value >= 0.1 * max(sides):
+            raise ValueError(
+                "expected the focal length in pixels, at least a tenth of the image's "
+                f"{max(sides)}, got {value:g}"
+            )
+        if info.field_name in ("cx", "cy") and side and not -side <= value <= 2 * side:
+            raise ValueError(
+                f"expected the principal point in pixels, in or near the image's {side}, got "
+                f"{value:g}"
+            )
+        return value
+
+    @field_validator("distortion")
+    @classmethod
+    def _is_a_lens(
+        cls, values: tuple[float, ...] | None, info: ValidationInfo
+    ) -> tuple[float, ...]:
+        terms = _FISHEYE_TERMS if info.data.get("model") else _TERMS
+        if info.data.get("field_of_view_deg") and not info.data.get("model"):
+            raise ValueError("field_of_view_deg belongs to model: fisheye")
+        values = values or (0.0,) * len(terms)
+        if len(values) != len(terms):
+            raise ValueError(
+                f"expected the {len(terms)} numbers [{', '.join(terms)}], got {len(values)} "
+                "values; fill up with 0, other lens models are not read"
+            )
+        if len(info.data) == _FIELDS_ABOVE and (problem := _problem(_lens(info.data, values))):
+            raise ValueError(
+                f"{problem}; expected {', '.join(terms)} of a calibration that covers the whole "
+                "image, or of a fisheye a smaller field_of_view_deg"
+            )
+        return values
+
+
+_TERMS: Final = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE_TERMS: Final = ("k1", "k2", "k3", "k4")
+_FIELDS_ABOVE: Final = len(_Lens.model_fields) - 1
+
+
+def _lens(given: Mapping[str, Any], terms: tuple[float, ...]) -> Intrinsics | FisheyeLens:
+    """Give the lens of an entry, in our convention."""
+    pixels = {key: given[key] for key in _REQUIRED}
+    pixels |= {key: pixels[key] + HALF_PIXEL for key in ("cx", "cy")}
+    if not given["model"]:
+        return Intrinsics(**pixels, distortion=terms, skew=given["skew"] or None)
+    return FisheyeLens(
+        **pixels,
+        radial=terms,
+        skew=given["skew"],
+        field_of_view_deg=given["field_of_view_deg"] or WIDEST_DEG,
+    )
+
+
+def _problem(lens: Intrinsics | FisheyeLens) -> str:
+    if isinstance(lens, Intrinsics):
+        two = "the lens model folds back inside the image, so that two directions share a pixel"
+        return two if _folds(lens) else ""
+    problem = problem_of(lens)
+    return f"the fisheye lens is none: {problem}" if problem else ""
 
 
 class _Reader:
@@ -226,7 +285,9 @@ class _Reader:
                 f"{{'*': {{{', '.join(f'{key}: ...' for key in _REQUIRED)}}}}}",
             )
             return None
-        self._refuse_unknown(document, ("cameras",), "")
+        for entry in document:
+            if entry.key != "cameras":
+                self._add(entry.position, f"{entry.key}: unknown key; expected cameras")
         if not isinstance(section.value, Table) or not section.value.entries:
             self._add(section.position, "cameras: expected one entry per photo name or pattern")
             return None
@@ -238,179 +299,72 @@ class _Reader:
                 "of one camera one entry, by a pattern",
             )
             return None
-        cameras: dict[str, Intrinsics | FisheyeLens] = {}
-        for entry in section.value:
-            camera = self._camera(entry)
-            if camera is not None:
-                cameras[entry.key] = camera
-        return CalibratedLenses(patterns=tuple(cameras), lenses=tuple(cameras.values()))
+        found = {entry.key: self._lens(entry) for entry in section.value}
+        lenses = {name: lens for name, lens in found.items() if lens is not None}
+        return CalibratedLenses(patterns=tuple(lenses), lenses=tuple(lenses.values()))
 
     def add(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of the YAML; places are told by line and column."""
         del path
         self._add(position, message)
 
-    def _camera(self, entry: Entry) -> Intrinsics | FisheyeLens | None:
+    def _lens(self, entry: Entry) -> Intrinsics | FisheyeLens | None:
         name, values = entry.key, entry.value
         if not entry.is_text:
             self._add(
                 entry.position, f'cameras: a photo name must be text, got {name}; write "{name}"'
             )
             return None
-        path = f'cameras."{name}"'
         if not isinstance(values, Table):
-            self._add(entry.position, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
+            self._add(
+                entry.position,
+                f'cameras."{name}": expected {", ".join(_REQUIRED)} [, distortion]',
+            )
             return None
-        n_before = len(self.problems)
-        given = {item.key: item for item in values}
-        is_fisheye = self._is_fisheye(given.get(_MODEL), path)
-        more = (_MODEL, _FIELD) if is_fisheye else (_MODEL,)
-        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION, _SKEW, *more), path + ".")
-        missing = [key for key in _REQUIRED if key not in given]
+        try:
+            lens = _Lens.model_validate(plain(values))
+        except ValidationError as error:
+            errors = error.errors(include_url=False)
+        else:
+            return _lens(dict(lens), lens.distortion or ())
+        missing = [str(each["loc"][0]) for each in errors if each["type"] == "missing"]
         if missing:
-            self._add(entry.position, f"{path}: {', '.join(missing)} missing")
-        sizes: dict[str, int] = {
-            key: self._size(given[key], path) for key in _SIZES if key in given
-        }
-        numbers: dict[str, float] = {
-            key: self._number(given[key], f"{path}.{key}", given[key].value)
-            for key in (*_FOCALS, *_CENTRES, _SKEW, _FIELD)
-            if key in given
-        }
-        terms = _FISHEYE_TERMS if is_fisheye else _TERMS
-        distortion = self._distortion(given.get(_DISTORTION), path, terms)
-        if len(self.problems) == n_before:
-            self._check_pixels(given, path, sizes, numbers)
-        if len(self.problems) > n_before:
-            return None
-        if is_fisheye:
-            return self._fisheye(entry, sizes, numbers, distortion)
-        camera = Intrinsics(
-            **_pixels(sizes, numbers), distortion=distortion, skew=numbers.get(_SKEW) or None
-        )
-        if _folds(camera):
-            self._add(
-                given[_DISTORTION].position,
-                f"{path}.{_DISTORTION}: the lens model folds back inside the image, so that two "
-                "directions share a pixel; expected k1, k2, p1, p2, k3 of a calibration that "
-                "covers the whole image",
-            )
-        return camera
-
-    def _fisheye(
-        self,
-        entry: Entry,
-        sizes: Mapping[str, int],
-        numbers: Mapping[str, float],
-        radial: tuple[float, ...],
-    ) -> FisheyeLens | None:
-        lens = FisheyeLens(
-            **_pixels(sizes, numbers),
-            radial=radial,
-            skew=numbers.get(_SKEW, 0.0),
-            field_of_view_deg=numbers.get(_FIELD, WIDEST_DEG),
-        )
-        problem = problem_of(lens)
-        if problem:
-            self._add(
-                entry.position,
-                f'cameras."{entry.key}": the fisheye lens is none: {problem}; expected '
-                f"{', '.join(_FISHEYE_TERMS)} of a calibration that covers the image, or a smaller "
-                f"{_FIELD}",
-            )
-        return None if problem else lens
-
-    def _is_fisheye(self, entry: Entry | None, path: str) -> bool:
-        if entry is None:
-            return False
-        value = plain(entry.value)
-        if value != _FISHEYE:
-            self._add(
-                entry.position,
-                f"{path}.{_MODEL}: expected {_FISHEYE}, or no {_MODEL} for other lenses, got "
-                f"{describe(entry.value)}",
-            )
-        return bool(value == _FISHEYE)
-
-    def _size(self, entry: Entry, path: str) -> int:
-        value = plain(entry.value)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            self._add(
-                entry.position,
-                f"{path}.{entry.key}: expected a whole number of pixels, got {value}",
-            )
-            return 0
-        return value
-
-    def _number(self, entry: Entry, path: str, value: Value) -> float:
-        given = value.value if isinstance(value, Text) else None
-        is_number = isinstance(given, int | float) and not isinstance(given, bool)
-        # Through text: whole numbers may be larger than a float can be.
-        number = float(str(given)) if is_number else math.nan
-        if not math.isfinite(number):
-            got = describe(value) if isinstance(value, Text) else "a list or mapping"
-            self._add(entry.position, f"{path}: expected a number, got {got}")
-            return 0.0
-        return number
-
-    def _distortion(
-        self, entry: Entry | None, path: str, terms: Sequence[str]
-    ) -> tuple[float, ...]:
-        path = f"{path}.{_DISTORTION}"
-        if entry is None:
-            return (0.0,) * len(terms)
-        values = entry.value
-        if not isinstance(values, Listing) or len(values.items) != len(terms):
-            got = f"{len(values.items)} values" if isinstance(values, Listing) else describe(values)
-            self._add(
-                entry.position,
-                f"{path}: expected the {_COUNTED[len(terms)]} numbers [{', '.join(terms)}], got "
-                f"{got}; fill up with 0, other lens models are not read",
-            )
-            return ()
-        return tuple(
-            self._number(entry, f"{path}[{index}]", value)
-            for index, value in enumerate(values.items)
-        )
-
-    def _check_pixels(
-        self,
-        given: Mapping[str, Entry],
-        path: str,
-        sizes: Mapping[str, int],
-        numbers: Mapping[str, float],
-    ) -> None:
-        """Refuse what looks like millimetres, or like another image."""
-        longest = max(sizes.values())
-        for key in _FOCALS:
-            if key in numbers and not numbers[key] >= 0.1 * longest:
-                self._add(
-                    given[key].position,
-                    f"{path}.{key}: expected the focal length in pixels, at least a tenth of the "
-                    f"image's {longest}, got {numbers[key]:g}",
-                )
-        for key, side in zip(_CENTRES, _SIZES, strict=True):
-            if not -sizes[side] <= numbers[key] <= 2 * sizes[side]:
-                self._add(
-                    given[key].position,
-                    f"{path}.{key}: expected the principal point in pixels, in or near the "
-                    f"image's {sizes[side]}, got {numbers[key]:g}",
-                )
-
-    def _refuse_unknown(self, table: Table, known: Collection[str], path: str) -> None:
-        for entry in table:
-            if entry.key not in known:
-                near = difflib.get_close_matches(entry.key, known, n=1)
-                hint = f" (did you mean {near[0]}?)" if near else ""
-                if entry.key.isdecimal():
-                    hint = ", what a decimal comma leaves behind: write decimal points"
-                self._add(
-                    entry.position,
-                    f"{path}{entry.key}: unknown key{hint}; expected {', '.join(known)}",
-                )
+            self._add(entry.position, f'cameras."{name}": {", ".join(missing)} missing')
+        for each in errors:
+            if each["type"] != "missing":
+                position, path, value = _place(entry, each["loc"])
+                self._add(position, f'cameras."{name}"{path}: {_sentence(each, value)}')
+        return None
 
     def _add(self, place: Position, message: str) -> None:
         self.problems.append((place, f"{self.file_name}:{place.line}:{place.column}: {message}"))
+
+
+def _place(entry: Entry, location: Sequence[int | str]) -> tuple[Position, str, Value]:
+    """Where in the text a field of an entry stands, how messages call it, and its value."""
+    position, value, path = entry.position, entry.value, ""
+    for key in location:
+        path += f"[{key}]" if isinstance(key, int) else f".{key}"
+        if isinstance(value, Table) and (field := value.get(str(key))) is not None:
+            position, value = field.position, field.value
+        elif isinstance(value, Listing) and isinstance(key, int):
+            value = value.items[key]
+    return position, path, value
+
+
+def _sentence(error: ErrorDetails, value: Value) -> str:
+    """Say what pydantic found wrong with a field, and the way out."""
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return message
+    if error["type"] != "extra_forbidden":
+        return f"{message[0].lower()}{message[1:]}, got {describe(value)}"
+    key, known = str(error["loc"][-1]), list(_Lens.model_fields)
+    near = difflib.get_close_matches(key, known, n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    if key.isdecimal():
+        hint = ", what a decimal comma leaves behind: write decimal points"
+    return f"unknown key{hint}; expected {', '.join(known)}"
 
 
 def _folds(camera: Intrinsics) -> bool:

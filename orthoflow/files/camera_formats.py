@@ -1,11 +1,20 @@
-"""Which reader a file of cameras needs, told by its name."""
+"""Files of cameras: who reads which, and the readers of `cameras.json`, Bundler, RealityCapture.
+
+Metashape, COLMAP and E57 have modules of their own.
+"""
 
 from __future__ import annotations
 
+import csv
+import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.alike import first_few
 from orthoflow.errors import InputError
@@ -13,15 +22,31 @@ from orthoflow.files.colmap import COLMAP_PARTS, read_colmap_model
 from orthoflow.files.e57_images import read_e57_images
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
+    CentredLens,
     GivenCamera,
-    bundler_count,
+    checked_lens,
+    damaged,
+    lines_of,
+    numbers_of,
     photo_path,
-    read_bundler,
-    read_cameras_json,
-    read_realitycapture_list,
+    rotation_of,
     text_of,
 )
+from orthoflow.files.images import PHOTO_SUFFIXES
+from orthoflow.files.json_texts import parse_json
 from orthoflow.files.metashape import read_metashape_xml
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.products import Intrinsics
+
+_FULL_FRAME_MM: Final = 36.0
+# Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
+_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
+_ANGLES: Final = ("x", "y", "alt", "heading", "pitch", "roll")
+_FOCAL_BEHIND: Final = re.compile(r"\s+0\s+[-+.\deE]+$")
+_SEPARATORS: Final = re.compile("[,;\t]")
+_FIRST_LINES: Final = 50
+# Of several files of one kind these are meant.
+_USUAL_NAMES: Final = ("cameras.json", "bundle.out", "cameras.xml", "cameras.csv")
 
 
 def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
@@ -48,18 +73,24 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
         ".csv": read_realitycapture_list,
         ".e57": lambda path: tuple(image.camera for image in read_e57_images(path)),
         ".out": lambda path: read_bundler(path, _photo_list(path, paths)),
+        ".txt": read_realitycapture_list,
     }
+    several = ""
     for suffix, reader in readers.items():
         files = [path for path in paths if path.suffix.lower() == suffix]
-        named = [path for path in files if path.name.lower() == "cameras.json"]
-        if len(files) == 1 or len(named) == 1:
-            return reader((named or files)[0])
+        if suffix == ".txt":
+            files = [path for path in files if _is_realitycapture(path)]
+        usual = [path for path in files if path.name.lower() in _USUAL_NAMES]
+        if len(files) == 1 or len(usual) == 1:
+            return reader((usual or files)[0])
+        if files and not several:
+            several = f"{len(files)} {suffix} files, of which one must be named; "
     names = first_few([path.name for path in paths])
     raise InputError(
-        f"{names or 'nothing'} holds no cameras that orthoflow reads: expected one cameras.json of "
-        "a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), Metashape's .xml, "
-        "Bundler's .out with its list of photos (.txt) beside it, RealityCapture's .csv, or an E57 "
-        "file with photos"
+        f"{names or 'nothing'} holds no cameras that orthoflow reads: {several}expected one "
+        "cameras.json of a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), "
+        "Metashape's .xml, Bundler's .out with its list of photos (.txt) beside it, "
+        "RealityCapture's .csv, or an E57 file with photos"
     )
 
 
@@ -79,29 +110,232 @@ def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
 def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
     """Names of the photos of a Bundler file, from the list beside it that has as many.
 
-    A line is a name, which may hold spaces, or a name, 0 and a focal length in pixels.
+    A line is a name, which may hold spaces or stand in quotes, or a name, 0 and a focal length in
+    pixels. Of several lists the one is meant that is called after the file, then `list.txt`; lists
+    of anything but photos are none where there is one of photos.
     """
     n_cameras = bundler_count(path)
     lists = {
         other.name: [
-            _FOCAL_BEHIND.sub("", line.strip())
+            photo_path(_FOCAL_BEHIND.sub("", line.strip()).strip("\"'"))
             for line in text_of(other).splitlines()
             if line.strip() and not line.startswith("#")
         ]
         for other in paths
         if other.suffix.lower() == ".txt" and other.parent == path.parent
     }
-    fitting = [name for name, lines in lists.items() if len(lines) == n_cameras]
-    preferred = [name for name in fitting if "list" in name.lower()]
-    if len(preferred) != 1 and len(fitting) == 1:
-        preferred = fitting
-    if len(preferred) != 1:
-        counts = ", ".join(f"{name} ({len(lines)} lines)" for name, lines in lists.items())
-        raise InputError(
-            f"{path.name} has {n_cameras} cameras without names: give the folder with it and one "
-            f"list of as many photos (.txt), one line each; there is {counts or 'no such file'}"
+    fitting = {name: names for name, names in lists.items() if len(names) == n_cameras}
+    of_photos = {
+        name: names
+        for name, names in fitting.items()
+        if all(each.lower().endswith(PHOTO_SUFFIXES) for each in names)
+    }
+    fitting = of_photos or fitting
+    called = (f"{path.name}.list.txt".lower(), f"{path.stem}.list.txt".lower(), "list.txt")
+
+    def rank(name: str) -> int:
+        lower = name.lower()
+        return called.index(lower) if lower in called else len(called) + ("list" not in lower)
+
+    best = [name for name in fitting if rank(name) == min(map(rank, fitting))]
+    if len({tuple(fitting[name]) for name in best}) == 1:
+        return fitting[best[0]]
+    counts = ", ".join(f"{name} ({len(names)} lines)" for name, names in lists.items())
+    raise InputError(
+        f"{path.name} has {n_cameras} cameras without names: give the folder with it and one "
+        f"list of as many photos (.txt), one line each; there is {counts or 'no such file'}"
+    )
+
+
+def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
+    """Read the `cameras.json` of a run: OpenCV's pixels, X_camera = R X_world + t.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        content: Any = parse_json(text_of(path))
+        entries: Mapping[str, Any] = dict(content["cameras"])
+        return tuple(
+            _of_json(name, dict(entry), path)
+            for name, entry in islice(entries.items(), MOST_CAMERAS + 1)
         )
-    return [photo_path(name) for name in lists[preferred[0]]]
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise damaged(path, "it is no cameras.json of a run") from error
 
 
-_FOCAL_BEHIND: Final = re.compile(r"\s+0\s+[-+.\deE]+$")
+def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
+    if entry["status"] != "ok":
+        return GivenCamera(name=name, reason=str(entry["status"]))
+    matrix = np.array(entry["K"], dtype=np.float64)
+    distortion = tuple(float(value) for value in entry["distortion"])
+    if matrix.shape != (3, 3) or len(distortion) != 5:
+        raise damaged(path, f"the lens of {name} must be K (3 x 3) and k1, k2, p1, p2, k3")
+    lens = Intrinsics(
+        width=int(entry["width"]),
+        height=int(entry["height"]),
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]) + HALF_PIXEL,
+        cy=float(matrix[1, 2]) + HALF_PIXEL,
+        distortion=distortion,
+        source="given",
+        skew=float(matrix[0, 1]) or None,
+    )
+    lens = checked_lens(lens, path, name)
+    rotation = np.array(entry["R_camera_from_world"], dtype=np.float64).ravel().tolist()
+    sigma_mm = entry.get("sigma_wall_mm")
+    return GivenCamera(
+        name=name,
+        lens=lens,
+        rotation=rotation_of(rotation, path, name),
+        translation=np.array(
+            numbers_of([str(v) for v in entry["t_camera_from_world"]], path, f"t of {name}")
+        ).reshape(3),
+        sigma_wall_m=None
+        if sigma_mm is None
+        else numbers_of([str(sigma_mm)], path, f"sigma_wall_mm of {name}")[0] / 1000.0,
+    )
+
+
+def bundler_count(path: Path) -> int:
+    """Return how many cameras a file of Bundler states.
+
+    Raises:
+        InputError: it does not.
+    """
+    words = list(islice(_words_of(path), 2))
+    counts = numbers_of(words, path, "the counts of cameras and points")
+    if len(counts) < 2 or not 0.0 <= counts[0] <= MOST_CAMERAS:
+        raise damaged(path, "it states no count of cameras")
+    return int(counts[0])
+
+
+def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
+    """Read Bundler's file: f, k1, k2, R and t of each camera, with the axes of OpenGL.
+
+    Its pixels count from the middle of the photo, y upwards.
+
+    Args:
+        path: the file.
+        names: of the photos, in its order.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    # What follows the cameras are points, which may be many.
+    words = list(islice(_words_of(path), 2 + 15 * len(names)))
+    found = []
+    for index, name in enumerate(names):
+        values = numbers_of(words[2 + 15 * index : 17 + 15 * index], path, f"camera {index}")
+        if len(values) < 15:
+            raise damaged(path, f"it ends within camera {index}")
+        focal, k1, k2 = values[:3]
+        if not focal > 0.0:
+            found.append(GivenCamera(name=name, reason="Bundler did not orient it"))
+            continue
+        found.append(
+            GivenCamera(
+                name=name,
+                lens=CentredLens(focal_px=focal, radial=(k1, k2, 0.0)),
+                rotation=_FROM_OPENGL @ rotation_of(values[3:12], path, name),
+                translation=_FROM_OPENGL @ np.array(values[12:15]),
+            )
+        )
+    return tuple(found)
+
+
+def _words_of(path: Path) -> Iterator[str]:
+    for line in lines_of(path):
+        if not line.lstrip().startswith("#"):
+            yield from line.split()
+
+
+def _head_of(lines: Sequence[str]) -> tuple[int, list[str]] | None:
+    """Line and columns of a RealityCapture list's head; None where no line is one."""
+    for number, line in enumerate(lines):
+        columns = [word.strip().lower() for word in _SEPARATORS.split(line.lstrip("# \ufeff"))]
+        if {"name", "heading"} <= set(columns):
+            return number, ["alt" if word == "z" else word for word in columns]
+    return None
+
+
+def _is_realitycapture(path: Path) -> bool:
+    try:
+        return _head_of(list(islice(lines_of(path), _FIRST_LINES))) is not None
+    except InputError:
+        return False
+
+
+def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
+    """Read RealityCapture's "internal/external camera parameters" (CSV).
+
+    The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
+    principal point in shares of that side from the middle; heading is clockwise from north (y),
+    pitch 0 looks straight down. Terms that are not in the list are zero; lines of comment may
+    stand anywhere.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    lines = text_of(path).splitlines()
+    number, columns = _head_of(lines) or (0, [])
+    missing = [name for name in ("name", *_ANGLES) if name not in columns]
+    if missing:
+        raise damaged(
+            path,
+            f"the column {missing[0]} is missing: expected RealityCapture's internal/external "
+            "camera parameters, #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
+        )
+    separator = next(mark for mark in ",;\t" if mark in lines[number])
+    rows = csv.reader(lines[number + 1 :], delimiter=separator)
+    try:
+        return tuple(
+            _of_row(dict(zip(columns, row, strict=False)), path, number + 1 + rows.line_num)
+            for row in islice(rows, MOST_CAMERAS + 1)
+            if any(row) and not row[0].lstrip().startswith("#")
+        )
+    except csv.Error as error:
+        raise damaged(path, f"it is no table: {error}") from error
+
+
+def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
+    name = photo_path(row["name"])
+    pose = numbers_of([row.get(key, "") for key in _ANGLES], path, "the parameters", line)
+    terms = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+    px, py, *radial, t1, t2 = numbers_of(
+        [row.get(key) or "0" for key in terms], path, "the parameters", line
+    )
+    if not row.get("f"):
+        return GivenCamera(
+            name=name,
+            reason="the list has no focal length f: export internal/external camera parameters",
+        )
+    (focal,) = numbers_of([row["f"]], path, "the focal length", line)
+    if not focal > 0.0:
+        raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
+    rotation = _FROM_OPENGL @ _world_from_angles(*pose[3:]).T
+    return GivenCamera(
+        name=name,
+        lens=CentredLens(
+            focal_share=focal / _FULL_FRAME_MM,
+            off_middle=(px, py),
+            radial=tuple(radial),
+            tangential=(t1, t2),
+        ),
+        rotation=rotation,
+        translation=-rotation @ np.array(pose[:3]),
+    )
+
+
+def _world_from_angles(
+    heading_deg: float, pitch_deg: float, roll_deg: float
+) -> NDArray[np.float64]:
+    """World from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
+    h, p, r = (math.radians(value) for value in (-heading_deg, pitch_deg, roll_deg))
+    about_z = [[math.cos(h), -math.sin(h), 0.0], [math.sin(h), math.cos(h), 0.0], [0.0, 0.0, 1.0]]
+    about_x = [[1.0, 0.0, 0.0], [0.0, math.cos(p), -math.sin(p)], [0.0, math.sin(p), math.cos(p)]]
+    about_y = [[math.cos(r), 0.0, math.sin(r)], [0.0, 1.0, 0.0], [-math.sin(r), 0.0, math.cos(r)]]
+    return np.asarray(np.array(about_z) @ np.array(about_x) @ np.array(about_y))

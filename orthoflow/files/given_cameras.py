@@ -1,20 +1,16 @@
 """Orientations of photos that other programs found, turned from the convention of each into ours.
 
 What comes out has our axes (x right, y down, z forward) and our pixels (first centre at 0.5, 0.5),
-in the world of the file. Read here are `cameras.json` of a run, Bundler's file and RealityCapture's
-list; `camera_formats` knows who reads the rest.
+in the world of the file. `camera_formats` knows who reads what.
 """
 
 from __future__ import annotations
 
-import csv
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +18,8 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.containers import MOST_PIXELS
 from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
-from orthoflow.files.json_texts import parse_json
 from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_name
 from orthoflow.files.regular_files import open_text, reading, text_of_file
-from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
 # Of a model with the observations of each photo, which is read line by line, and of other files.
@@ -35,7 +29,6 @@ MOST_LINE: Final = 20_000_000
 _WHAT: Final = "a file of cameras"
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
-_FULL_FRAME_MM: Final = 36.0
 _ORTHONORMAL: Final = 1e-4
 # A lens that is so near to another one is the same to any matcher; beyond the other limit its
 # error shows in an orthoimage.
@@ -44,8 +37,6 @@ MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
 _FAR_PX: Final = 1e4
 _WIDEST_FITTED_DEG: Final = 355.0
-# Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
-_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,190 +307,3 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
 def _cut(number: int) -> str:
     text = str(number)
     return text if len(text) <= _LONGEST_NUMBER else f"{text[:_LONGEST_NUMBER]}..."
-
-
-def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
-    """Read the `cameras.json` of a run: OpenCV's pixels, X_camera = R X_world + t.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    try:
-        content: Any = parse_json(text_of(path))
-        entries: Mapping[str, Any] = dict(content["cameras"])
-        return tuple(
-            _of_json(name, dict(entry), path)
-            for name, entry in islice(entries.items(), MOST_CAMERAS + 1)
-        )
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise damaged(path, "it is no cameras.json of a run") from error
-
-
-def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
-    if entry["status"] != "ok":
-        return GivenCamera(name=name, reason=str(entry["status"]))
-    matrix = np.array(entry["K"], dtype=np.float64)
-    distortion = tuple(float(value) for value in entry["distortion"])
-    if matrix.shape != (3, 3) or len(distortion) != 5:
-        raise damaged(path, f"the lens of {name} must be K (3 x 3) and k1, k2, p1, p2, k3")
-    lens = Intrinsics(
-        width=int(entry["width"]),
-        height=int(entry["height"]),
-        fx=float(matrix[0, 0]),
-        fy=float(matrix[1, 1]),
-        cx=float(matrix[0, 2]) + HALF_PIXEL,
-        cy=float(matrix[1, 2]) + HALF_PIXEL,
-        distortion=distortion,
-        source="given",
-        skew=float(matrix[0, 1]) or None,
-    )
-    lens = checked_lens(lens, path, name)
-    rotation = np.array(entry["R_camera_from_world"], dtype=np.float64).ravel().tolist()
-    sigma_mm = entry.get("sigma_wall_mm")
-    return GivenCamera(
-        name=name,
-        lens=lens,
-        rotation=rotation_of(rotation, path, name),
-        translation=np.array(
-            numbers_of([str(v) for v in entry["t_camera_from_world"]], path, f"t of {name}")
-        ).reshape(3),
-        sigma_wall_m=None
-        if sigma_mm is None
-        else numbers_of([str(sigma_mm)], path, f"sigma_wall_mm of {name}")[0] / 1000.0,
-    )
-
-
-def bundler_count(path: Path) -> int:
-    """Return how many cameras a file of Bundler states.
-
-    Raises:
-        InputError: it does not.
-    """
-    words = list(islice(_words_of(path), 2))
-    counts = numbers_of(words, path, "the counts of cameras and points")
-    if len(counts) < 2 or not 0.0 <= counts[0] <= MOST_CAMERAS:
-        raise damaged(path, "it states no count of cameras")
-    return int(counts[0])
-
-
-def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
-    """Read Bundler's file: f, k1, k2, R and t of each camera, with the axes of OpenGL.
-
-    Its pixels count from the middle of the photo, y upwards.
-
-    Args:
-        path: the file.
-        names: of the photos, in its order.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    # What follows the cameras are points, which may be many.
-    words = list(islice(_words_of(path), 2 + 15 * len(names)))
-    found = []
-    for index, name in enumerate(names):
-        values = numbers_of(words[2 + 15 * index : 17 + 15 * index], path, f"camera {index}")
-        if len(values) < 15:
-            raise damaged(path, f"it ends within camera {index}")
-        focal, k1, k2 = values[:3]
-        if not focal > 0.0:
-            found.append(GivenCamera(name=name, reason="Bundler did not orient it"))
-            continue
-        found.append(
-            GivenCamera(
-                name=name,
-                lens=CentredLens(focal_px=focal, radial=(k1, k2, 0.0)),
-                rotation=_FROM_OPENGL @ rotation_of(values[3:12], path, name),
-                translation=_FROM_OPENGL @ np.array(values[12:15]),
-            )
-        )
-    return tuple(found)
-
-
-def _words_of(path: Path) -> Iterator[str]:
-    for line in lines_of(path):
-        if not line.lstrip().startswith("#"):
-            yield from line.split()
-
-
-_ANGLES: Final = ("x", "y", "alt", "heading", "pitch", "roll")
-
-
-def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
-    """Read RealityCapture's "internal/external camera parameters" (CSV).
-
-    The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
-    principal point in shares of that side from the middle; heading is clockwise from north (y),
-    pitch 0 looks straight down. Terms that are not in the list are zero; lines of comment may
-    stand anywhere.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    lines = text_of(path).splitlines()
-    heads = (
-        (number, line.lstrip("# "))
-        for number, line in enumerate(lines)
-        if {"name", "heading"} <= {word.strip() for word in re.split("[,;\t]", line.lstrip("# "))}
-    )
-    number, head = next(heads, (0, ""))
-    columns = [word.strip() for word in re.split("[,;\t]", head)]
-    missing = [name for name in ("name", *_ANGLES) if name not in columns]
-    if missing:
-        raise damaged(
-            path,
-            f"the column {missing[0]} is missing: expected RealityCapture's internal/external "
-            "camera parameters, #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
-        )
-    separator = next(mark for mark in ",;\t" if mark in head)
-    rows = csv.reader(lines[number + 1 :], delimiter=separator)
-    try:
-        return tuple(
-            _of_row(dict(zip(columns, row, strict=False)), path, number + 1 + rows.line_num)
-            for row in islice(rows, MOST_CAMERAS + 1)
-            if any(row) and not row[0].lstrip().startswith("#")
-        )
-    except csv.Error as error:
-        raise damaged(path, f"it is no table: {error}") from error
-
-
-def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
-    name = photo_path(row["name"])
-    pose = numbers_of([row.get(key, "") for key in _ANGLES], path, "the parameters", line)
-    terms = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-    px, py, *radial, t1, t2 = numbers_of(
-        [row.get(key) or "0" for key in terms], path, "the parameters", line
-    )
-    if not row.get("f"):
-        return GivenCamera(
-            name=name,
-            reason="the list has no focal length f: export internal/external camera parameters",
-        )
-    (focal,) = numbers_of([row["f"]], path, "the focal length", line)
-    if not focal > 0.0:
-        raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
-    rotation = _FROM_OPENGL @ _world_from_angles(*pose[3:]).T
-    return GivenCamera(
-        name=name,
-        lens=CentredLens(
-            focal_share=focal / _FULL_FRAME_MM,
-            off_middle=(px, py),
-            radial=tuple(radial),
-            tangential=(t1, t2),
-        ),
-        rotation=rotation,
-        translation=-rotation @ np.array(pose[:3]),
-    )
-
-
-def _world_from_angles(
-    heading_deg: float, pitch_deg: float, roll_deg: float
-) -> NDArray[np.float64]:
-    """World from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
-    h, p, r = (math.radians(value) for value in (-heading_deg, pitch_deg, roll_deg))
-    about_z = [[math.cos(h), -math.sin(h), 0.0], [math.sin(h), math.cos(h), 0.0], [0.0, 0.0, 1.0]]
-    about_x = [[1.0, 0.0, 0.0], [0.0, math.cos(p), -math.sin(p)], [0.0, math.sin(p), math.cos(p)]]
-    about_y = [[math.cos(r), 0.0, math.sin(r)], [0.0, 1.0, 0.0], [-math.sin(r), 0.0, math.cos(r)]]
-    return np.asarray(np.array(about_z) @ np.array(about_x) @ np.array(about_y))

@@ -497,7 +497,7 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"b.out": "# Bundle\n", "list.txt": "a.jpg\n"}, "b.out: it states no count"),
         ({"b.out": "1\n", "list.txt": "a.jpg\n"}, "b.out: it states no count"),
         ({"b.out": "1 0\n"}, "there is no such file"),
-        ({"b.out": "1 0\n", "l.txt": "a.jpg", "m.txt": "a.jpg"}, r"l.txt \(1 lines\), m.txt \(1"),
+        ({"b.out": "1 0\n", "l.txt": "a.jpg", "m.txt": "b.jpg"}, r"l.txt \(1 lines\), m.txt \(1"),
         ({"b.json": "{}", "c.json": "{}"}, "b.json, c.json holds no cameras"),
         ({f"{n}.jpg": "" for n in "abc"}, "a.jpg, b.jpg, c.jpg holds no cameras"),
         ({f"{n}.jpg": "" for n in "abcd"}, r"a.jpg, b.jpg, c.jpg and 1 more holds no cameras"),
@@ -523,7 +523,7 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "the rotation of a.jpg is no rotation matrix"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0\n"},
          "c.csv:2: the focal length of a.jpg must be positive, got 0"),
-        ({"c.csv": "name,heading,x,y,z\n"}, "the column alt is missing"),
+        ({"c.csv": "name,heading,x,y,z\n"}, "the column pitch is missing"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,zero,0,0,0,0,0,0\n"}, "c.csv:2: the parameters"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,four,0,0\n"}, "c.csv:2: the parameters"),
         ({"c.csv": HEAD + "x" * 200_000 + ",1\n"}, "c.csv: it is no table: field larger than"),
@@ -625,6 +625,12 @@ def test_lists_of_photos_may_have_blank_lines_and_capitals(tmp_path: Path) -> No
         ({"list.txt": "a.jpg\nb.jpg", "notes.txt": "x"}, ["a.jpg", "b.jpg"]),
         ({"list.txt": "a.jpg\nb.jpg", "other.txt": "c\nd"}, ["a.jpg", "b.jpg"]),
         ({"list.txt": "x.jpg", "photos.txt": "a.jpg\nb.jpg"}, ["a.jpg", "b.jpg"]),
+        ({"list.txt": "'a b.jpg'\n\"c d.jpg\"\n"}, ["a b.jpg", "c d.jpg"]),
+        ({"list.txt": "a.jpg\nb.jpg", "list_old.txt": "c.jpg\nd.jpg"}, ["a.jpg", "b.jpg"]),
+        ({"list_1.txt": "a.jpg\nb.jpg", "list_2.txt": "a.jpg 0 9\nb.jpg"}, ["a.jpg", "b.jpg"]),
+        ({"a_list.txt": "a.jpg\nb.jpg", "list_keys.txt": "a.key\nb.key"}, ["a.jpg", "b.jpg"]),
+        ({"LIST.txt": "c.jpg\nd.jpg", "bundle.out.list.txt": "a.tif\nb.tif"}, ["a.tif", "b.tif"]),
+        ({"list.txt": "a.jpg\nb.jpg", "bundle_001.out": "1 0\n"}, ["a.jpg", "b.jpg"]),
     ],
 )
 def test_the_list_of_bundler_is_the_one_with_as_many_names(
@@ -641,16 +647,25 @@ def test_the_list_of_bundler_is_the_one_with_as_many_names(
         "#cameras 1\n#name,x,y,alt,heading,pitch,roll,f\na.jpg,1,2,3,0,0,0,24\n",
         "# written today\n\nname;x;y;alt;heading;pitch;roll;f\n# a comment\na.jpg;1;2;3;0;0;0;24\n",
         "#name,x,y,alt,roll,pitch,heading,f,note\na.jpg,1,2,3,0,0,0,24,good\n",
+        "\ufeff#Name\tX\tY\tZ\tHeading\tPitch\tRoll\tF\r\na.jpg\t1\t2\t3\t0\t0\t0\t24\r\n",
     ],
-    ids=["few-columns", "semicolons", "other-order"],
+    ids=["few-columns", "semicolons", "other-order", "capitals"],
 )
+@pytest.mark.parametrize("suffix", [".csv", ".txt"])
 def test_columns_of_realitycapture_may_be_missing_and_lines_be_comments(
-    tmp_path: Path, text: str
+    tmp_path: Path, text: str, suffix: str
 ) -> None:
-    (given,) = read_given_cameras(write(tmp_path, {"cameras.csv": text}))
+    files: dict[str, str | bytes] = {f"export{suffix}": text, "notes.txt": "of the photos\n"}
+    (given,) = read_given_cameras(write(tmp_path, files))
     assert isinstance(given.lens, CentredLens)
     assert given.lens.of_size(WIDTH, HEIGHT)[0].fx == pytest.approx(24 / 36 * WIDTH)
     np.testing.assert_allclose(given.translation, [-1, 2, 3], atol=1e-12)
+
+
+def test_of_several_files_of_one_kind_one_must_be_named(tmp_path: Path) -> None:
+    files: dict[str, str | bytes] = {"a.xml": "<document/>", "b.xml": "<document/>"}
+    with pytest.raises(InputError, match=r"2 \.xml files, of which one must be named"):
+        read_given_cameras(write(tmp_path, files))
 
 
 def test_a_realitycapture_list_without_lenses_gives_the_reason(tmp_path: Path) -> None:
