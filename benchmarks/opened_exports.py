@@ -35,11 +35,11 @@ import rasterio
 import trimesh
 from click.testing import CliRunner
 from laspy.copc import CopcReader
+from orthoflow_plugins.plane.open3d_library import load_open3d
 from PIL import Image
 from pystac.validation import RegisteredValidator
 
 from orthoflow.cli.program import program
-from orthoflow.files.open3d_guard import load_open3d
 from tests.browser import IS_HERE, Page, started
 
 MM: Final = 25.4 / 72.0

@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
-from orthoflow.files.ortho_files import ortho_files
-from orthoflow.files.sidecars import frame_json, write_json
+from orthoflow.files.sidecars import frame_json, ortho_files, write_json
 from orthoflow.files.tiles.pyramid import write_tiles, write_viewer
 from orthoflow.geometry import WallFrame
 

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import json
+import os
 import re
+import stat
 import unicodedata
-from collections.abc import Iterable, Sequence
-from typing import Final, TypeAlias
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BufferedReader, TextIOWrapper
+from pathlib import Path
+from typing import Final, NoReturn, TypeAlias
+from xml.parsers import expat
+
+from orthoflow.errors import InputError
+from orthoflow.system import flags
 
 Value: TypeAlias = str | int | float | None
 
@@ -97,3 +108,191 @@ def _cell(value: Value) -> str:
         value = f"'{value}"
     value = _INNER_CELL.sub(lambda found: f"{found[0]}'", value)
     return '"{}"'.format(value.replace('"', '""'))
+
+
+def parse_json(text: str) -> object:
+    """Parse JSON.
+
+    Raises:
+        ValueError: it is no JSON, nested too deeply, or has a number of too many digits.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def json_bytes(value: object, *, indent: int | None) -> bytes:
+    r"""Write JSON as UTF-8 for people; halves of letters, which UTF-8 has not, as escapes.
+
+    Raises:
+        ValueError: it holds a number that is not finite.
+
+    >>> json_bytes(["\xe9", "\ud800"], indent=None).decode()
+    '["é", "\\ud800"]'
+    """
+    text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", "backslashreplace")
+
+
+def _refuse_constant(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def open_file(path: Path) -> BufferedReader:
+    """Open a file for reading, at once.
+
+    Raises:
+        OSError: it cannot be read, or is a folder, a pipe or a device.
+    """
+    descriptor = os.open(path, flags("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC"))
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "it is a folder, a pipe or a device", str(path))
+
+
+@contextmanager
+def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Iterator[None]:
+    """Say what is wrong with a file that is opened and read in here, as an `InputError`.
+
+    Args:
+        path: the file.
+        most_bytes: a larger one is not read.
+        what: it should be, e.g. `a title block (YAML)`.
+        way_out: for those whose file is too large.
+    """
+    try:
+        n_bytes = path.stat().st_size
+        if n_bytes > most_bytes:
+            raise InputError(
+                f"{path.name} has {n_bytes} bytes, {what} at most {most_bytes}{way_out}"
+            )
+        yield
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path.name} is no UTF-8 text: expected {what}; save it as UTF-8"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+
+
+def open_text(path: Path) -> TextIOWrapper:
+    """Open a text, UTF-8 with or without a mark at its beginning.
+
+    Raises:
+        OSError: it cannot be read, or is a folder, a pipe or a device.
+    """
+    return TextIOWrapper(open_file(path), encoding="utf-8-sig")
+
+
+def text_of_file(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> str:
+    """Read a text whole, with the arguments of `reading`.
+
+    Raises:
+        InputError: it cannot be read, is no text, or is too large.
+    """
+    with reading(path, most_bytes, what, way_out=way_out), open_text(path) as stream:
+        return stream.read()
+
+
+MOST_SVG_BYTES: Final = 16_000_000
+# What plotting libraries draw with; `a`, `script`, `foreignObject`, animations are not among them.
+_SVG_ELEMENTS: Final = frozenset(
+    [
+        *("svg", "g", "defs", "symbol", "use", "path", "rect", "circle", "ellipse", "line"),
+        *("polyline", "polygon", "text", "tspan", "textPath", "image", "title", "desc", "style"),
+        *("clipPath", "mask", "pattern", "marker", "linearGradient", "radialGradient", "stop"),
+        *("filter", "metadata"),
+    ]
+)
+# Of the description that libraries put into `metadata`.
+_ABOUT: Final = frozenset(
+    [
+        "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
+        "http://creativecommons.org/ns#",
+        "http://purl.org/dc/elements/1.1/",
+    ]
+)
+_SVG_NAMESPACE: Final = "http://www.w3.org/2000/svg"
+_INSIDE: Final = re.compile(r"#|data:image/(png|jpeg|webp|gif);base64,")
+_ELSEWHERE: Final = re.compile(r"""url\(\s*(?!["']?\s*#)|@import|image-set|\\""", re.IGNORECASE)
+
+
+class _ActiveError(Exception):
+    """Something in it is no drawing."""
+
+
+def is_plain_svg(content: bytes) -> bool:
+    """Whether a picture can be handed on as a file that people open.
+
+    Args:
+        content: the file; what is no SVG at all is no plain one.
+    """
+    if len(content) > MOST_SVG_BYTES:
+        return False
+    check = _SvgCheck()
+    parser = expat.ParserCreate(namespace_separator=" ")
+    parser.StartElementHandler = check.start
+    parser.EndElementHandler = check.end
+    parser.CharacterDataHandler = check.text
+    parser.StartDoctypeDeclHandler = _check_doctype
+    parser.XmlDeclHandler = _check_declaration
+    parser.ProcessingInstructionHandler = _refuse_instruction
+    try:
+        parser.Parse(content, True)  # noqa: FBT003 - of expat
+    except (expat.ExpatError, _ActiveError):
+        return False
+    return True
+
+
+class _SvgCheck:
+    """Looks at elements as they come."""
+
+    def __init__(self) -> None:
+        # A style comes in pieces, which mean something together only.
+        self._style: list[str] | None = None
+
+    def start(self, name: str, attributes: Mapping[str, str]) -> None:
+        namespace, _, local = name.rpartition(" ")
+        if namespace not in _ABOUT and (namespace != _SVG_NAMESPACE or local not in _SVG_ELEMENTS):
+            raise _ActiveError(name)
+        for key, value in attributes.items():
+            bare = key.rpartition(" ")[2].lower()
+            is_link = bare == "href" and namespace not in _ABOUT
+            if bare.startswith("on") or (is_link and not _INSIDE.match(value)):
+                raise _ActiveError(key)
+            _check_style(value)
+        if local == "style":
+            self._style = []
+
+    def text(self, piece: str) -> None:
+        if self._style is not None:
+            self._style.append(piece)
+
+    def end(self, _name: str) -> None:
+        if self._style is not None:
+            _check_style("".join(self._style))
+            self._style = None
+
+
+def _check_style(text: str) -> None:
+    """Check a style, or an attribute, many of which are styles."""
+    if _ELSEWHERE.search(text):
+        raise _ActiveError(text[:20])
+
+
+def _check_doctype(_name: str, _system: str | None, _public: str | None, is_own: int) -> None:
+    # Only its own one can define entities; that of SVG 1.1 is a word that nobody looks up.
+    if is_own:
+        raise _ActiveError("DOCTYPE")
+
+
+def _check_declaration(_version: str, encoding: str | None, _standalone: int) -> None:
+    # A browser reads it in that one, whatever was checked here.
+    if encoding is not None and encoding.lower() not in ("utf-8", "us-ascii"):
+        raise _ActiveError(encoding)
+
+
+def _refuse_instruction(target: str, _data: str) -> None:
+    raise _ActiveError(target)

@@ -13,8 +13,12 @@ from orthoflow_provenance.record import write_record
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
 from orthoflow.files.drawings.room_lines import DrawnWall
-from orthoflow.files.opening_files import publish_openings
-from orthoflow.files.publishing import publish_orthoimages, publish_planes, publish_walls
+from orthoflow.files.publishing import (
+    publish_openings,
+    publish_orthoimages,
+    publish_planes,
+    publish_walls,
+)
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import frame_over
 from orthoflow.products import (

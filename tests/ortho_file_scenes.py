@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.ortho_files import OrthoFile, ortho_files
 from orthoflow.files.publishing import publish_orthoimages
+from orthoflow.files.sidecars import OrthoFile, ortho_files
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages
 from tests import samples

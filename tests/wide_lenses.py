@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens
 
 
 def directions_of(lens: FisheyeLens) -> NDArray[np.float64]:

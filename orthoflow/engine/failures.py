@@ -14,7 +14,7 @@ from typing import Final
 from orthoflow.engine.checked_json import is_checked, with_digest
 from orthoflow.engine.durability import read_whole, write_whole
 from orthoflow.errors import StoreError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.sdk.lines import one_line
 
 # A reason stands in one column of a table; the record of the run has the whole sentence.

@@ -19,7 +19,7 @@ from orthoflow.engine.checked_json import is_checked, with_digest
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import RecordedFile, name_problem
 from orthoflow.errors import InputError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
 

@@ -26,7 +26,7 @@ from orthoflow.engine.kernels import kernel_sources
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import MappedPort, Method, mapped_port, port_specs
 from orthoflow.version import DISTRIBUTION

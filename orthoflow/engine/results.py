@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.checked_json import is_checked, with_digest
 from orthoflow.errors import StoreError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 
 # The words of a record, for the rest of the engine.
 __all__ = [

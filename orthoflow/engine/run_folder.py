@@ -21,7 +21,7 @@ from orthoflow.engine.clock import now, time_in_a_name
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.results import CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
-from orthoflow.files.regular_files import open_file
+from orthoflow.foreign_text import open_file
 from orthoflow.system import file_lock, flags
 
 JOURNAL: Final = "journal.jsonl"

@@ -69,7 +69,7 @@ from orthoflow.engine.objects import (
 from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
 from orthoflow.engine.store_folder import make_store
 from orthoflow.errors import DamageError, ProductError, StoreError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue, Payload, Product
 
 __all__ = [

@@ -37,8 +37,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from orthoflow.errors import GeometryError, InputError
-from orthoflow.files.fisheyes import WIDEST_DEG, FisheyeLens, problem_of
-from orthoflow.files.regular_files import text_of_file
+from orthoflow.files.cube_faces import WIDEST_DEG, FisheyeLens, problem_of
 from orthoflow.files.sidecars import write_text
 from orthoflow.files.yaml_positions import (
     Dialect,
@@ -52,6 +51,7 @@ from orthoflow.files.yaml_positions import (
     plain,
     read_yaml,
 )
+from orthoflow.foreign_text import text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 

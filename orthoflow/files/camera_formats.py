@@ -33,8 +33,8 @@ from orthoflow.files.given_cameras import (
     text_of,
 )
 from orthoflow.files.images import PHOTO_SUFFIXES
-from orthoflow.files.json_texts import parse_json
 from orthoflow.files.metashape import read_metashape_xml
+from orthoflow.foreign_text import parse_json
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError, InputError, PluginError
-from orthoflow.files.containers import MOST_PIXELS
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens, face_lens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     MOST_MODEL_BYTES,
@@ -33,9 +32,9 @@ from orthoflow.files.given_cameras import (
     photo_path,
     rotation_of,
 )
-from orthoflow.files.panoramas import face_lens
-from orthoflow.files.regular_files import open_file, reading
+from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.files.sidecars import write_text
+from orthoflow.foreign_text import open_file, reading
 from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 

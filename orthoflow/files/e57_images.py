@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.cube_faces import FACES, PanoramaFace, faces_of
 from orthoflow.files.given_cameras import GivenCamera
-from orthoflow.files.panoramas import FACES, PanoramaFace, faces_of
 from orthoflow.files.points.e57 import FORMAT, number_of, pose_of
 from orthoflow.files.points.libraries import load_library, reading
 from orthoflow.products import Intrinsics

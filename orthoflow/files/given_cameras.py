@@ -16,10 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.containers import MOST_PIXELS
-from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
-from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_name
-from orthoflow.files.regular_files import open_text, reading, text_of_file
+from orthoflow.files.cube_faces import (
+    FACE_FROM_CAMERA,
+    FACES,
+    PANORAMA_FROM_CAMERA,
+    FisheyeLens,
+    face_lenses,
+    face_name,
+    problem_of,
+)
+from orthoflow.files.photo_files import MOST_PIXELS
+from orthoflow.foreign_text import open_text, reading, text_of_file
 from orthoflow.products import Intrinsics
 
 # Of a model with the observations of each photo, which is read line by line, and of other files.

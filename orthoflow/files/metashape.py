@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.containers import MOST_PIXELS
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens, face_lens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     GivenCamera,
@@ -38,7 +37,7 @@ from orthoflow.files.given_cameras import (
     rotation_of,
     text_of,
 )
-from orthoflow.files.panoramas import face_lens
+from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Intrinsics
 
 MOST_TAGS: Final = 2_000_000

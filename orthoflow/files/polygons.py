@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.geotiff import SITE_CRS, SITE_CRS_WKT, epsg_of, local_crs_wkt
-from orthoflow.files.json_texts import json_bytes, parse_json
-from orthoflow.files.regular_files import open_file
 from orthoflow.files.sidecars import write_bytes
+from orthoflow.foreign_text import json_bytes, open_file, parse_json
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import ClassVar, Final, TypeVar
 
 from orthoflow.errors import InputError
-from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.sidecars import MOST_WALLS
+from orthoflow.foreign_text import text_of_file
 
 _MEASURED: Final = ("wall", "u_px", "v_px")
 _IN_MAP: Final = ("map_x", "map_y")

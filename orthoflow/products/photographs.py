@@ -101,7 +101,7 @@ class Photo:
         exif_focal_px: focal length from EXIF in pixels, or None.
         intrinsics: calibration if known, or None.
         mask: PNG of the same pixels, white where they may be used; None where all may
-            (`files.photo_masks`).
+            (`files.images`).
         camera: which camera and focal length took it, the same text for photos of one lens; empty
             where nobody knows.
         folder: of the file below the input, empty where all photos lie in one.

@@ -22,7 +22,7 @@ from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
 from orthoflow.engine.store import Store
 from orthoflow.errors import StoreError
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.records.input_files import embedded_inputs
 from orthoflow.records.published import PRODUCTS_FOLDER

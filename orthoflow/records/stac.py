@@ -12,10 +12,9 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from orthoflow.errors import ArgumentError
-from orthoflow.files.json_texts import json_bytes
-from orthoflow.files.raster_places import RasterPlace, place_of
+from orthoflow.files.geotiff import RasterPlace, place_of
 from orthoflow.files.sidecars import read_sidecar
-from orthoflow.foreign_text import shown
+from orthoflow.foreign_text import json_bytes, shown
 from orthoflow.products import JsonValue
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating

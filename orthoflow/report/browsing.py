@@ -14,8 +14,7 @@ import numpy as np
 
 from orthoflow.engine.run_folder import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
-from orthoflow.files.json_texts import parse_json
-from orthoflow.files.regular_files import open_file
+from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.alike import first_few
-from orthoflow.files.json_texts import parse_json
+from orthoflow.foreign_text import parse_json
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell

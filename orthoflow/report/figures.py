@@ -10,7 +10,7 @@ from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
-from orthoflow.files.plain_svg import is_plain_svg
+from orthoflow.foreign_text import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
 from orthoflow.records.run_files import figure_files, write_files

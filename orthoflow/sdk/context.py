@@ -25,7 +25,7 @@ from orthoflow.diagnostics import (
     warning_texts,
 )
 from orthoflow.errors import CancelledStepError, ProductError
-from orthoflow.files.plain_svg import MOST_BYTES, is_plain_svg
+from orthoflow.foreign_text import MOST_SVG_BYTES, is_plain_svg
 from orthoflow.sdk.lines import is_name, one_line
 from orthoflow.system import take_room
 
@@ -336,7 +336,7 @@ def _suffix(picture: bytes, name: str) -> str:
     if not is_plain_svg(picture):
         raise ProductError(
             f"figure {name} must be a PNG, a WebP or a plain SVG (no script, no link, no file from "
-            f"elsewhere, at most {MOST_BYTES // 1_000_000} MB), got what begins with "
+            f"elsewhere, at most {MOST_SVG_BYTES // 1_000_000} MB), got what begins with "
             f"{picture[:_HEAD_BYTES]!r}"
         )
     return ".svg"

@@ -18,11 +18,10 @@ from orthoflow.alike import first_few
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.containers import HOW_TO_DEVELOP
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
-from orthoflow.files.exif import read_exif
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
+from orthoflow.files.photo_files import HOW_TO_DEVELOP, read_exif
 from orthoflow.files.points.blocks import ScanFile
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points

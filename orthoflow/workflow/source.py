@@ -11,13 +11,13 @@ from pydantic_core import ErrorDetails
 
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
-from orthoflow.files.regular_files import open_file
 from orthoflow.files.yaml_positions import (
     Listing,
     Value,
     describe,
     plain,
 )
+from orthoflow.foreign_text import open_file
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.model import (
     FORMAT_TOO_NEW,

@@ -182,7 +182,7 @@ def orthoflow_products() -> list[ProductSpec]:
             "openings",
             "openings:Openings",
             "outlines of windows, doors and niches",
-            publisher="opening_files",
+            publisher="publishing",
         ),
         _product("inspection", "inspections:Inspection", "measured displacements"),
     ]

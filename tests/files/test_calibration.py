@@ -17,7 +17,7 @@ from orthoflow.files.calibration import (
     read_calibration,
     write_calibration,
 )
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Calibration, Intrinsics
 

@@ -17,17 +17,17 @@ from PIL import Image
 from rasterio.transform import Affine
 
 from orthoflow.errors import InputError
-from orthoflow.files.containers import (
+from orthoflow.files.images import decode_image, encode_jpeg
+from orthoflow.files.photo_files import (
     count_pages,
     damage,
     icc_profile,
     opaque_pixels,
     photo_format,
+    read_exif,
     stated_bits,
     stated_size,
 )
-from orthoflow.files.exif import read_exif
-from orthoflow.files.images import decode_image, encode_jpeg
 from tests import photo_files as made
 from tests.optional import skip_unless
 

@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoflow.files import exif
-from orthoflow.files.containers import icc_profile
-from orthoflow.files.exif import Exif, focal_length, read_exif
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
+from orthoflow.files.photo_files import Exif, focal_length, icc_profile, read_exif
 from tests import photo_files as made
 
 MAIN: dict[int, made.Value] = {
@@ -454,10 +452,3 @@ def test_the_pitch_is_the_mean_of_both_axes() -> None:
 )
 def test_the_maker_is_not_said_twice(make: str, model: str, camera: str) -> None:
     assert Exif(make=make, model=model).camera == camera
-
-
-@pytest.mark.parametrize(
-    ("value", "whole"), [(None, None), (0.9, None), (1.0, 1), (1.9, 1), (4000.0, 4000)]
-)
-def test_a_size_is_a_whole_number_of_pixels(value: float | None, whole: int | None) -> None:
-    assert exif._whole(value) == whole

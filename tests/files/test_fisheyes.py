@@ -10,17 +10,19 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.fisheyes import (
+from orthoflow.files.cube_faces import (
     FACE_FROM_CAMERA,
+    FACES,
     FisheyeFace,
     FisheyeLens,
+    PanoramaFace,
     _fold_rad,
     face_lenses,
+    faces_of,
     fisheye_faces,
     problem_of,
 )
 from orthoflow.files.images import decode_image, encode_png
-from orthoflow.files.panoramas import FACES, PanoramaFace, faces_of
 from tests.wide_lenses import directions_of
 
 # Wholly on its picture: a circle of 180 degrees is 464 pixels wide.

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.colmap import write_colmap_model
-from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses
+from orthoflow.files.cube_faces import FACE_FROM_CAMERA, FisheyeLens, face_lenses, face_picture
 from orthoflow.files.given_cameras import (
     MAX_LEFT_OUT_PX,
     NEGLIGIBLE_PX,
     CentredLens,
     GivenCamera,
 )
-from orthoflow.files.panoramas import face_picture
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.products import Camera, Cameras, Intrinsics
 from tests import scenes

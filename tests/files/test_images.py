@@ -13,7 +13,7 @@ from PIL import Image
 
 from orthoflow.errors import InputError, ProductError
 from orthoflow.files import images
-from orthoflow.files.containers import photo_format
+from orthoflow.files.photo_files import photo_format
 
 
 def blocks(rows: int, columns: int, side: int = 8) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import InputError
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.files.given_cameras import MAX_LEFT_OUT_PX, GivenCamera
 from orthoflow.files.metashape import read_metashape_xml
 from orthoflow.products import Intrinsics

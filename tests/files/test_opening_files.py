@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoflow.files.opening_files import publish_openings
+from orthoflow.files.publishing import publish_openings
 from orthoflow.products import Opening, Openings
 from tests.drawing_runs import WALL, box_openings
 

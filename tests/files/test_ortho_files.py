@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files import ortho_files as module
+from orthoflow.files import sidecars as module
 from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
-from orthoflow.files.ortho_files import OrthoFile, ortho_files
+from orthoflow.files.sidecars import OrthoFile, ortho_files
 from orthoflow.geometry import WallFrame
 
 ROWS, COLUMNS = 6, 9

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import decode_image, encode_png
-from orthoflow.files.panoramas import (
+from orthoflow.files.cube_faces import (
     FACES,
     MOST_PX,
     face_in,
@@ -18,6 +17,7 @@ from orthoflow.files.panoramas import (
     face_rays,
     faces_of,
 )
+from orthoflow.files.images import decode_image, encode_png
 
 WIDTH, HEIGHT = 512, 256
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.files.images import encode_png
-from orthoflow.files.photo_masks import before_masks, decode_mask
+from orthoflow.files.images import before_masks, decode_mask, encode_png
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.products import Photo
 

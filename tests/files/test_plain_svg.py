@@ -7,7 +7,7 @@ import io
 import matplotlib.pyplot as plt
 import pytest
 
-from orthoflow.files.plain_svg import is_plain_svg
+from orthoflow.foreign_text import is_plain_svg
 
 LINKS = 'xmlns:xlink="http://www.w3.org/1999/xlink"'
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from orthoflow.errors import InputError
-from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
-from orthoflow.files.raster_places import place_of
+from orthoflow.files.geotiff import GridPlace, place_of, write_orthoimage, write_raster
 from tests import photo_files
 
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files import wall_meshes as module
+from orthoflow.files import gltf as module
 from orthoflow.files.geotiff import GridPlace, write_raster
-from orthoflow.files.wall_meshes import WallMesh, flat_mesh, relief_mesh
+from orthoflow.files.gltf import WallMesh, flat_mesh, relief_mesh
 from orthoflow.geometry import WallFrame
 from tests import samples
 

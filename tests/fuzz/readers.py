@@ -26,11 +26,10 @@ from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
 from orthoflow.engine.store import Store
 from orthoflow.engine.stored_results import list_results
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
-from orthoflow.files.containers import damage, icc_profile
 from orthoflow.files.drawings.title_blocks import read_title_block
-from orthoflow.files.exif import focal_length, read_exif
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp
+from orthoflow.files.photo_files import damage, focal_length, icc_profile, read_exif
 from orthoflow.files.sidecars import frame_json, write_json
 from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, InputFiles

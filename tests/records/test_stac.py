@@ -13,8 +13,8 @@ from orthoflow_provenance.document import PublishedFile
 from pystac.validation import RegisteredValidator
 
 from orthoflow.errors import ArgumentError
+from orthoflow.files.geotiff import RasterPlace
 from orthoflow.files.publishing import publish_orthoimages
-from orthoflow.files.raster_places import RasterPlace
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages
 from orthoflow.records import stac

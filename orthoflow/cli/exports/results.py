@@ -107,7 +107,7 @@ def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write `prov.json`."""
-    from orthoflow.files.json_texts import json_bytes
+    from orthoflow.foreign_text import json_bytes
     from orthoflow.records.prov import count_things, prov_document
     from orthoflow.records.run_files import creating
 

@@ -19,8 +19,7 @@ from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.relief import Light, write_relief
 from orthoflow.files.gltf import write_page, write_room
-from orthoflow.files.ortho_files import OrthoFile, ortho_files
-from orthoflow.files.sidecars import placed_raster
+from orthoflow.files.sidecars import OrthoFile, ortho_files, placed_raster
 from orthoflow.files.tiles.iiif import MANIFEST, Canvas, Layer, write_manifest
 from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
 from orthoflow.products import Planes

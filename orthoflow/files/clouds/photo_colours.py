@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import decode_image
-from orthoflow.files.photo_masks import before_masks
+from orthoflow.files.images import before_masks, decode_image
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, PointCloud

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import InputError
-from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.yaml_positions import (
     Dialect,
     Position,
@@ -25,6 +24,7 @@ from orthoflow.files.yaml_positions import (
     describe,
     read_yaml,
 )
+from orthoflow.foreign_text import text_of_file
 
 MOST_BYTES: Final = 100_000
 MOST_LETTERS: Final = 300

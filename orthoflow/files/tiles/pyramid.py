@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_webp
-from orthoflow.files.ortho_files import OrthoFile
-from orthoflow.files.sidecars import numbers, write_bytes, write_text
+from orthoflow.files.sidecars import OrthoFile, numbers, write_bytes, write_text
 from orthoflow.products import JsonValue
 
 TILE_PX: Final = 512

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.photo_masks import used_pixels
+from orthoflow.files.images import used_pixels
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthoflow.files.photo_masks import before_masks
+from orthoflow.files.images import before_masks
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import (

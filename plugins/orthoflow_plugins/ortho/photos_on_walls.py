@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.files.containers import icc_profile, stated_bits
 from orthoflow.files.images import decode_image, decode_levels
+from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import MethodParams, Ports, StepContext

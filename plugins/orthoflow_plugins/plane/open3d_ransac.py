@@ -66,8 +66,8 @@ class Open3dRansac(Method):
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
-        from orthoflow.files.open3d_guard import load_open3d
         from orthoflow_plugins.plane.detecting import Detector, detect
+        from orthoflow_plugins.plane.open3d_library import load_open3d
 
         open3d = load_open3d(self.id)
         open3d.utility.random.seed(int(ctx.rng.integers(2**31)))

@@ -12,9 +12,8 @@ from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens, face_in
 from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reason
-from orthoflow.files.panoramas import face_in
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import PHOTO_SUFFIXES, encode_png
-from orthoflow.files.photo_masks import decode_mask
+from orthoflow.files.images import PHOTO_SUFFIXES, decode_mask, encode_png
 from orthoflow.files.polygons import NamedPolygon, filled, read_polygons
 from orthoflow.sdk import StepContext
 

@@ -22,30 +22,38 @@ from orthoflow.files.calibration import (
     read_calibration,
 )
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.containers import (
-    HOW_TO_DEVELOP,
-    HOW_TO_READ_HEIC,
-    READABLE,
-    count_pages,
-    damage,
-    opaque_pixels,
-    opened,
-    photo_format,
-    stated_bits,
+from orthoflow.files.cube_faces import (
+    FisheyeFace,
+    FisheyeLens,
+    PanoramaFace,
+    faces_of,
+    fisheye_faces,
 )
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
-from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
-from orthoflow.files.fisheyes import FisheyeFace, FisheyeLens, fisheye_faces
 from orthoflow.files.images import (
     PHOTO_SUFFIXES,
     RAW_SUFFIXES,
     decode_image,
     decode_levels,
+    decode_mask,
     encode_png,
 )
-from orthoflow.files.panoramas import PanoramaFace, faces_of
-from orthoflow.files.photo_masks import decode_mask
+from orthoflow.files.photo_files import (
+    HOW_TO_DEVELOP,
+    HOW_TO_READ_HEIC,
+    READABLE,
+    Exif,
+    FocalLength,
+    count_pages,
+    damage,
+    focal_length,
+    opaque_pixels,
+    opened,
+    photo_format,
+    read_exif,
+    stated_bits,
+)
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from orthoflow.files.ortho_files import OrthoFile
+from orthoflow.files.sidecars import OrthoFile
 from orthoflow.files.tiles import pyramid
 from orthoflow.files.tiles.pyramid import halved, write_tiles, write_viewer
 from tests.browser import Page

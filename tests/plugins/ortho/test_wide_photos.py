@@ -12,7 +12,7 @@ from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
 
-from orthoflow.files.fisheyes import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from orthoflow.products import InputFiles, Layer, LayerMask

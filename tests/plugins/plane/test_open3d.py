@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.plane import open3d_ransac
+from orthoflow_plugins.plane import open3d_library, open3d_ransac
+from orthoflow_plugins.plane.open3d_library import load_open3d
 from orthoflow_plugins.plane.open3d_patches import Open3dPatches
 from orthoflow_plugins.plane.open3d_ransac import Open3dRansac
 from orthoflow_plugins.plane.ransac import Ransac
 
 from orthoflow.errors import PluginError
-from orthoflow.files import open3d_guard
-from orthoflow.files.open3d_guard import load_open3d
 from orthoflow.geometry import angle_between_deg
 from orthoflow.sdk import Method, StepContext
 from tests.plane_scenes import ROOM, cloud_of, context, sampled
@@ -82,7 +81,7 @@ def test_an_open3d_that_does_not_load_is_one_sentence(monkeypatch: pytest.Monkey
             raise OSError("libGL.so.1: cannot open shared object file\nmore")
         return SimpleNamespace(get_library_path=lambda: "nowhere.so")
 
-    monkeypatch.setattr(open3d_guard, "import_module", fail)
+    monkeypatch.setattr(open3d_library, "import_module", fail)
     with pytest.raises(PluginError, match=r"does not load \(libGL\.so\.1: .* file\): install the"):
         load_open3d("plane.x")
 

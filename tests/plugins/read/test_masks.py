@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.read.photos import ReadPhotos
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import encode_jpeg, encode_png
-from orthoflow.files.photo_masks import used_pixels
+from orthoflow.files.images import encode_jpeg, encode_png, used_pixels
 from orthoflow.files.polygons import MOST_BYTES
 from orthoflow.products import InputFiles, Photo
 from tests import raster_scenes as scenes

@@ -15,8 +15,14 @@ from PIL import Image
 from rasterio.transform import Affine
 
 from orthoflow.errors import CancelledStepError, InputError
-from orthoflow.files.images import decode_image, decode_levels, encode_jpeg, encode_png, encode_webp
-from orthoflow.files.photo_masks import used_pixels
+from orthoflow.files.images import (
+    decode_image,
+    decode_levels,
+    encode_jpeg,
+    encode_png,
+    encode_webp,
+    used_pixels,
+)
 from orthoflow.products import InputFiles, Photo
 from orthoflow.sdk import StepContext
 from tests import photo_files as made
