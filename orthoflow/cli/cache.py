@@ -77,7 +77,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
     metavar="DAYS",
     help="Also remove results that no run used for so many days; 0 removes all.",
 )
-@click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
+@click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option
 def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: bool) -> int:
     """Remove incomplete results, products that no result needs, and what killed runs left."""

@@ -1,4 +1,4 @@
-"""`orthoflow check`: say everything that is wrong with a workflow file."""
+"""`orthoflow check`: report everything that is wrong with a workflow file."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 @workflow_arguments
 @json_option
 def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
-    """Say everything that is wrong with WORKFLOW, a file or the name of a shipped one.
+    """Report everything that is wrong with WORKFLOW, a file or the name of a shipped one.
 
     Every problem is named in one pass, as file:line:column: path: message; input files are looked
-    for as well. Warnings say what is allowed and can hardly be meant. Ends with 2 when something is
+    for as well. Warnings name what is allowed but hardly intended. Ends with 2 when something is
     wrong, with 4 when a plugin is missing.
     """
     if not as_json:

@@ -1,4 +1,4 @@
-"""`orthoflow compare`: lay two runs side by side."""
+"""`orthoflow compare`: compare two runs."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ _READDRESSED_MOST: Final = 3
 @click.option("--all", "is_whole", is_flag=True, help="Print every row that differs, rounding too.")
 @json_option
 def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: bool) -> int:
-    """Lay the runs A and B, run folders or their run.h5, side by side.
+    """Compare the runs A and B, run folders or their run.h5.
 
-    Says in what their inputs, workflows, parameters, versions and environments differ, and how
-    far their metrics and products lie apart. A parameter with * was set, others are defaults.
-    Steps are the same when their addresses are, or else when all that varies on their way has one
-    method with the same parameters; what only one run has is counted apart. Of long tables
-    the first rows are printed, of metrics those that say how good results are, none of rounding
-    (a millionth), and what is said alike of many steps or repeats is one row. --json has also what
-    is equal. Ends with 3 where the seal of a record does not hold; of large arrays, which
-    are not read where digests are equal, `orthoflow verify` says so.
+    Shows the differences of inputs, workflows, parameters, versions and environments, and how far
+    metrics and products differ. A parameter with * was set, others are defaults. Steps are
+    paired by address, else by methods and parameters of everything that varies before them; what
+    only one run has is counted separately. Of long tables the first rows are printed, of metrics
+    those that show how good results are; differences by rounding (a millionth) are left out, and
+    equal differences of many steps or repeats are one row. --json also has what is equal. Ends
+    with 3 where the seal of a record does not hold; large arrays, which are not read where
+    digests are equal, are checked by `orthoflow verify`.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.comparison import compare_runs

@@ -18,7 +18,7 @@ from orthoflow.version import __version__
 @store_option
 @json_option
 def doctor(store: Path, *, as_json: bool) -> int:
-    """Say what is installed, what is missing, and what that costs.
+    """Show what is installed, what is missing, and what that costs.
 
     Ends with 4 when something is missing without which nothing works.
     """

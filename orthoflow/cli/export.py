@@ -39,7 +39,7 @@ _HELP: Final = "\n\n".join(
         (
             "--embed: run.h5 alone, which verifies and replays without any other file; what it "
             "lacks so far comes from the store and from the input files, found by content, under "
-            "any name: where --input says, else as `replay` finds them."
+            "any name: where --input points, else as `replay` finds them."
         ),
         (
             "--split: of a run on several datasets a run folder each, with record, report and "
@@ -72,7 +72,7 @@ _HELP: Final = "\n\n".join(
     metavar="ADDRESS",
     help="colmap: the step whose orientations are meant; without it the last one that oriented "
     "photos. laz, copc, ply, e57: the step that found the planes; without it the last one that "
-    "did. layers: the step that laid photos onto walls, likewise. figures: the only step that is "
+    "did. layers: the step that projected photos onto walls, likewise. figures: the only step that is "
     "meant. gltf, tiles, sheet, dxf, geojson: the step that made the orthoimages, likewise.",
 )
 @click.option(

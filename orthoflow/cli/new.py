@@ -43,8 +43,8 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     """Look at each FILE, or what lies in a folder, and write a commented workflow for them.
 
     Scans, photos, a calibration, check points, ties measured by hand, cameras of other programs
-    and their orthoimages are told by their content. The workflow is a shipped one that names
-    them; it is yours to change.
+    and their orthoimages are recognised by their content. The workflow is a shipped one that
+    names them; change it as you like.
     """
     from orthoflow.cli.progress import working_on
 

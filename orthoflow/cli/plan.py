@@ -1,4 +1,4 @@
-"""`orthoflow plan`: say which steps would run, which are cached, and why."""
+"""`orthoflow plan`: show which steps would run, which are cached, and why."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def plan(
     # Any: the fields of RunOptions, whose types click has checked.
     **selection: Any,
 ) -> int:
-    """Say for every step of WORKFLOW whether its result is stored, and if not, why it would run.
+    """Show for every step of WORKFLOW whether its result is stored, and if not, why it would run.
 
     Nothing is computed. "unknown yet" means that it depends on results that are not there yet;
     some of its own are stored, and it may be one of these.

@@ -458,18 +458,18 @@ def plugins_new(
 @click.option(
     "--quick",
     is_flag=True,
-    help="Leave out what takes more than two runs of the method; what that is, is said.",
+    help="Leave out what takes more than two runs of the method, and name it.",
 )
 @json_option
 def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: bool) -> int:
-    """Run every conformance check that applies to the method ID, and say which rules it breaks.
+    """Run every conformance check that applies to the method ID, and report the rules it breaks.
 
     With `--quick` those while you write it: parameters, outputs, inputs left as they were, progress
     and cancelling, two runs on one core and on two, clouds that must be refused. The others, before
     you hand it on: a run in a new process and an empty folder, wild input, what is known of the
     example.
 
-    What stops every run is told once, and other rules are skipped. Ends with 1 when a rule
+    What stops every run is reported once, and other rules are skipped. Ends with 1 when a rule
     is broken, with 4 when the method cannot be loaded. What still stands as `plugins new` wrote it
     is named, and breaks no rule.
     """

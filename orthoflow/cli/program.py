@@ -19,23 +19,23 @@ from orthoflow.version import __version__
 
 _SUMMARIES: Final = {
     "new": "Write a first workflow for your own files.",
-    "check": "Say everything that is wrong with a workflow file.",
-    "plan": "Say which steps would run, which are cached, and why.",
+    "check": "Report everything that is wrong with a workflow file.",
+    "plan": "Show which steps would run, which are cached, and why.",
     "graph": "Draw a workflow as a Mermaid graph.",
     "run": "Run a workflow; makes orthoimages, report and record.",
     "show": "Summarise a finished run.",
     "runs": "List the runs below a folder: when, how good, in what they differ.",
-    "compare": "Lay two runs side by side: what differs, and how far.",
+    "compare": "Compare two runs: what differs, and how far.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",
     "sign": "Sign a record with your key, for those who verify it.",
-    "replay": "Make a run again from its record and say what came out differently.",
+    "replay": "Make a run again from its record and show what differs.",
     "export": "Write a run's results for other programs.",
     "plugins": "List, show and check methods, and write a plugin of your own.",
     "schema": "Print the JSON Schema of workflow files.",
     "warm": "Compile beforehand what runs would compile.",
     "cache": "List, check or clean the store of results.",
-    "doctor": "Say what is installed, what is missing, and what that costs.",
+    "doctor": "Show what is installed, what is missing, and what that costs.",
 }
 
 _HELP: Final = """Make orthoimages of walls from laser scans and free-hand photographs, with methods

@@ -29,7 +29,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     Without -o it lies in the run's folder, with figures/ beside it: the figures as PNG or
     SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
     Of two runs it compares products, too, those that records only name from the store.
-    Where a record's seal does not hold, the page says so, and this ends with 3.
+    Where a record's seal does not hold, the page states it, and this ends with 3.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.runs import REPORT_FILE

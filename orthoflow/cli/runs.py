@@ -101,13 +101,13 @@ def runs(
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
 
-    A row says when a run was made, with which workflow, how it ended, how good its baseline is
+    A row states when a run was made, with which workflow, how it ended, how good its baseline is
     (of several datasets, the median), and which parameters and inputs differ from those of other
     runs of the workflow. What --split wrote into a run is listed where its folder is named. Runs
-    without a record, and records that cannot be read, say why.
+    without a record, and records that cannot be read, state why.
     --table FILE joins the runs named, or those below the folders named, into one table with a row
     per cell and metric: what was computed with the same methods, parameters, seeds and data in
-    several of them is one cell, and `environments` says on how many machines.
+    several of them is one cell, and `environments` counts the machines.
     """
     table, page = chosen.pop("table"), chosen.pop("page")
     if table is not None:

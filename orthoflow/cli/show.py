@@ -53,10 +53,10 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
 
-    Of many metrics those that say how good results are are printed, with --all every one; of a
+    Of many metrics those that show how good results are are printed, with --all every one; of a
     comparison a row per combination of variants, over datasets with their medians. Of a
     folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
-    the record does not hold; of large arrays, which are not read, `orthoflow verify` says so.
+    the record does not hold; large arrays, which are not read, are checked by `orthoflow verify`.
     """
     from orthoflow.engine.run_folder import RECORD_FILE
     from orthoflow.records.unfinished import open_run

@@ -38,7 +38,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     every cache key, compares what repeats the document with it, and the published files and report
     pages beside the record with what was written. Files that are missing, or that the record does
     not name, and a report that was changed are noted; with --strict they fail. Figures beside the
-    report, and what else lies in the folder, logs, say, are not covered. With --signer the record
+    report, and other files in the folder, such as logs, are not covered. With --signer the record
     must be signed with that key.
     Ends with 3 when something differs, or RUN is no record or of another version.
     """

@@ -382,10 +382,10 @@ class StepSection(CallSection):
 
 
 class DatasetSection(BaseModel):
-    """What hangs on the data runs once per dataset, with `data=<name>` first in its address; all
+    """What depends on the data runs once per dataset, with `data=<name>` first in its address; all
     else runs once. An input that a dataset does not name is that of the workflow. Instead of the
     mapping there may be a CSV file with a line per dataset: the column `name`, a column per input,
-    and columns such as `room.noise_m` for parameters; an empty place says nothing, and relative
+    and columns such as `room.noise_m` for parameters; an empty field sets nothing, and relative
     paths start at the CSV file. `--datasets FILE` takes the place of the section, `--only-data A,B`
     chooses among the names.
     """  # noqa: D205
