@@ -72,8 +72,8 @@ _HELP: Final = "\n\n".join(
     metavar="ADDRESS",
     help="colmap: the step whose orientations are meant; without it the last one that oriented "
     "photos. laz, copc, ply, e57: the step that found the planes; without it the last one that "
-    "did. layers: the step that projected photos onto walls, likewise. figures: the only step that is "
-    "meant. gltf, tiles, sheet, dxf, geojson: the step that made the orthoimages, likewise.",
+    "did. layers: the step that projected photos onto walls, likewise. figures: the only step "
+    "that is meant. gltf, tiles, sheet, dxf, geojson: that of the orthoimages, likewise.",
 )
 @click.option(
     "--license",

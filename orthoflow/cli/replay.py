@@ -62,9 +62,9 @@ def replay(
     """Make RUN, a run folder or its run.h5, again from its record and its input files.
 
     Takes workflow, parameters and seeds as recorded. The inputs come from the record, if they are
-    in it, or are found by content, under any name: where --input points, else at the places that the
-    workflow names, beside the run, here, and where the store in .orthoflow saw them last.
-    What is missing or not as it was is named before anything runs. States of every product whether
+    in it, or are found by content, under any name: where --input points, else where the workflow
+    names them, beside the run, here, and where the store in .orthoflow saw them last.
+    What is missing or not as it was is named before anything runs. States for every product whether
     it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
     differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
     whose products are identical or whose method's code has changed: by more than a millionth, or a
