@@ -308,6 +308,10 @@ def _fits(name: str, values: NDArray[np.float64]) -> bool:
     if finite.min() < 0.0 or finite.max() > 65535.0:
         return False
     is_whole = bool(np.all(finite == np.rint(finite)))
+    largest = finite.max(axis=0)
+    if (largest > 255.0).any() and not (largest > 255.0).all():
+        # Channels of other depth: one of them is an intensity.
+        return False
     return (is_whole and not (is_unit and finite.max() <= 1.0)) or (
         finite.max() <= 1.0 and not is_unit
     )

@@ -35,7 +35,10 @@ LAS: Final = Format(name="LAS/LAZ", suffixes=(".las", ".laz"), signatures=(b"LAS
 PLY: Final = Format(name="PLY", suffixes=(".ply",), signatures=(b"ply\n", b"ply\r", b"ply "))
 PCD: Final = Format(name="PCD", suffixes=(".pcd",), signatures=(b"# .PCD",))
 PTX: Final = Format(name="PTX", suffixes=(".ptx",))
-TEXT: Final = Format(name="text", suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts"))
+TEXT: Final = Format(
+    name="text",
+    suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb", ".tsv"),
+)
 _SNIFFED_BYTES: Final = 4096
 _PCD_HEADER: Final = re.compile(rb"(?im)^[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]")
 FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)

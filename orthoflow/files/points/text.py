@@ -219,7 +219,9 @@ def _unknown_columns(
 
 
 def _labels(header: str) -> list[str]:
-    return [unquoted(field) for field in split_fields(header.lstrip(_COMMENT))[0]]
+    # A semicolon begins a comment, unless it parts columns of which the first has no name.
+    stripped = header.lstrip(_COMMENT if header.count(";") == 1 else _COMMENT.replace(";", ""))
+    return [unquoted(field) for field in split_fields(stripped)[0]]
 
 
 def _first_lines(path: Path) -> list[str]:

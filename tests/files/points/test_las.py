@@ -15,23 +15,6 @@ from tests import scan_files
 from tests.scan_files import read_all
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_gives_survey_coordinates_to_the_last_digit(
-    tmp_path: Path, points: NDArray[np.float64], suffix: str
-) -> None:
-    shifted = points + np.array([634512.0, 5486215.0, 112.0])
-    intensity = np.arange(40) * 100
-    rgb = np.arange(120).reshape(40, 3) * 257
-    path = scan_files.write_las(tmp_path / f"a{suffix}", shifted, intensity=intensity, rgb=rgb)
-    scan = open_scan(path)
-    (block,) = scan.read()
-    np.testing.assert_allclose(block.points, shifted, atol=1e-9)
-    np.testing.assert_array_equal(block.intensity, intensity)
-    np.testing.assert_array_equal(block.rgb, rgb)
-    assert scan.fields == {"intensity", "rgb"}
-    assert scan.n_most == 40
-
-
 def test_las_leaves_out_points_marked_as_deleted(
     tmp_path: Path, points: NDArray[np.float64]
 ) -> None:
@@ -58,34 +41,6 @@ def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
     assert sum(block.n_read for block in blocks) == 60_000
     assert sum(block.left_out["withheld"] for block in blocks) == withheld.sum()
     assert sum(block.left_out["other_class"] for block in blocks) == (~wanted & ~withheld).sum()
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_blocks_keep_the_order_of_the_file(
-    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Four chunks of 50 000 points, the last one not full; one to a block.
-    many = np.random.default_rng(0).uniform(0, 5, (170_000, 3))
-    path = scan_files.write_las(tmp_path / f"a{suffix}", many, withheld=np.arange(170_000) == 9)
-    monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
-    blocks = list(open_scan(path).read())
-    assert [block.n_read for block in blocks] == [50_000, 50_000, 50_000, 20_000]
-    found = np.concatenate([block.points for block in blocks])
-    np.testing.assert_allclose(found, np.delete(many, 9, axis=0), atol=6e-5)
-    for block in blocks:
-        assert block.bounds is not None
-        np.testing.assert_array_equal(block.bounds[0], block.points.min(axis=0))
-        np.testing.assert_array_equal(block.bounds[1], block.points.max(axis=0))
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
-def test_a_las_file_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, share: float) -> None:
-    many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
-    path = scan_files.write_las(tmp_path / f"a{suffix}", many)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    with pytest.raises(InputError, match=rf"a\{suffix} (cannot be read|is cut off)"):
-        read_all(path)
 
 
 @pytest.mark.parametrize("seed", range(12))

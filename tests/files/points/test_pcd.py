@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan, pcd, tables
+from orthoflow.files.points import open_scan
 from orthoflow.files.points.lzf_kernels import decompress_lzf
 from tests import scan_files
 from tests.scan_files import read_all
@@ -27,20 +27,6 @@ def pcd_fields(points: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
     }
 
 
-@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
-def test_pcd_gives_its_points(tmp_path: Path, points: NDArray[np.float64], data: str) -> None:
-    fields = pcd_fields(points)
-    path = scan_files.write_pcd(tmp_path / "a.pcd", fields, data=data, width=8)
-    (block,) = read_all(path)
-    expected = np.column_stack([fields["x"], fields["y"], fields["z"]])
-    np.testing.assert_array_equal(block.points, expected.astype(np.float64))
-    index = np.arange(40)
-    np.testing.assert_array_equal(block.rgb, np.column_stack([index, index + 1, index + 2]))
-    np.testing.assert_array_equal(block.intensity, fields["intensity"])
-    np.testing.assert_array_equal(block.row, index // 8)
-    np.testing.assert_array_equal(block.column, index % 8)
-
-
 def test_texts_keep_the_digits_that_their_type_has_no_room_for(
     tmp_path: Path, points: NDArray[np.float64]
 ) -> None:
@@ -51,25 +37,6 @@ def test_texts_keep_the_digits_that_their_type_has_no_room_for(
     path.write_bytes(b"".join(first[:2]) + b"500000.01 " + behind)
     (block,) = read_all(path)
     assert block.points[0, 0] == 500_000.01
-
-
-@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
-def test_the_grid_of_a_pcd_goes_on_from_block_to_block(
-    tmp_path: Path, points: NDArray[np.float64], data: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points), data=data, width=8)
-    for module in (pcd, tables):
-        monkeypatch.setattr(module, "BLOCK_POINTS", 15)
-    blocks = read_all(path)
-    assert [block.n_read for block in blocks] == [15, 15, 10]
-    index = np.arange(40)
-    rows, columns, greys = (
-        np.concatenate([getattr(block, name) for block in blocks])
-        for name in ("row", "column", "intensity")
-    )
-    np.testing.assert_array_equal(rows, index // 8)
-    np.testing.assert_array_equal(columns, index % 8)
-    np.testing.assert_array_equal(greys, index // 4)
 
 
 def test_a_grid_of_one_column_has_as_many_rows_as_points(
@@ -126,23 +93,6 @@ def test_pcd_colours_may_be_integers_and_the_sensor_may_stand_somewhere(
     np.testing.assert_array_equal(opened.scans[0].station, [1.0, 2.0, 3.0])
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ("ascii", r"a\.pcd is cut off"),
-        ("binary", r"a\.pcd is cut off"),
-        ("binary_compressed", r"a\.pcd is cut off: its compressed data holds \d+ bytes"),
-    ],
-)
-def test_a_pcd_file_that_is_cut_off_is_refused(
-    tmp_path: Path, points: NDArray[np.float64], data: str, message: str
-) -> None:
-    path = scan_files.write_pcd(tmp_path / "a.pcd", pcd_fields(points), data=data)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(InputError, match=message):
-        read_all(path)
-
-
 def test_a_damaged_compressed_pcd_file_is_refused(
     tmp_path: Path, points: NDArray[np.float64]
 ) -> None:
@@ -173,16 +123,6 @@ def test_pcd_headers_that_make_no_sense_are_refused(
         open_scan(path)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_lzf_gives_back_what_was_packed(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    plain = rng.integers(0, 2 + 60 * seed, 5000).astype(np.uint8)
-    packed = np.frombuffer(scan_files.compress_lzf(plain.tobytes()), np.uint8)
-    unpacked = np.zeros(5000, np.uint8)
-    assert decompress_lzf(packed, unpacked) == 5000
-    np.testing.assert_array_equal(unpacked, plain)
-
-
 # Nothing checks indices in compiled code: each case is tried in arrays that go on behind their end.
 GUARD = 0xAA
 
@@ -197,52 +137,6 @@ def unpack(packed: list[int], n_plain: int) -> tuple[int, list[int]]:
     said = decompress_lzf(source, memory[:n_plain])
     assert (memory[n_plain:] == GUARD).all()
     return int(said), memory[:n_plain].tolist()
-
-
-@pytest.mark.parametrize("count", [1, 2, 31, 32])
-def test_lzf_literals_fit_exactly_or_not_at_all(count: int) -> None:
-    literals = list(range(1, count + 1))
-    packed = [count - 1, *literals]
-    assert unpack(packed, count) == (count, literals)
-    assert unpack(packed, count + 1) == (count, [*literals, GUARD])
-    assert unpack(packed, count - 1)[0] == -1
-    assert unpack(packed[:-1], count)[0] == -1
-
-
-@pytest.mark.parametrize("length", [3, 8, 9, 10, 263, 264])
-def test_lzf_back_references_fit_exactly_or_not_at_all(length: int) -> None:
-    # Three literals, then a reference to the first of them; from nine bytes on the length takes a
-    # byte of its own.
-    long = [7 << 5, length - 9, 2] if length >= 9 else [(length - 2) << 5, 2]
-    packed = [2, 11, 12, 13, *long]
-    repeated = [11, 12, 13] * 90
-    whole = repeated[: 3 + length]
-    assert unpack(packed, 3 + length) == (3 + length, whole)
-    assert unpack(packed, 4 + length) == (3 + length, [*whole, GUARD])
-    assert unpack(packed, 2 + length)[0] == -1
-    for n_missing in range(1, len(long)):
-        assert unpack(packed[:-n_missing], 3 + length)[0] == -1
-
-
-@pytest.mark.parametrize("distance", [1, 2, 256, 257, 8191, 8192])
-def test_lzf_back_references_reach_the_first_byte_and_none_before(distance: int) -> None:
-    literals = [1 + k % 150 for k in range(distance)]
-    packed: list[int] = []
-    for start in range(0, distance, 32):
-        part = literals[start : start + 32]
-        packed += [len(part) - 1, *part]
-    reference = [(1 << 5) | ((distance - 1) >> 8), (distance - 1) & 255]
-    whole = (literals * 4)[: distance + 3]
-    assert unpack(packed + reference, distance + 3) == (distance + 3, whole)
-    # One literal less: the same reference points before the first byte.
-    shorter = [*packed[: -(len(part) + 1)], *([len(part) - 2, *part[1:]] if len(part) > 1 else [])]
-    assert unpack(shorter + reference, distance + 2)[0] == -1
-
-
-def test_lzf_data_without_anything_give_nothing() -> None:
-    assert unpack([], 0) == (0, [])
-    assert unpack([], 2) == (0, [GUARD, GUARD])
-    assert unpack([0], 2)[0] == -1
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import open_scan, ply
+from orthoflow.files.points import open_scan
 from tests import scan_files
 from tests.scan_files import read_all, read_points
 
@@ -17,28 +17,6 @@ EMPTY_PLY = (
     "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
     "property float z\nend_header\n"
 )
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_ply_gives_its_vertices(tmp_path: Path, points: NDArray[np.float64], encoding: str) -> None:
-    fields = {
-        "x": points[:, 0],
-        "y": points[:, 1],
-        "z": points[:, 2].astype(np.float32),
-        "nx": np.zeros(40, np.float32),
-        "red": np.arange(40, dtype=np.uint8),
-        "green": np.arange(40, dtype=np.uint8) + np.uint8(1),
-        "blue": np.arange(40, dtype=np.uint8) + np.uint8(2),
-        "scalar_Intensity": np.arange(40, dtype=np.float32),
-    }
-    scan = open_scan(scan_files.write_ply(tmp_path / "a.ply", fields, encoding=encoding))
-    (block,) = scan.read()
-    np.testing.assert_allclose(block.points[:, :2], points[:, :2], atol=0)
-    np.testing.assert_allclose(block.points[:, 2], points[:, 2], atol=1e-6)
-    np.testing.assert_array_equal(block.rgb[:, 2], np.arange(40) + 2)  # type: ignore[index]
-    np.testing.assert_array_equal(block.intensity, np.arange(40))
-    assert scan.scans[0].rgb_limit == 255.0
-    assert scan.fields == {"intensity", "rgb"}
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -56,41 +34,6 @@ def test_ply_elements_before_the_vertices_are_skipped(
         tmp_path / "a.ply", fields, encoding=encoding, before=before, before_data=data
     )
     np.testing.assert_array_equal(read_points(path), points)
-
-
-@pytest.mark.parametrize("n_before", [3, 4, 5])
-def test_many_lines_before_the_vertices_are_skipped_in_blocks(
-    tmp_path: Path, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch, n_before: int
-) -> None:
-    monkeypatch.setattr(ply, "BLOCK_POINTS", 2)
-    path = scan_files.write_ply(
-        tmp_path / "a.ply",
-        dict(zip("xyz", points.T, strict=True)),
-        encoding="ascii",
-        before=f"element strip {n_before}\nproperty uchar kind",
-        before_data=b"1\n" * n_before,
-    )
-    np.testing.assert_array_equal(read_points(path), points)
-    # Lines are counted on from the header's.
-    head, _, data = path.read_bytes().partition(b"end_header\n")
-    lines = data.split(b"\n")
-    lines[2] = b"1" * 10_001
-    path.write_bytes(head + b"end_header\n" + b"\n".join(lines))
-    with pytest.raises(InputError, match=rf"line {head.count(bytes([10])) + 4}: the line has more"):
-        read_points(path)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-def test_a_ply_file_that_is_cut_off_is_refused(
-    tmp_path: Path, points: NDArray[np.float64], encoding: str
-) -> None:
-    fields = dict(zip("xyz", points.T, strict=True))
-    path = scan_files.write_ply(tmp_path / "a.ply", fields, encoding=encoding)
-    path.write_bytes(path.read_bytes()[:-300])
-    with pytest.raises(
-        InputError, match=r"a\.ply is cut off: its vertex element holds \d+ points, .* 40;"
-    ):
-        read_all(path)
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,7 @@ def test_text_is_read_however_its_numbers_are_separated(
         ("a.csv", "x,y,z,i,red,green,blue\n1,2,3,7,10,20,30\n", [10, 20, 30], 7),
         ("a.xyz", "1 2 3 0.25\n", None, 0.25),
         ("a.xyz", "1 2 3 10 20 30\n", [10, 20, 30], None),
+        ("a.xyz", "1 2 3 10 20 30 2232\n", [10, 20, 30], 2232),
         ("a.xyz", "1 2 3 -1200 10 20 30\n", [10, 20, 30], -1200),
         ("a.pts", "1\n1 2 3 -1200 10 20 30\n", [10, 20, 30], -1200),
         ("a.pts", "1\n1 2 3 120 10 20 30\n", [10, 20, 30], 120),
@@ -78,7 +79,7 @@ def test_text_columns_are_told_by_header_or_by_number(
 
 
 @pytest.mark.parametrize(
-    "content", ["1 2 3 10 20 30 40\n", "1 2 3 10 20 30 2232\n", "1 2 3 4 5\n", "1 2 3 4 5 6 7 8\n"]
+    "content", ["1 2 3 10 20 30 40\n", "1 2 3 10 20 30 22\n", "1 2 3 4 5\n", "1 2 3 4 5 6 7 8\n"]
 )
 def test_text_columns_that_can_mean_several_things_are_asked_for(
     tmp_path: Path, content: str
@@ -146,15 +147,3 @@ def test_binary_data_named_as_text_are_refused(tmp_path: Path) -> None:
     path.write_bytes("1 2 3\n".encode("utf-16"))
     with pytest.raises(InputError, match=r"a\.xyz is UTF-16 text"):
         open_scan(path)
-
-
-def test_text_blocks_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orthoflow.files.points import text
-
-    monkeypatch.setattr(text, "BLOCK_POINTS", 7)
-    table = np.arange(90).reshape(30, 3)
-    path = tmp_path / "a.xyz"
-    np.savetxt(path, table, fmt="%d", header="x y z")
-    blocks = read_all(path)
-    assert [len(block.points) for block in blocks] == [7, 7, 7, 7, 2]
-    np.testing.assert_array_equal(np.concatenate([block.points for block in blocks]), table)
