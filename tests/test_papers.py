@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
@@ -89,7 +90,8 @@ def test_every_metric_named_is_declared_by_a_method() -> None:
     loaded = [discover_catalog().method(name).load() for name in ours]
     known = {metric.name for method in loaded for metric in method.metric_specs()}
     assert len(METRICS) > 15
-    assert set(METRICS) <= known
+    unknown = {name for name in METRICS if not any(fnmatchcase(name, one) for one in known)}
+    assert unknown == set()
 
 
 @pytest.mark.parametrize("code", [code for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)])
