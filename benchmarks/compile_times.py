@@ -26,7 +26,7 @@ from numba.core import event  # noqa: E402 - it reads the variable
 
 from orthoflow.catalog.discovery import discover_catalog  # noqa: E402
 from orthoflow.engine.plan import RunOptions, plan_run  # noqa: E402
-from orthoflow.engine.scheduling import execute  # noqa: E402
+from orthoflow.engine.scheduler import execute  # noqa: E402
 from orthoflow.engine.store import Store  # noqa: E402
 from orthoflow.workflow.document import load_workflow  # noqa: E402
 from orthoflow.workflow.expand import expand_cells  # noqa: E402

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.loading import LoadingMeter
+from orthoflow.engine.measuring import LoadingMeter
 from orthoflow.engine.store import Store
 from orthoflow.products import PointCloud
 from orthoflow.records.unfinished import open_run

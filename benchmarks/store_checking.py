@@ -21,7 +21,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine import store
 from orthoflow.engine.durability import folder_size
 from orthoflow.engine.plan import RunOptions, plan_run
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.records import writing
 from orthoflow.records.runs import Run

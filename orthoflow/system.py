@@ -1,14 +1,13 @@
 """What differs between operating systems, behind names that are the same on all of them.
 
-Linux has all of it. Elsewhere, where `fcntl`, `resource` or forked processes are missing, there is
-a portable twin: locks of SQLite's, no limits, and steps that run in the process that asks for them.
+Linux has all of it. Elsewhere, where `fcntl` or `resource` are missing, there is a portable twin:
+locks of SQLite's, and no limits.
 """
 
 from __future__ import annotations
 
 import os
 import sqlite3
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -27,16 +26,7 @@ def _module(name: str) -> Any:
 
 
 _fcntl: Final = _module("fcntl")
-# Public: the processes of steps, which nothing else starts, set limits with it.
-resource: Final = _module("resource")
-
-# Whether steps can have processes of their own that end with whoever asked for them.
-HAS_STEP_PROCESSES: Final = (
-    sys.platform == "linux"
-    and _fcntl is not None
-    and resource is not None
-    and all(hasattr(os, name) for name in ("fork", "killpg", "pidfd_open", "setsid"))
-)
+_resource: Final = _module("resource")
 
 
 def flags(*names: str) -> int:
@@ -77,18 +67,18 @@ def usable_cores() -> int:
 
 def address_space() -> int | None:
     """Bytes of memory that this process may ask for (`ulimit -v`); None without such a limit."""
-    if resource is None:
+    if _resource is None:
         return None
-    limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
-    return None if limit == resource.RLIM_INFINITY else limit
+    limit = int(_resource.getrlimit(_resource.RLIMIT_AS)[0])
+    return None if limit == _resource.RLIM_INFINITY else limit
 
 
 def children_processor_s() -> float:
     """Processor seconds of all processes that this one started and waited for."""
-    if resource is None:
+    if _resource is None:
         times = os.times()
         return times.children_user + times.children_system
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used = _resource.getrusage(_resource.RUSAGE_CHILDREN)
     return float(used.ru_utime + used.ru_stime)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import multiprocessing.util
 import os
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -87,6 +88,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Write into memory; the processes that tests are spread over write where this one does."""
+    # What servers of steps need lies elsewhere: they end later than the folder in memory.
+    multiprocessing.util.get_temp_dir()
     config.pluginmanager.register(_Examples())  # a hook of this module sees files beside it only
     is_spread = "PYTEST_XDIST_WORKER" in os.environ
     if is_spread:  # it has read them; what it starts is as elsewhere

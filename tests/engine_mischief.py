@@ -7,7 +7,6 @@ import re
 MISCHIEF = """
 import os
 import resource
-import socket
 import subprocess
 import sys
 import threading
@@ -21,30 +20,11 @@ from toy_plugin.works import Numbers, Work, work
 
 SLEEPER = [sys.executable, "-c", "import time; time.sleep(600)"]
 
-def _pipe():
-    # The progress pipe is the only one a step has.
-    return next(n for n in range(3, 64) if _name(n).startswith("pipe:"))
-
-def _name(number):
-    # What watches the memory opens and closes files in a thread of its own meanwhile.
-    try:
-        return os.readlink(f"/proc/self/fd/{number}")
-    except FileNotFoundError:
-        return ""
-
-def _say(content):
-    pipe = _pipe()
-    while content:
-        content = content[os.write(pipe, content):]
 
 @work("exact")
 def daemon(values, params, ctx):
     return np.array([float(subprocess.Popen(SLEEPER, start_new_session=True).pid)])
 
-@work("exact")
-def daemon_then_crash(values, params, ctx):
-    ctx.log(f"started {subprocess.Popen(SLEEPER, start_new_session=True).pid}")
-    os.abort()
 
 @work("exact")
 def forks(values, params, ctx):
@@ -53,17 +33,11 @@ def forks(values, params, ctx):
         return values + 1.0
     return values + 2.0
 
-@work("exact")
-def long_line(values, params, ctx):
-    for _ in range(64):
-        _say(b"x" * (1 << 20))
-    return values
 
 @work("exact")
 def never_silent(values, params, ctx):
-    line = b'{"kind":"log","text":"x","fraction":0}\\n' * 1000
     while True:
-        _say(line)
+        ctx.log("x" * 100)
 
 @work("exact")
 def prints_much(values, params, ctx):
@@ -72,12 +46,6 @@ def prints_much(values, params, ctx):
     print("the end")
     return values
 
-@work("exact")
-def closes_all(values, params, ctx):
-    os.closerange(0, 256)
-    ctx.log("unheard")
-    ctx.progress(0.5)
-    return values
 
 @work("exact")
 def closes_streams(values, params, ctx):
@@ -86,27 +54,9 @@ def closes_streams(values, params, ctx):
     ctx.log("unheard")
     return values
 
-@work("exact")
-def leaves_fifo(values, params, ctx):
-    os.mkfifo(ctx.scratch.parent / "result.json")
-    os._exit(0)
 
-@work("exact")
-def leaves_giant(values, params, ctx):
-    with (ctx.scratch.parent / "result.json").open("wb") as file:
-        file.truncate(1 << 40)
-    os._exit(0)
 
-@work("exact")
-def leaves_brackets(values, params, ctx):
-    (ctx.scratch.parent / "result.json").write_text("[" * 100_000)
-    os._exit(0)
 
-@work("exact")
-def leaves_another(values, params, ctx):
-    text = '{"format": "orthoflow/result/1", "status": "ok", "key": "another"}'
-    (ctx.scratch.parent / "result.json").write_text(text)
-    os._exit(0)
 
 @work("exact")
 def digs_deep(values, params, ctx):
@@ -126,27 +76,14 @@ def replaces_log(values, params, ctx):
 
 @work("exact")
 def stops(values, params, ctx):
-    # Its keeper with it, which leaves nobody to obey.
     os.killpg(0, 19)
 
-def _parent_of(number):
-    with open(f"/proc/{number}/stat") as file:
-        return int(file.read().rpartition(")")[2].split()[1])
-
-@work("exact")
-def kills_keeper(values, params, ctx):
-    os.kill(os.getppid(), 9)
-    time.sleep(600)
 
 @work("exact")
 def kills_server(values, params, ctx):
-    os.kill(_parent_of(os.getppid()), 9)
+    os.kill(os.getppid(), 9)
     time.sleep(600)
 
-@work("exact")
-def stops_server(values, params, ctx):
-    os.kill(_parent_of(os.getppid()), 19)
-    return values
 
 @work("exact")
 def opens_nothing_more(values, params, ctx):
@@ -158,18 +95,6 @@ def writes_nothing_more(values, params, ctx):
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     return values
 
-@work("exact")
-def floods_all_sockets(values, params, ctx):
-    for number in range(3, 64):
-        if _name(number).startswith("socket:"):
-            with socket.socket(fileno=os.dup(number)) as one:
-                one.setblocking(False)
-                for content in [b"os sys numba", b"\\xff" * 5000, b""] * 1000:
-                    try:
-                        one.send(content)
-                    except OSError:
-                        pass
-    return values
 
 @work("exact")
 def goes_on_writing(values, params, ctx):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orthoflow.engine.tasks import Task
+from orthoflow.engine.worker import Task
 
 
 def bare_task(**more: Any) -> Task:

@@ -24,9 +24,10 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.engine import processes
 from orthoflow.engine.events import RunEvent
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import OrthoflowError
 from orthoflow.workflow.document import load_workflow
@@ -218,6 +219,8 @@ def has_ended(process_id: int) -> bool:
 def _coordinate(folder: Path, steps: str, into: str, said: Any) -> None:
     """Run a workflow as a process of its own that has started in its own session."""
     os.setsid()
+    # Toys need no compiler.
+    processes.PRELOADED[:] = ["orthoflow.engine.worker"]
     descriptor = said.detach()
     for stream in (1, 2):
         os.dup2(descriptor, stream)

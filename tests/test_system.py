@@ -191,20 +191,20 @@ def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatc
 def test_memory_is_limited_where_somebody_limited_it(monkeypatch: pytest.MonkeyPatch) -> None:
     limits = SimpleNamespace(RLIMIT_AS=9, RLIM_INFINITY=-1)
     limits.getrlimit = {9: (5_000_000, 7_000_000)}.__getitem__
-    monkeypatch.setattr(system, "resource", limits)
+    monkeypatch.setattr(system, "_resource", limits)
     assert system.address_space() == 5_000_000
     limits.getrlimit = {9: (-1, -1)}.__getitem__
     assert system.address_space() is None
-    monkeypatch.setattr(system, "resource", None)
+    monkeypatch.setattr(system, "_resource", None)
     assert system.address_space() is None
 
 
 def test_processes_that_ended_have_used_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
     used = SimpleNamespace(ru_utime=1.5, ru_stime=0.25)
     of_children = SimpleNamespace(RUSAGE_CHILDREN=-1, getrusage={-1: used}.__getitem__)
-    monkeypatch.setattr(system, "resource", of_children)
+    monkeypatch.setattr(system, "_resource", of_children)
     assert system.children_processor_s() == 1.75
-    monkeypatch.setattr(system, "resource", None)
+    monkeypatch.setattr(system, "_resource", None)
     times = SimpleNamespace(children_user=2.5, children_system=0.5, user=9.0, system=9.0)
     monkeypatch.setattr(os, "times", lambda: times)
     assert system.children_processor_s() == 3.0

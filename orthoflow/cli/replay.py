@@ -27,7 +27,7 @@ from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
 
 if TYPE_CHECKING:
-    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.records.distances import ProductDistance
     from orthoflow.records.replay_metrics import ReplayedMetric
@@ -191,7 +191,7 @@ class _Call:
 
     def _make(self) -> Run:
         from orthoflow.cli.progress import make_progress
-        from orthoflow.engine.scheduling import execute
+        from orthoflow.engine.scheduler import execute
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.writing import executed_and_written, write_run
         from orthoflow.report import write_report

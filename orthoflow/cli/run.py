@@ -35,7 +35,7 @@ from orthoflow.foreign_text import shown_json
 if TYPE_CHECKING:
     from orthoflow.engine.events import RunEvent, RunListener
     from orthoflow.engine.plan import RunPlan
-    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
@@ -190,7 +190,7 @@ class Call:
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
-        from orthoflow.engine.scheduling import execute
+        from orthoflow.engine.scheduler import execute
         from orthoflow.records.writing import begin_run
 
         # Before minutes pass.

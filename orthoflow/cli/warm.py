@@ -194,7 +194,7 @@ def _new_cells(
 
 def _executed(plan: RunPlan, folder: Path, store: Store) -> list[tuple[str, CellResult]]:
     from orthoflow.cli.progress import make_progress
-    from orthoflow.engine.scheduling import execute
+    from orthoflow.engine.scheduler import execute
 
     if not plan.cells:
         return []

@@ -31,11 +31,10 @@ from orthoflow.engine.dask_worker import (
     run_attempt,
 )
 from orthoflow.engine.durability import write_whole, writing_to
-from orthoflow.engine.executors import Capacity, TaskEnd, Tell
+from orthoflow.engine.local import Capacity, TaskEnd, Tell
 from orthoflow.engine.method_versions import methods_text
 from orthoflow.engine.results import CellResult, result_from_json
-from orthoflow.engine.running import failed_result
-from orthoflow.engine.tasks import Task, write_task
+from orthoflow.engine.worker import Task, failed_result
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
@@ -129,10 +128,9 @@ class DaskExecutor:
         """
         with writing_to(Path(task.folder).parent):
             Path(task.folder).mkdir(parents=True, exist_ok=True)
-        write_task(task)
         name = f"{task.address}-{uuid.uuid4().hex[:12]}"
         order = Order(
-            task_file=str(task.task_file),
+            task=task,
             name=name,
             topic=self._topic,
             retries=self._retries,

@@ -19,12 +19,10 @@ from distributed.worker import WORKER_ANY_RUNNING
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.environment import environment
-from orthoflow.engine.executors import Capacity
-from orthoflow.engine.local_executor import LocalExecutor
+from orthoflow.engine.local import Capacity, LocalExecutor
 from orthoflow.engine.method_versions import misfit
 from orthoflow.engine.results import CellResult, result_to_json
-from orthoflow.engine.running import failed_result
-from orthoflow.engine.tasks import Task, read_task
+from orthoflow.engine.worker import Task, failed_result
 from orthoflow.errors import PluginError, StepFailedError
 from orthoflow.sdk.context import StepEvent
 
@@ -40,7 +38,7 @@ class Order:
     """What a worker is told besides the task itself.
 
     Attributes:
-        task_file: the task, on the shared file system.
+        task: what to run.
         name: what the scheduler calls it.
         topic: where to say how it goes.
         retries: so often it may be tried again after its worker was lost.
@@ -48,7 +46,7 @@ class Order:
             process that made the plan.
     """
 
-    task_file: str
+    task: Task
     name: str
     topic: str
     retries: int
@@ -82,7 +80,7 @@ def look_around(path: str, methods: str) -> Surroundings:
 def run_attempt(order: Order) -> str:
     """Run a task in a child process of this worker; give its result as JSON."""
     worker = get_worker()
-    task = read_task(Path(order.task_file))
+    task = order.task
     home = Path(task.folder)
     n_before = sum(1 for _ in home.glob(f"{_ATTEMPT}*"))
     folder = home / f"{_ATTEMPT}{uuid.uuid4().hex[:12]}"

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import errno
-import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
-from orthoflow.engine.process_trees import descendants
-from orthoflow.geometry.threads import start_beside
+import psutil
 
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
-_SAMPLE_S: Final = 0.05
 _CGROUPS: Final = Path("/sys/fs/cgroup")
 # Version 1 says "unlimited" with a number near 2**63.
 _UNLIMITED: Final = 1 << 60
@@ -25,39 +21,25 @@ _SHORTEST_S: Final = 0.01
 _LONGEST_S: Final = 0.25
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProcessMemory:
-    """Memory of one process in bytes.
+def process_memory(process_id: int | None = None) -> int:
+    """Bytes that a process, this one by default, made itself; 0 when it is gone.
 
-    Attributes:
-        anonymous: its own memory; mapped files do not count.
-        files: resident parts of mapped files.
-        peak_resident: largest sum of both so far.
+    Mapped files do not count: they can be read again.
     """
-
-    anonymous: int
-    files: int
-    peak_resident: int
-
-
-def process_memory(process_id: int | str = "self") -> ProcessMemory | None:
-    """Measure a process; None when it is gone."""
     try:
-        text = Path(f"/proc/{process_id}/status").read_text(encoding="utf-8")
-    except OSError:
-        return None
-    fields = _fields(text)
-    return ProcessMemory(
-        anonymous=fields.get("RssAnon", 0) + fields.get("RssShmem", 0),
-        files=fields.get("RssFile", 0),
-        peak_resident=fields.get("VmHWM", 0),
-    )
+        memory = psutil.Process(process_id).memory_info()
+    except psutil.Error:
+        return 0
+    return int(memory.rss - getattr(memory, "shared", 0))
 
 
 def tree_memory(root: int) -> int:
-    """Anonymous memory of a process and of all that it started, in bytes."""
-    memories = (process_memory(process) for process in (root, *descendants(root)))
-    return sum(memory.anonymous for memory in memories if memory)
+    """Bytes that a process and all that it started made themselves."""
+    try:
+        children = psutil.Process(root).children(recursive=True)
+    except psutil.Error:
+        return 0
+    return sum(process_memory(process) for process in (root, *(one.pid for one in children)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,78 +57,12 @@ class AvailableMemory:
 
 def available_memory() -> AvailableMemory:
     """Measure the machine and every control group that this process is in."""
-    fields = _fields(Path("/proc/meminfo").read_text(encoding="utf-8"))
-    total, available = fields["MemTotal"], fields["MemAvailable"]
+    memory = psutil.virtual_memory()
+    total, available = memory.total, memory.available
     for limit, used in _group_limits():
         total = min(total, limit)
         available = min(available, limit - used)
     return AvailableMemory(available=max(0, available), total=total)
-
-
-class MemorySampler:
-    """Samples this process's memory in a thread while a method runs.
-
-    Attributes:
-        peak_mib: largest own memory; at least what the kernel's high-water mark proves.
-        processor_s: processor seconds that the samples took so far. They grow with the clock, so a
-            step that compiles for minutes would seem to compute longer.
-    """
-
-    def __init__(self) -> None:
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._peak_anonymous = 0
-        self._peak_files = 0
-        self._peak_resident = 0
-        self._earlier_peak = 0
-        self.processor_s = 0.0
-
-    def __enter__(self) -> Self:
-        self._note()
-        self._earlier_peak = self._peak_resident
-        self._thread = start_beside(self._sample)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._note()
-
-    @property
-    def peak_mib(self) -> float:
-        """Largest own memory in MiB.
-
-        Between two samples the kernel's mark of all resident memory less the largest part that
-        mapped files ever took is a lower bound; of a process in which other steps ran before, where
-        the mark rose.
-        """
-        has_risen = self._peak_resident > self._earlier_peak
-        proven = self._peak_resident - self._peak_files if has_risen else 0
-        return round(max(self._peak_anonymous, proven) / MIB, 1)
-
-    def _sample(self) -> None:
-        while not self._stop.wait(_SAMPLE_S):
-            self._note()
-            self.processor_s = time.thread_time()
-
-    def _note(self) -> None:
-        memory = process_memory()
-        if memory is not None:
-            self._peak_anonymous = max(self._peak_anonymous, memory.anonymous)
-            self._peak_files = max(self._peak_files, memory.files)
-            self._peak_resident = max(self._peak_resident, memory.peak_resident)
-
-
-def _fields(text: str) -> dict[str, int]:
-    """Read `Name:   123 kB` lines as bytes."""
-    fields: dict[str, int] = {}
-    for line in text.splitlines():
-        name, _, value = line.partition(":")
-        words = value.split()
-        if len(words) == 2 and words[1] == "kB":
-            fields[name] = int(words[0]) * 1024
-    return fields
 
 
 def _group_limits() -> list[tuple[int, int]]:

@@ -19,11 +19,11 @@ from typing import Final
 
 from orthoflow.diagnostics import unique
 from orthoflow.engine.durability import remove_tree, write_whole
-from orthoflow.engine.executors import TaskEnd
 from orthoflow.engine.keys import MethodFacts, read_preimage
+from orthoflow.engine.local import TaskEnd
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.store import Store, canonical_json
-from orthoflow.engine.tasks import PART, Task, TaskPart
+from orthoflow.engine.worker import PART, Task, TaskPart
 from orthoflow.errors import CancelledStepError, DamageError
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import MappedPort

@@ -48,7 +48,7 @@ from orthoflow.workflow.resolved import (
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import FigureRef
-    from orthoflow.engine.scheduling import RunOutcome
+    from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.workflow.expand import Cell
     from orthoflow.workflow.model import (
@@ -228,7 +228,7 @@ def begin_run(
         StoreError: the disk refuses.
     """
     from orthoflow.engine.clock import now  # noqa: PLC0415 - runs alone begin
-    from orthoflow.engine.scheduling import RunOutcome  # noqa: PLC0415
+    from orthoflow.engine.scheduler import RunOutcome  # noqa: PLC0415
 
     began = now()
     outcome = RunOutcome(run_id=run_id, started=began, ended=began, results={})
@@ -270,7 +270,7 @@ def executed_and_written(
     """Execute a run and write it; what the store turns out to have lost is computed again.
 
     Args:
-        execute: goes on with the run each time it is called, as `engine.scheduling.execute` does.
+        execute: goes on with the run each time it is called, as `engine.scheduler.execute` does.
         write: calls `write_run`.
 
     Raises:

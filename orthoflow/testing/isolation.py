@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.fork_server import load_library
 from orthoflow.engine.store import Store
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial
@@ -178,8 +177,9 @@ def serve() -> None:
         task_file = Path(line.rstrip("\n"))
         task = json.loads(task_file.read_text())
         for library in task["libraries"]:
-            if library not in sys.modules:
-                load_library(library)
+            # The trial itself reports what is wrong with it.
+            with suppress(Exception):
+                importlib.import_module(library)
         process = os.fork()
         if process == 0:
             _run_forked(task_file.parent, task)

@@ -35,7 +35,7 @@ def make(name: str) -> Path:
 
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run
-    from orthoflow.engine.scheduling import execute
+    from orthoflow.engine.scheduler import execute
     from orthoflow.engine.store import Store
     from orthoflow.records.writing import build_record
     from orthoflow.workflow.document import load_workflow

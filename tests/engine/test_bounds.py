@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from orthoflow.engine import garbage, running
+from orthoflow.engine import garbage, worker
 from orthoflow.engine import plan as planning
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileDigests
@@ -42,10 +42,10 @@ def test_a_cells_sentence_is_remembered_in_four_hundred_letters(tmp_path: Path) 
 
 
 def test_of_a_traceback_the_last_64_kilobytes_are_kept() -> None:
-    text = running._trace(ValueError("b" + "x" * 70_000))
+    text = worker._trace(ValueError("b" + "x" * 70_000))
     assert len(text) == 65_536
     assert text.endswith("x\n")
-    short = running._trace(ValueError("b" + "x" * 60_000))
+    short = worker._trace(ValueError("b" + "x" * 60_000))
     assert short == f"ValueError: b{'x' * 60_000}\n"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.events import CellStarted, RunEvent
-from orthoflow.engine.scheduling import execute
+from orthoflow.engine.scheduler import execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, InputError
 from tests.engine_world import World, toy_world

@@ -15,9 +15,9 @@ from distributed import KilledWorker
 from orthoflow.engine import dask_executor, dask_worker
 from orthoflow.engine.dask_executor import CORES, DaskExecutor
 from orthoflow.engine.dask_worker import CANCEL_FILE, Surroundings
-from orthoflow.engine.executors import Capacity, TaskEnd
+from orthoflow.engine.local import Capacity, TaskEnd
 from orthoflow.engine.results import CellResult, result_to_json
-from orthoflow.engine.tasks import Task
+from orthoflow.engine.worker import Task
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
 from orthoflow.sdk.context import StepEvent
 from tests.engine_tasks import bare_task

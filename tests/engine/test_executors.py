@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.executors import Capacity, InlineExecutor
-from orthoflow.engine.tasks import Task
+from orthoflow.engine.local import Capacity, InlineExecutor
+from orthoflow.engine.worker import Task
 from tests.engine_world import toy_world
 
 

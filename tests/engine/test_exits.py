@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
-from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import step_logs
-from orthoflow.engine.local_executor import (
+from orthoflow.engine.local import (
     describe_exit,
     describe_memory,
     describe_timeout,
     duration,
 )
 from orthoflow.engine.memory import is_for_want_of_memory
-from orthoflow.engine.step_logs import StepLog
 
 WHO = "method plane.mine of mine 1.0"
 
@@ -94,20 +90,3 @@ def test_want_of_memory_and_unknown_signals_are_told() -> None:
 )
 def test_want_of_memory_is_told_from_other_errors(error: Exception, is_memory: bool) -> None:
     assert is_for_want_of_memory(error) == is_memory
-
-
-@pytest.mark.parametrize("n_bytes", [0, 9, 10, 11, 25])
-def test_of_a_long_log_the_end_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int
-) -> None:
-    monkeypatch.setattr(step_logs, "_KEPT_BYTES", 10)
-    log = StepLog(tmp_path / "log")
-    text = "".join(chr(ord("a") + k) for k in range(n_bytes))
-    os.write(log.descriptor, text.encode())
-    kept = text if n_bytes <= 10 else f"... ({n_bytes - 10} bytes before)\n{text[-10:]}"
-    assert log.text() == kept
-    log.close()
-    log = StepLog(tmp_path / "log")
-    os.write(log.descriptor, b"a\0b\xff")
-    assert log.text() == "ab\ufffd"
-    log.close()

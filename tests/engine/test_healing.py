@@ -14,7 +14,7 @@ import pytest
 from orthoflow.engine.events import CellStarted, RunEvent
 from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.soundness import check_store
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError

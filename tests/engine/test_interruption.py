@@ -13,7 +13,7 @@ import pytest
 
 from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.run_folder import is_running
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import find_record
 from tests.engine_world import World, digests, start_coordinator, toy_world

@@ -11,9 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthoflow.engine import loading, running
-from orthoflow.engine.loading import LoadingMeter
-from orthoflow.engine.memory import MemorySampler
+from orthoflow.engine import measuring, worker
+from orthoflow.engine.measuring import LoadingMeter, MemorySampler
 from orthoflow.engine.results import CellResult
 from tests.engine_world import World
 
@@ -63,7 +62,7 @@ def test_looking_at_the_memory_is_in_no_processor_time(
             looks.append(self)
 
     looks: list[MemorySampler] = []
-    monkeypatch.setattr(running, "MemorySampler", Laborious)
+    monkeypatch.setattr(worker, "MemorySampler", Laborious)
     steps = STEPS.format("slow", ", params: {steps: 30}")
     result = world.run(steps, executor="inline").results["b"]
     assert looks[-1].processor_s > 0.15
@@ -75,7 +74,7 @@ def test_a_step_that_takes_nothing_takes_no_less(
 ) -> None:
     """Threads' clocks run ahead of their process's by ticks, and a record takes no such time."""
     clock = itertools.count(5.0, -0.001)
-    monkeypatch.setattr(running._Call, "_cpu_s", lambda _: next(clock))
+    monkeypatch.setattr(worker._Call, "_cpu_s", lambda _: next(clock))
     result = world.run(STEPS.format("slow", ", params: {steps: 1}"), executor="inline").results["b"]
     assert result.cpu_s == 0.0
 
@@ -138,7 +137,7 @@ def test_the_clock_stands_still_while_something_is_loaded(
 ) -> None:
     now = {"s": 100.0}
     clock = SimpleNamespace(perf_counter=lambda: now["s"], thread_time=lambda: now["s"])
-    monkeypatch.setattr(loading, "time", clock)
+    monkeypatch.setattr(measuring, "time", clock)
     meter = LoadingMeter()
     assert meter.clock_s() == 100.0
     now["s"] = 101.0

@@ -19,7 +19,7 @@ import pytest
 
 from orthoflow.engine.dask_executor import CORES
 from orthoflow.engine.events import CellProgress, RunEvent
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import OrthoflowError
 from tests.engine_world import World, digests
 from tests.long_loops import IS_LONG

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.engine import running
+from orthoflow.engine import worker
 from orthoflow.engine.file_digests import file_identity, file_sha256
 from orthoflow.engine.results import ProductRef
 from orthoflow.engine.store import digest_of
-from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
+from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import (
     DiskSpaceError,
     InputError,
@@ -47,13 +47,13 @@ def a_task(**more: Any) -> Task:
 
 
 def test_a_result_begins_with_what_is_known_of_its_task() -> None:
-    blank = running.blank_result(a_task())
+    blank = worker.blank_result(a_task())
     assert (blank.status, blank.key, blank.key_preimage, blank.run_id) == ("ok", "k", "{}", "r1")
     assert (blank.method, blank.distribution, blank.seed) == ("work.add", "toys", 7)
     assert (blank.inputs, blank.environment) == ({"numbers": REF}, environment())
     # What draws nothing has no seed.
-    assert running.blank_result(a_task(determinism="exact")).seed is None
-    assert running.blank_result(a_task(determinism="loose")).seed == 7
+    assert worker.blank_result(a_task(determinism="exact")).seed is None
+    assert worker.blank_result(a_task(determinism="loose")).seed == 7
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_result_begins_with_what_is_known_of_its_task() -> None:
     ids=["plain", "problems", "lines", "mute", "long", "longer"],
 )
 def test_a_failure_is_told_in_one_line(error: MethodError | InputError, said: str) -> None:
-    failed = running.failed_result(a_task(), error, "the trace")
+    failed = worker.failed_result(a_task(), error, "the trace")
     assert (failed.status, failed.error_type) == ("failed", type(error).__name__)
     assert (failed.error_message, failed.traceback) == (said, "the trace")
     assert (failed.exit_code, failed.key) == (type(error).exit_code, "k")
@@ -106,12 +106,12 @@ WHO = "method work.add of toys 1.0"
 def test_whatever_a_method_raises_is_told_by_one_of_our_errors(
     error: BaseException, kind: type[Exception], said: str
 ) -> None:
-    told = running.explain_failure(a_task(), error)
+    told = worker.explain_failure(a_task(), error)
     assert type(told) is kind
     assert str(told).startswith(said)
     assert not str(told).endswith(": ")
     ours = StoreError("full")
-    assert running.explain_failure(a_task(), ours) is ours
+    assert worker.explain_failure(a_task(), ours) is ours
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_whatever_a_method_raises_is_told_by_one_of_our_errors(
 def test_what_the_disk_refuses_is_told_by_whose_fault_it_is(
     number: int, name: str | None, kind: type[Exception] | None
 ) -> None:
-    told = running._disk_failure(OSError(number, "why", name), STORE)
+    told = worker._disk_failure(OSError(number, "why", name), STORE)
     assert (None if told is None else type(told)) is kind
     if told is not None:
         assert str(STORE) in str(told)
@@ -140,7 +140,7 @@ def test_what_the_disk_refuses_is_told_by_whose_fault_it_is(
 
 def test_between_what_is_compiled_a_step_says_what_it_said_before() -> None:
     heard: list[StepEvent] = []
-    news = running._News(heard.append)
+    news = worker._News(heard.append)
     news.compiling("compiling peel")
     half = StepEvent(kind="progress", text="peeling", fraction=0.5)
     news.listen(half)
@@ -157,7 +157,7 @@ def test_between_what_is_compiled_a_step_says_what_it_said_before() -> None:
 
 
 def a_call(task: Task, **more: Any) -> Any:
-    call: Any = object.__new__(running._Call)
+    call: Any = object.__new__(worker._Call)
     call.task = task
     for name, value in more.items():
         setattr(call, name, value)
@@ -184,8 +184,8 @@ def test_a_method_runs_as_a_whole_or_joins_its_parts() -> None:
 
 
 def test_processor_time_is_without_loading_and_looking(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running.time, "process_time", lambda: 10.0)
-    monkeypatch.setattr(running, "children_processor_s", lambda: 4.0)
+    monkeypatch.setattr(worker.time, "process_time", lambda: 10.0)
+    monkeypatch.setattr(worker, "children_processor_s", lambda: 4.0)
     call = a_call(
         a_task(),
         _meter=SimpleNamespace(processor_s=3.0),
@@ -195,25 +195,25 @@ def test_processor_time_is_without_loading_and_looking(monkeypatch: pytest.Monke
 
 
 def test_a_class_is_loaded_by_its_import_string_or_named_as_missing() -> None:
-    assert running.load_target("json:loads") is json.loads
+    assert worker.load_target("json:loads") is json.loads
     for target in ("no_such_module:Thing", "json:nothing"):
         with pytest.raises(PluginError, match=rf"^{target} cannot be loaded: [A-Z]\w+Error: "):
-            running.load_target(target)
+            worker.load_target(target)
 
 
 def test_an_input_file_may_be_touched_and_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
     path.write_text("points")
     file = TaskFile(path=str(path), identity=file_identity(path), sha256=file_sha256(path))
-    running._check_file(file)
+    worker._check_file(file)
     os.utime(path, ns=(1, 1))
-    running._check_file(file)
+    worker._check_file(file)
     path.write_text("POINTS")
     with pytest.raises(InputError, match=r"scan\.txt changed while it was read; run again"):
-        running._check_file(file)
+        worker._check_file(file)
     path.unlink()
     with pytest.raises(InputError, match=r"scan\.txt cannot be read any more: No such file"):
-        running._check_file(file)
+        worker._check_file(file)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,11 +257,11 @@ def test_of_a_long_trace_the_end_is_kept() -> None:
         def __str__(self) -> str:
             raise RuntimeError("not a word")
 
-    kept = running._trace(ValueError("x" * 1_000_000 + "the end"))
+    kept = worker._trace(ValueError("x" * 1_000_000 + "the end"))
     assert kept.rstrip().endswith("the end")
     assert 1_000 < len(kept) < 1_000_000
-    assert "\\ud800" in running._trace(ValueError("\ud800"))
-    assert isinstance(running._trace(MuteError()), str)
+    assert "\\ud800" in worker._trace(ValueError("\ud800"))
+    assert isinstance(worker._trace(MuteError()), str)
 
 
 def test_a_product_that_contradicts_its_inputs_fails_its_step_and_names_the_method(

@@ -18,7 +18,7 @@ from orthoflow.engine.events import (
 )
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import cell_file_name
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import ArgumentError, InputError, StoreError
 from tests.engine_world import World, digests
 

@@ -15,10 +15,10 @@ from orthoflow.engine import splitting
 from orthoflow.engine.events import CellFinished, CellProgress, CellStarted, RunEvent
 from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.splitting import _parts, parts_folder
 from orthoflow.engine.store import Store
-from orthoflow.engine.tasks import Task, TaskPart
+from orthoflow.engine.worker import Task, TaskPart
 from orthoflow.errors import CancelledStepError, DamageError
 from tests.engine_tasks import bare_task
 from tests.engine_world import World, toy_world
@@ -187,7 +187,7 @@ def test_a_damaged_part_is_computed_again(world: World, file: str) -> None:
 
 
 def test_a_part_that_takes_too_long_is_named(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orthoflow.engine.local_executor._GRACE_S", 0.3)
+    monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.3)
     steps = STEPS.replace("in: {rows: first.rows}}", "in: {rows: first.rows}, timeout: 1s}")
     outcome = world.run(steps, sets=("told.wait_s=9",), parts=2, jobs=2)
     said = outcome.results["told"].error_message

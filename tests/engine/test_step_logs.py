@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.step_logs import StepLog
+from orthoflow.engine.local import StepLog
 from orthoflow.errors import StoreError
 
 KEPT = 256 << 10
@@ -23,11 +22,13 @@ def log(tmp_path: Path) -> Iterator[StepLog]:
 
 
 def append(log: StepLog, content: bytes) -> None:
-    assert os.write(log.descriptor, content) == len(content)
+    """As the process of a step does."""
+    with log.path.open("ab") as file:
+        file.write(content)
 
 
 def size_of(log: StepLog) -> int:
-    return os.fstat(log.descriptor).st_size
+    return log.path.stat().st_size
 
 
 def test_a_short_log_is_kept_whole(log: StepLog) -> None:

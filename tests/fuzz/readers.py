@@ -25,7 +25,6 @@ from orthoflow.engine.results import (
 from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
 from orthoflow.engine.store import Store
 from orthoflow.engine.stored_results import list_results
-from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
 from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp
@@ -399,42 +398,6 @@ _KEY: Final = "ab" * 32
 _DIGEST: Final = "sha256:" + "cd" * 32
 
 
-def _task(folder: Path) -> Task:
-    return Task(
-        method="plane.hough2d",
-        distribution="orthoflow-tls",
-        distribution_version="0.1.0",
-        result_version=1,
-        determinism="exact",
-        citations=("somebody 2015",),
-        address="plane@plane=hough2d",
-        run_id="20260101T000000Z-abcdef",
-        target="orthoflow_plugins.plane.hough2d:Hough2d",
-        key=_KEY,
-        key_preimage="{}",
-        params={"cell_m": 0.02, "limits": [1, 2], "normal": None},
-        seed=1729,
-        inputs={
-            "cloud": TaskInput(
-                ref=ProductRef(type_name="cloud", encoding_version=1, digest=_DIGEST),
-                target="orthoflow.products:PointCloud",
-            ),
-            "files": TaskInput(
-                ref=ProductRef(type_name="files", encoding_version=0, digest=_DIGEST),
-                input_name="scan",
-                files=(TaskFile(path="/data/room.e57", identity="1-2-5-7", sha256="ab" * 32),),
-            ),
-        },
-        outputs={"planes": TaskOutput(type_name="planes", target="orthoflow.products:Planes")},
-        cores=2,
-        timeout_s=90.0,
-        store="/store",
-        folder=str(folder),
-        log="/run/logs/plane.log",
-        kernels="ab",
-    )
-
-
 def _result() -> CellResult:
     return CellResult(
         status="ok",
@@ -525,11 +488,6 @@ def _read_journal(path: Path) -> object:
         return journal.finished_keys
 
 
-TASK = Target(
-    seeds=lambda folder: write_task(_task(folder)),
-    read=lambda path: read_task(path).task_file,
-    mutate=mutate_json,
-)
 RESULT = Target(
     seeds=lambda folder: (folder / "result.json").write_text(result_to_json(_result())),
     read=_read_result,

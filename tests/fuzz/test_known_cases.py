@@ -396,9 +396,6 @@ KNOWN: Final = {
         words="has more than 200000 elements",
     ),
     # The engine's own files.
-    "a task that is none": Known(
-        target="TASK", file="task.json", content=b"[" * 50_000, words=r"the task .* is damaged"
-    ),
     "a journal of brackets": Known(
         target="JOURNAL_FILE", file="journal.jsonl", content=b"[" * 50_000 + b"\n", words="damaged"
     ),

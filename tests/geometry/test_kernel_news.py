@@ -6,7 +6,7 @@ import re
 
 import numba
 
-from orthoflow.engine.running import _News
+from orthoflow.engine.worker import _News
 from orthoflow.geometry import compiling
 from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.sdk import StepEvent

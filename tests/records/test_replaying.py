@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from orthoflow.engine.plan import RunOptions, plan_run
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.records import replaying
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay

@@ -21,7 +21,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
 from orthoflow.engine.run_folder import is_running
-from orthoflow.engine.scheduling import RunOutcome, execute
+from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
 from orthoflow.records.published import publish_products

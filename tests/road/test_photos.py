@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import orthoflow
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.plan import RunOptions, plan_run
-from orthoflow.engine.scheduling import execute
+from orthoflow.engine.scheduler import execute
 from orthoflow.engine.store import Store
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth

@@ -1,30 +1,43 @@
-"""Running one task where we are: read the inputs, call the method, keep the outputs."""
+"""Running one task: read the inputs, call the method, keep the outputs.
+
+`run_step` is what the process of a step does, `run_task` does it in any process.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
+import faulthandler
+import io
 import json
+import multiprocessing
 import os
 import signal
+import sys
+import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final, cast
 
 import numpy as np
-from pydantic import ValidationError
+import psutil
+import threadpoolctl
+from pydantic import JsonValue, ValidationError
 
 from orthoflow.diagnostics import Diagnostic, warning_texts
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import is_broken, store_error, writing_to
 from orthoflow.engine.file_digests import file_identity, file_sha256
-from orthoflow.engine.loading import LoadingMeter
-from orthoflow.engine.memory import MIB, MemorySampler, is_for_want_of_memory
+from orthoflow.engine.kernels import reload_numba_config
+from orthoflow.engine.measuring import LoadingMeter, MemorySampler
+from orthoflow.engine.memory import MIB, is_for_want_of_memory
 from orthoflow.engine.results import (
     CellResult,
     Costs,
@@ -32,10 +45,11 @@ from orthoflow.engine.results import (
     FigureRef,
     MethodIdentity,
     ProductRef,
+    RecordedEnvironment,
+    result_to_json,
     shared_fields,
 )
 from orthoflow.engine.store import Publisher, Store, digest_of
-from orthoflow.engine.tasks import PART, Task, TaskFile, TaskInput, TaskPart
 from orthoflow.errors import (
     DiskSpaceError,
     InputError,
@@ -45,23 +59,271 @@ from orthoflow.errors import (
     ProductError,
     StepFailedError,
 )
+from orthoflow.foreign_text import shown
 from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, Part, Ports, checked_part, labelled
-from orthoflow.system import children_processor_s
+from orthoflow.system import children_processor_s, flags
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
-# The main one and the sampler of memory.
-_OWN_THREADS: Final = 2
+# The main one, the sampler of memory, and the one that waits for the coordinator.
+_OWN_THREADS: Final = 3
 # With room for what a method raised, which is cut shorter, and the words around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
+_OOM_SCORE: Final = "900"
+_PROGRESS_EVERY_S: Final = 0.1
+
+# The output port of a part.
+PART: Final = "part"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskFile:
+    """An input file of a task.
+
+    Attributes:
+        path: where it lies.
+        identity: what the file system says of it as long as it stays as it is.
+        sha256: digest of its content, hexadecimal.
+    """
+
+    path: str
+    identity: str
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskInput:
+    """A product on an input port.
+
+    Attributes:
+        ref: which product.
+        target: import string of its class; empty for files.
+        input_name: name of the workflow input; empty for products.
+        files: of a workflow input.
+    """
+
+    ref: ProductRef
+    target: str = ""
+    input_name: str = ""
+    files: tuple[TaskFile, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOutput:
+    """What an output port must carry: type, class and publisher by import string.
+
+    Attributes:
+        type_name: product type.
+        target: of its class.
+        publisher: of what writes its published files; empty when nothing does.
+        publisher_tag: version of the publisher.
+    """
+
+    type_name: str
+    target: str
+    publisher: str = ""
+    publisher_tag: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskPart:
+    """Some of the items that a method maps over.
+
+    Attributes:
+        first: index of the first one.
+        end: index behind the last one.
+        ref: what the part came to; None before it ran.
+    """
+
+    first: int
+    end: int
+    ref: ProductRef | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(MethodIdentity):
+    """One method call: of a whole step, of a part of one, or the one that joins parts.
+
+    Everything its process needs, nothing left to decide.
+
+    Attributes:
+        address: of the cell.
+        run_id: of the run.
+        target: import string of the class.
+        key: cache key.
+        key_preimage: text it is the digest of.
+        params: resolved, JSON.
+        seed: of the generator.
+        inputs: port -> product.
+        outputs: port -> what is expected.
+        cores: threads it may use.
+        timeout_s: seconds, None for no limit.
+        store: folder of the store.
+        folder: folder of the task, on the store's file system: scratch and unfinished objects.
+        log: file that takes stdout and stderr.
+        kernels: names the folder for compiled kernels.
+        environment: where it will run.
+        is_compared: whether its times stand beside those of others.
+        part: the part to compute; None for a whole step.
+        parts: the parts to join, in order; empty where there are none.
+        parts_store: folder of the store that has them.
+    """
+
+    address: str
+    run_id: str
+    target: str
+    key: str
+    key_preimage: str
+    params: Mapping[str, JsonValue]
+    seed: int
+    inputs: Mapping[str, TaskInput]
+    outputs: Mapping[str, TaskOutput]
+    cores: int
+    timeout_s: float | None
+    store: str
+    folder: str
+    log: str
+    kernels: str
+    environment: RecordedEnvironment | None = None
+    is_compared: bool = False
+    part: TaskPart | None = None
+    parts: tuple[TaskPart, ...] = ()
+    parts_store: str = ""
+
+    @property
+    def who(self) -> str:
+        """Method and distribution, as sentences about it begin."""
+        brought = (
+            f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
+        )
+        return f"method {self.method}{brought}"
+
+    @property
+    def scratch(self) -> Path:
+        """The folder a method may write to."""
+        return Path(self.folder) / "scratch"
+
 
 Listener = Callable[[StepEvent], None]
+
+
+# What the process of a step sends: one of these, then JSON.
+EVENT: Final = b"event "
+RESULT: Final = b"result "
+
+
+def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None:
+    """Be the process of a step: run a task, send what it says and at last its result.
+
+    Args:
+        task: what to run.
+        pipe: takes `EVENT` and `RESULT` messages.
+        variables: all environment variables of the step.
+    """
+    _move_to(task, variables)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    # Nobody but the method can raise it from here on.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_coordinator, daemon=True).start()
+    events = _EventPipe(pipe)
+    result = run_task(task, events.listen, stop.is_set, has_own_process=True)
+    events.send(RESULT + result_to_json(result).encode())
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):
+            stream.flush()
+    _kill_children()
+    # Without the interpreter's tear-down: libraries crash there, and threads may never end.
+    os._exit(0)
+
+
+def _move_to(task: Task, variables: Mapping[str, str]) -> None:
+    """Take the surroundings of a step for this process."""
+    if hasattr(os, "setsid"):
+        os.setsid()
+    log = os.open(task.log, flags("O_WRONLY", "O_APPEND", "O_NOFOLLOW"))
+    for descriptor in (1, 2):
+        os.dup2(log, descriptor)
+    os.close(log)
+    sys.stdout, sys.stderr = (
+        io.TextIOWrapper(
+            io.FileIO(descriptor, "w", closefd=False),
+            encoding="utf-8",
+            errors="backslashreplace",
+            write_through=True,
+        )
+        for descriptor in (1, 2)
+    )
+    faulthandler.enable()
+    os.environ.clear()
+    os.environ.update(variables)
+    task.scratch.mkdir(parents=True, exist_ok=True)
+    os.chdir(task.scratch)
+    tempfile.tempdir = None
+    # Be the first that the kernel kills when memory runs out, instead of the coordinator.
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
+    # Libraries that are loaded have read how many threads they may start.
+    reload_numba_config()
+    threadpoolctl.threadpool_limits(task.cores)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(task.cores)
+
+
+def _end_with_coordinator() -> None:
+    """Wait until the process that wants the result is gone, and end with all of this session."""
+    coordinator = multiprocessing.parent_process()
+    if coordinator is not None:
+        coordinator.join()
+        _kill_children()
+        if hasattr(os, "killpg"):
+            os.killpg(0, signal.SIGKILL)
+        os._exit(1)
+
+
+def _kill_children() -> None:
+    with suppress(psutil.Error):
+        for child in psutil.Process().children(recursive=True):
+            with suppress(psutil.Error):
+                child.kill()
+
+
+class _EventPipe:
+    """Sends events to the coordinator; threads may share it."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+        self._lock = threading.Lock()
+        self._sent_s = 0.0
+        self._sent = StepEvent(kind="progress", text="", fraction=0.0)
+
+    def listen(self, event: StepEvent) -> None:
+        """Send an event; progress at most ten times a second, the rest into the log too.
+
+        Another text of the same fraction is another activity, and always sent.
+        """
+        if event.kind == "progress":
+            is_soon = time.monotonic() - self._sent_s < _PROGRESS_EVERY_S
+            is_same = event.text == self._sent.text or event.fraction > self._sent.fraction
+            if is_soon and is_same and event.fraction < 1.0:
+                return
+            self._sent_s, self._sent = time.monotonic(), event
+        else:
+            # The method may have closed it, or put something else into its place.
+            with suppress(AttributeError, OSError, ValueError):
+                sys.stderr.write(shown(event.text, keep="\n") + "\n")
+        self.send(EVENT + json.dumps(dataclasses.asdict(event)).encode())
+
+    def send(self, message: bytes) -> None:
+        """Send a message, unless the method closed the pipe: then it works on unheard."""
+        with self._lock, suppress(OSError):
+            self._pipe.send_bytes(message)
 
 
 def run_task(

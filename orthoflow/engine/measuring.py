@@ -1,4 +1,4 @@
-"""The time that a process spends loading modules and compiling kernels, apart from all other.
+"""Time and memory of a method: what loading and compiling take is kept apart from all other.
 
 It says something of the disk and of what ran before, and nothing of a method: a kernel that was
 compiled once is read from a file ever after. So `compile_s` is measured here, and a clock that
@@ -18,6 +18,9 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, Final, Self, cast
 
+from orthoflow.engine.memory import MIB, process_memory
+from orthoflow.geometry.threads import start_beside
+
 # Every import goes through these, where a module is not there yet and where another thread still
 # loads it. Private, but finders and loaders only hear when a module is looked for, not when all
 # that it imports is there.
@@ -29,6 +32,7 @@ _COMPILER_LOCK: Final = "numba:compiler_lock"
 # A load as long as this leaves objects in number; to look for garbage among them takes a few
 # hundredths of it.
 _LONG_S: Final = 0.25
+_SAMPLE_S: Final = 0.05
 
 
 class LoadingMeter:
@@ -147,3 +151,42 @@ class LoadingMeter:
         )()
         events.register(_COMPILER_LOCK, listener)
         self._listener = listener
+
+
+class MemorySampler:
+    """Samples this process's memory in a thread while a method runs.
+
+    Attributes:
+        processor_s: processor seconds that the samples took so far. They grow with the clock, so a
+            step that compiles for minutes would seem to compute longer.
+    """
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._peak_bytes = 0
+        self.processor_s = 0.0
+
+    def __enter__(self) -> Self:
+        self._note()
+        self._thread = start_beside(self._sample)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._note()
+
+    @property
+    def peak_mib(self) -> float:
+        """Largest own memory."""
+        return round(self._peak_bytes / MIB, 1)
+
+    def _sample(self) -> None:
+        while not self._stop.wait(_SAMPLE_S):
+            self._note()
+            self.processor_s = time.thread_time()
+
+    def _note(self) -> None:
+        self._peak_bytes = max(self._peak_bytes, process_memory())

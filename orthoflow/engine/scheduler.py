@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Final, Literal
 
 from orthoflow.diagnostics import Diagnostic, DiagnosticSpec, placed, step_names, warning_texts
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import remove_tree, writing_to
+from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
@@ -23,14 +27,20 @@ from orthoflow.engine.events import (
     RunStarted,
     ignore,
 )
-from orthoflow.engine.executor_choice import executor_of
-from orthoflow.engine.executors import Capacity, Executor, TaskEnd, Tell
 from orthoflow.engine.failures import Failures
-from orthoflow.engine.interruptions import Interruption, watching_interruptions
-from orthoflow.engine.keys import CellKey, cell_key
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.local import (
+    Capacity,
+    Executor,
+    InlineExecutor,
+    LocalExecutor,
+    TaskEnd,
+    Tell,
+)
 from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.plan import (
     PlannedInput,
+    ProductTarget,
     RunPlan,
     known_inputs,
     needed_addresses,
@@ -44,21 +54,22 @@ from orthoflow.engine.run_folder import (
     CellEnded,
     Journal,
     RunWent,
+    cell_file_name,
 )
 from orthoflow.engine.splitting import Splits
 from orthoflow.engine.store import Store
-from orthoflow.engine.task_making import TaskMaker
-from orthoflow.engine.tasks import Task
+from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
     ClusterError,
     DamageError,
+    PluginError,
     StoreError,
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
-from orthoflow.workflow.expand import Cell, CellOutput, compared_cells
+from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput, compared_cells
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = DiagnosticSpec(
@@ -165,8 +176,8 @@ def execute(
                 run_id=journal.run_id, n_cells=len(plan.cells), is_resumed=journal.is_resumed
             )
         )
-        with _scratch(store, journal.run_id) as scratch, watching_interruptions() as interruption:
-            tasks = TaskMaker(
+        with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
+            tasks = _TaskMaker(
                 plan=plan,
                 store=store,
                 scratch=scratch,
@@ -174,7 +185,7 @@ def execute(
                 run_id=journal.run_id,
             )
             splits = Splits(store)
-            executor = executor_of(
+            executor = _executor_of(
                 plan, scratch, _passing_on(listen, splits), lambda: interruption.is_asked
             )
             run = _Run(tasks, splits, journal, listen)
@@ -201,7 +212,7 @@ class _Run:
 
     def __init__(
         self,
-        tasks: TaskMaker,
+        tasks: _TaskMaker,
         splits: Splits,
         journal: Journal,
         listen: RunListener,
@@ -543,3 +554,140 @@ def _scratch(store: Store, run_id: str) -> Iterator[Path]:
 
 def _lock_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.lock")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TaskMaker:
+    """Makes the tasks of one run.
+
+    Attributes:
+        plan: of the run.
+        store: where products and results go.
+        scratch: folder of the run for work in progress, on the store's file system.
+        logs: folder for the logs of steps.
+        run_id: of the run.
+    """
+
+    plan: RunPlan
+    store: Store
+    scratch: Path
+    logs: Path
+    run_id: str
+
+    def make(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
+        """Give the task of a cell.
+
+        Args:
+            cell: the cell.
+            key: its key.
+            refs: port -> product.
+            cores: threads it may use.
+        """
+        facts = self.plan.methods[cell.method]
+        return Task(
+            address=cell.address,
+            run_id=self.run_id,
+            target=facts.target,
+            key=key.key,
+            key_preimage=key.preimage,
+            params=cell.params,
+            seed=cell.seed,
+            inputs={port: self._input(cell, port, ref) for port, ref in refs.items()},
+            outputs=self._outputs(facts),
+            cores=cores,
+            timeout_s=cell.timeout_s,
+            store=str(self.store.folder),
+            folder=str(self.scratch / uuid.uuid4().hex[:12]),
+            log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
+            kernels=facts.compiled_digest,
+            environment=environment(cores),
+            **shared_fields(facts, MethodIdentity),
+        )
+
+    def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
+        source = cell.inputs[port]
+        if not isinstance(source, WorkflowInput):
+            return TaskInput(ref=ref, target=self.plan.products[ref.type_name].target)
+        given = self.plan.inputs[source.name]
+        return TaskInput(ref=ref, input_name=source.name, files=_task_files(given) if given else ())
+
+    def _outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
+        return {
+            port: TaskOutput(
+                type_name=type_name, **shared_fields(self.plan.products[type_name], ProductTarget)
+            )
+            for port, type_name in facts.outputs.items()
+        }
+
+
+def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
+    return tuple(
+        TaskFile(path=str(path.absolute()), identity=file.identity, sha256=file.sha256)
+        for path, file in zip(given.paths, given.files, strict=True)
+    )
+
+
+def _executor_of(
+    plan: RunPlan, scratch: Path, tell: Tell, is_asked_to_stop: Callable[[], bool]
+) -> Executor:
+    """Give the executor that the options of a run name.
+
+    Args:
+        plan: of the run.
+        scratch: its scratch folder.
+        tell: takes what steps say.
+        is_asked_to_stop: whether somebody interrupts the run.
+
+    Raises:
+        PluginError: its library is not installed.
+    """
+    options = plan.options
+    capacity = Capacity.of_jobs(options.jobs, options.all_cores)
+    if options.executor == "dask":
+        try:
+            from orthoflow.engine.dask_executor import DaskExecutor  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise PluginError(
+                "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
+            ) from error
+        return DaskExecutor(plan, scratch, capacity, tell)
+    if options.executor == "inline":
+        return InlineExecutor(capacity, tell, is_asked_to_stop)
+    return LocalExecutor(capacity, tell)
+
+
+class Interruption:
+    """Whether the run was asked to stop.
+
+    Attributes:
+        is_asked: a signal came.
+    """
+
+    def __init__(self) -> None:
+        self.is_asked = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal; a second one does not wait for anybody.
+
+        Raises:
+            KeyboardInterrupt: asked a second time.
+        """
+        if self.is_asked:
+            raise KeyboardInterrupt
+        self.is_asked = True
+
+
+@contextmanager
+def _watching_interruptions() -> Iterator[Interruption]:
+    """Catch SIGINT and SIGTERM inside the block; only the main thread can, others never see any."""
+    interruption = Interruption()
+    if threading.current_thread() is not threading.main_thread():
+        yield interruption
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, interruption) for number in numbers}
+    try:
+        yield interruption
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,481 @@
+"""Executors of one machine: a process per task, guarded against everything it may do, or none."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Final, Protocol
+
+from pydantic import TypeAdapter
+
+from orthoflow.engine.clock import now
+from orthoflow.engine.durability import write_whole, writing_to
+from orthoflow.engine.kernels import kernel_folder, kernels_in
+from orthoflow.engine.memory import GIB, MIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.processes import ask_to_end, end_tree, start_step
+from orthoflow.engine.results import CellResult, result_from_json
+from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_task
+from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
+from orthoflow.foreign_text import shown
+from orthoflow.sdk.context import StepEvent
+from orthoflow.sdk.lines import one_line
+from orthoflow.system import address_space, flags, read_at
+
+Tell = Callable[[str, StepEvent], None]
+_GRACE_S: Final = 5.0
+# So many messages are taken at once: a step that never stops must not keep us from its timeout.
+_MOST_MESSAGES: Final = 256
+_LARGEST_MESSAGE: Final = 64 << 20
+_LONGEST_LAST_LINE: Final = 300
+# Of a long log the end is kept: what went wrong stands last.
+_LOOKS: Final = 10
+_KEPT_BYTES: Final = 256 << 10
+_LARGEST_LOG: Final = 8 << 20
+_MOST_LINES: Final = 2000
+_CRASHES: Final = {
+    signal.SIGSEGV: "segmentation fault",
+    signal.SIGBUS: "bus error, as when the disk is full under a memory-mapped file",
+    signal.SIGABRT: "abort",
+    signal.SIGFPE: "arithmetic error",
+    signal.SIGILL: "illegal instruction",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskEnd:
+    """A task that ended.
+
+    Attributes:
+        address: of its cell.
+        result: ok or failed, never skipped.
+    """
+
+    address: str
+    result: CellResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capacity:
+    """What may run at the same time.
+
+    Attributes:
+        n_tasks: tasks.
+        n_cores: cores of all of them.
+        cores_of_one: the most that one may have.
+        share: what one gets that asks for nothing.
+    """
+
+    n_tasks: int
+    n_cores: int
+    cores_of_one: int
+    share: int
+
+    @classmethod
+    def of_jobs(cls, jobs: int, n_cores: int) -> Capacity:
+        """So many jobs that share the cores of one machine."""
+        share = max(1, n_cores // jobs)
+        return cls(n_tasks=jobs, n_cores=n_cores, cores_of_one=n_cores, share=share)
+
+
+class Executor(Protocol):
+    """Runs tasks; used from one thread.
+
+    Nothing here assumes one machine: a task is JSON, its results lie in the store.
+    """
+
+    @property
+    def capacity(self) -> Capacity:
+        """What may run at the same time, now."""
+
+    def start(self, task: Task) -> None:
+        """Begin a task, or put it in line.
+
+        Raises:
+            StoreError: its files cannot be written.
+        """
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
+
+    def cancel(self) -> None:
+        """Ask all tasks to stop; they still end through `poll`, after a grace period by force."""
+
+    def close(self) -> None:
+        """Stop whatever still runs, at once."""
+
+
+class InlineExecutor:
+    """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
+
+    def __init__(self, capacity: Capacity, tell: Tell, is_interrupted: Callable[[], bool]) -> None:
+        """Make one.
+
+        Args:
+            capacity: what a task may have.
+            tell: gets the address of a task and what it says.
+            is_interrupted: whether the user asked to stop, also while a task runs.
+        """
+        self.capacity = capacity
+        self._tell = tell
+        self._is_interrupted = is_interrupted
+        self._waiting: deque[Task] = deque()
+        self._is_cancelled = False
+
+    def start(self, task: Task) -> None:
+        """Put a task in line."""
+        self._waiting.append(task)
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Run the next task to its end; the timeout means nothing here."""
+        if not self._waiting:
+            return ()
+        task = self._waiting.popleft()
+        if self._is_cancelled:
+            reason = CancelledStepError(f"step {task.address} was interrupted")
+            return (TaskEnd(address=task.address, result=failed_result(task, reason)),)
+        log: deque[str] = deque(maxlen=_MOST_LINES)
+
+        def listen(event: StepEvent) -> None:
+            if event.kind != "progress":
+                log.append(shown(event.text, keep="\n"))
+            self._tell(task.address, event)
+
+        with kernels_in(kernel_folder(task.kernels)):
+            result = run_task(task, listen, self._is_interrupted)
+        text = "".join(f"{line}\n" for line in log)
+        write_whole(Path(task.log), text.encode())
+        return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)
+
+    def cancel(self) -> None:
+        """Let the tasks in line end without running; none runs while this is called."""
+        self._is_cancelled = True
+
+    def close(self) -> None:
+        """Forget the tasks in line."""
+        self._waiting.clear()
+
+
+class StepLog:
+    """An open log that another process appends to, while this one keeps it short.
+
+    It stays open: under its name there may be anything by the time that the step has ended.
+
+    Attributes:
+        path: under which the other process opens it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Begin an empty log.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
+        self.path = path
+        opened = flags("O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND", "O_NOFOLLOW")
+        with writing_to(path.parent):
+            self._descriptor = os.open(path, opened, 0o666)
+        self._n_dropped = 0
+        self._notice = b""
+
+    def shorten(self) -> None:
+        """Drop all but the end of a log that has grown too long; who appends goes on behind it."""
+        size = os.fstat(self._descriptor).st_size
+        if size <= _LARGEST_LOG:
+            return
+        tail = self._tail(size)
+        # What is written between the look and the cut is lost: look again until nothing was.
+        for _ in range(_LOOKS):
+            grown = os.fstat(self._descriptor).st_size
+            if grown == size:
+                break
+            size, tail = grown, self._tail(grown)
+        self._n_dropped += size - len(self._notice) - len(tail)
+        self._notice = f"... ({self._n_dropped} bytes before)\n".encode()
+        # A full disk costs the log, not the run.
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._descriptor, 0)
+            os.write(self._descriptor, self._notice + tail)
+
+    def text(self) -> str:
+        """The end of the log, without the NUL characters that no text in a record may have."""
+        size = os.fstat(self._descriptor).st_size
+        tail = self._tail(size)
+        text = tail.decode("utf-8", errors="replace").replace("\0", "")
+        n_before = self._n_dropped + size - len(self._notice) - len(tail)
+        return text if size == len(tail) else f"... ({n_before} bytes before)\n{text}"
+
+    def close(self) -> None:
+        """Close it; nothing can be asked any more."""
+        os.close(self._descriptor)
+
+    def _tail(self, size: int) -> bytes:
+        return read_at(self._descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
+
+
+@dataclass(kw_only=True)
+class _Running:
+    """A task and its process.
+
+    Attributes:
+        task: the task.
+        process: of the step.
+        pipe: what it says.
+        log: what it prints.
+        started: ISO 8601 UTC.
+        clock: monotonic seconds at the start.
+        oom_kills: the kernel's counter at the start.
+        reason: why we stopped it; None as long as we did not.
+        is_victim: stopped for want of memory.
+        kill_at: when it has had its time to end by itself, monotonic seconds.
+        peak_bytes: largest own memory seen from outside.
+        result: what it sent.
+    """
+
+    task: Task
+    process: BaseProcess
+    pipe: Connection
+    log: StepLog
+    started: str
+    clock: float
+    oom_kills: int
+    reason: OrthoflowError | None = None
+    is_victim: bool = False
+    kill_at: float | None = None
+    peak_bytes: int = 0
+    result: CellResult | None = None
+
+
+# By process, what runs, of all executors here: a cluster's workers in this process have one each.
+_all_running: Final[dict[int, _Running]] = {}
+
+
+@dataclass
+class LocalExecutor:
+    """Runs each task in a process of its own."""
+
+    capacity: Capacity
+    tell: Tell
+    _running: dict[str, _Running] = field(default_factory=dict)
+    _guard: MemoryGuard = field(default_factory=MemoryGuard)
+    _unstarted: list[TaskEnd] = field(default_factory=list)
+
+    def start(self, task: Task) -> None:
+        """Start the process of a task.
+
+        Raises:
+            StoreError: its files cannot be written.
+        """
+        with writing_to(Path(task.folder).parent):
+            task.scratch.mkdir(parents=True, exist_ok=True)
+        log, kills = StepLog(Path(task.log)), oom_kills()
+        try:
+            process, pipe = start_step(task)
+        except StepFailedError as error:
+            log.close()
+            self._unstarted.append(TaskEnd(address=task.address, result=failed_result(task, error)))
+            return
+        run = _Running(
+            task=task,
+            process=process,
+            pipe=pipe,
+            log=log,
+            started=now(),
+            clock=time.monotonic(),
+            oom_kills=kills,
+        )
+        self._running[task.address] = _all_running[_pid(run)] = run
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
+        unstarted, self._unstarted = tuple(self._unstarted), []
+        waited = [run.process.sentinel for run in self._running.values()]
+        heard = [run.pipe for run in self._running.values() if not run.pipe.closed]
+        wait([*heard, *waited], 0.0 if unstarted else min(timeout_s, self._guard.interval_s))
+        # Asked for before the last words are taken: nothing is said after the end.
+        ended = [run for run in self._running.values() if not run.process.is_alive()]
+        for run in self._running.values():
+            self._hear(run)
+        ends = tuple(self._end(run) for run in ended)
+        self._watch()
+        return unstarted + ends
+
+    def cancel(self) -> None:
+        """Ask all tasks to stop: SIGTERM, and SIGKILL when they do not within 5 s."""
+        for run in self._running.values():
+            self._stop(run, CancelledStepError(f"step {run.task.address} was interrupted"))
+
+    def close(self) -> None:
+        """Kill whatever still runs."""
+        for run in list(self._running.values()):
+            end_tree(run.process)
+            run.process.join(_GRACE_S)
+            self._forget(run)
+
+    def _hear(self, run: _Running) -> None:
+        for _ in range(_MOST_MESSAGES):
+            if run.pipe.closed:
+                return
+            try:
+                if not run.pipe.poll(0):
+                    return
+                message = run.pipe.recv_bytes(_LARGEST_MESSAGE)
+            except (EOFError, OSError):
+                # Ended, or it wrote there what is no message.
+                run.pipe.close()
+                return
+            self._take(run, message)
+
+    def _take(self, run: _Running, message: bytes) -> None:
+        # A method may write into the pipe by mistake: what says nothing is passed over.
+        with contextlib.suppress(ValueError, StoreError, RecursionError):
+            if message.startswith(RESULT):
+                text = message.removeprefix(RESULT).decode()
+                result = result_from_json(text, f"the result of {run.task.address}")
+                run.result = result if result.key == run.task.key else None
+            elif message.startswith(EVENT):
+                event = _events().validate_json(message.removeprefix(EVENT), strict=True)
+                self.tell(run.task.address, event)
+
+    def _watch(self) -> None:
+        time_now = time.monotonic()
+        for run in self._running.values():
+            run.peak_bytes = max(run.peak_bytes, process_memory(_pid(run)))
+            run.log.shorten()
+            limit = run.task.timeout_s
+            if run.kill_at is not None and time_now > run.kill_at:
+                end_tree(run.process)
+                run.kill_at = time_now + _GRACE_S
+            elif limit is not None and run.reason is None and time_now - run.clock > limit:
+                self._stop(run, describe_timeout(run.task.who, limit))
+        self._guard_memory()
+
+    def _guard_memory(self) -> None:
+        runs = {str(pid): run for pid, run in _all_running.copy().items()}
+        victim = self._guard.check({name: _pid(run) for name, run in runs.items()})
+        # One at a time: the memory of a dying process is not free at once.
+        if victim is None or any(run.is_victim for run in runs.values()):
+            return
+        run = runs[victim.address]
+        if self._running.get(run.task.address) is not run:
+            # Its own executor stops it.
+            return
+        run.is_victim = True
+        run.reason = describe_memory(run.task.who, victim.n_bytes)
+        run.peak_bytes = max(run.peak_bytes, victim.n_bytes)
+        end_tree(run.process)
+        run.kill_at = time.monotonic() + _GRACE_S
+
+    def _stop(self, run: _Running, reason: OrthoflowError) -> None:
+        if run.reason is None:
+            run.reason = reason
+            run.kill_at = time.monotonic() + _GRACE_S
+            ask_to_end(run.process)
+
+    def _end(self, run: _Running) -> TaskEnd:
+        end_tree(run.process)
+        run.log.shorten()
+        result = dataclasses.replace(_result(run), log=run.log.text())
+        self._forget(run)
+        return TaskEnd(address=run.task.address, result=result)
+
+    def _forget(self, run: _Running) -> None:
+        run.log.close()
+        run.pipe.close()
+        del _all_running[_pid(run)]
+        del self._running[run.task.address]
+        if not run.process.is_alive():
+            run.process.close()
+
+
+def _pid(run: _Running) -> int:
+    assert run.process.pid is not None  # noqa: S101 - it was started
+    return run.process.pid
+
+
+def _result(run: _Running) -> CellResult:
+    peak_mib = round(run.peak_bytes / MIB, 1)
+    if run.reason is None and run.result is not None:
+        peak_mib = max(run.result.peak_rss_mib, peak_mib)
+        return dataclasses.replace(run.result, peak_rss_mib=peak_mib)
+    return dataclasses.replace(
+        failed_result(run.task, run.reason or _reason_of_silence(run)),
+        started=run.started,
+        ended=now(),
+        wall_s=round(time.monotonic() - run.clock, 4),
+        peak_rss_mib=peak_mib,
+    )
+
+
+@cache
+def _events() -> TypeAdapter[StepEvent]:
+    return TypeAdapter(StepEvent)
+
+
+def _reason_of_silence(run: _Running) -> OrthoflowError:
+    code = run.process.exitcode or 0
+    if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
+        return describe_memory(run.task.who, run.peak_bytes)
+    tail = one_line(run.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
+    return StepFailedError(describe_exit(run.task.who, code, run.peak_bytes, tail))
+
+
+def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
+    """Say how a process ended that left no result.
+
+    Args:
+        who: method and distribution, as `Task.who` has them.
+        code: as `subprocess` has it, negative for signals.
+        n_bytes: largest memory seen.
+        tail: last line of its log.
+    """
+    if code >= 0:
+        last = f"; its log ends with: {tail}" if tail else ""
+        return f"{who} ended its process without a result (exit status {code}){last}"
+    name = _signal_name(-code)
+    if -code in _CRASHES:
+        limit = address_space()
+        room = f"; a process may take {limit / MIB:.0f} MiB of memory here" if limit else ""
+        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name}){room}"
+    return f"{who} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB of memory"
+
+
+def describe_memory(who: str, n_bytes: int) -> StepFailedError:
+    """Say that a step was stopped for want of memory."""
+    return StepFailedError(
+        f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
+        f"stopped); give it less data or coarser parameters"
+    )
+
+
+def describe_timeout(who: str, limit_s: float) -> StepFailedError:
+    """Say that a step took longer than its workflow allows."""
+    return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as people say it.
+
+    >>> [duration(s) for s in (0.5, 90, 1800, 7200)]
+    ['0.5 s', '90 s', '30 min', '2 h']
+    """
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= length and seconds % length == 0:
+            return f"{seconds / length:g} {unit}"
+    return f"{seconds:g} s"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

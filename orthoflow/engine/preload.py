@@ -1,0 +1,64 @@
+"""What every step needs, loaded once in the process that steps are forked from.
+
+Never a plugin: no third-party code of a plugin runs in the process that others come from.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+from contextlib import suppress
+from typing import Final
+
+from orthoflow.system import address_space
+
+_LIBRARIES: Final = (
+    "numba",
+    "scipy.interpolate",
+    "scipy.linalg",
+    "scipy.ndimage",
+    "scipy.optimize",
+    "scipy.spatial",
+    "scipy.stats",
+    "cv2",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.figure",
+    "PIL.JpegImagePlugin",
+    "rasterio",
+    "orthoflow.engine.worker",
+    "orthoflow.files.publishing",
+    "orthoflow_provenance.arrays",
+)
+
+
+def load_libraries() -> None:
+    """Load libraries; steps report what is wrong with one of them."""
+    if address_space() is not None:
+        # Some crash where they get too little memory, and every step with them.
+        return
+    for name in _LIBRARIES:
+        with suppress(Exception):
+            importlib.import_module(name)
+            if name == "numba":
+                _register_compiler()
+    gc.collect()
+    gc.freeze()
+
+
+def _register_compiler() -> None:
+    """Let numba register what it can compile, as it does for the first kernel of a process.
+
+    That takes longer than loading numba. Its extensions, which third parties install, are left to
+    each step, which looks for them again.
+    """
+    from numba.core import entrypoints  # noqa: PLC0415 - only where numba is there
+    from numba.core.registry import cpu_target  # noqa: PLC0415
+
+    entrypoints._already_initialized = True  # noqa: SLF001 - numba offers nothing else
+    try:
+        cpu_target.target_context.refresh()
+    finally:
+        entrypoints._already_initialized = False  # noqa: SLF001
+
+
+load_libraries()
