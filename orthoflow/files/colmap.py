@@ -2,7 +2,7 @@
 
 COLMAP counts pixels as orthoflow does, the centre of the first one at (0.5, 0.5), and has the same
 camera axes, so nothing is converted. The points written are the ties that the orientation kept.
-Models are read by pycolmap.
+Models are read and written by pycolmap.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import ArgumentError, InputError, PluginError
+from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.files.cube_faces import FisheyeLens, face_lens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
@@ -33,9 +32,7 @@ from orthoflow.files.given_cameras import (
     rotation_of,
 )
 from orthoflow.files.photo_files import MOST_PIXELS
-from orthoflow.files.sidecars import write_text
 from orthoflow.foreign_text import open_file, reading
-from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 
 # Our names of the parameters of models that OpenCV's hold; COLMAP's own differ for one.
@@ -75,6 +72,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
 
     Raises:
         ArgumentError: no photo is oriented, or a photo's name has spaces.
+        PluginError: pycolmap is missing.
         StoreError: a file cannot be written.
     """
     oriented = [camera for camera in cameras.cameras if camera.status == "ok"]
@@ -87,37 +85,65 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
                 f'{camera.photo}": rename the photo and run again'
             )
     lenses = list(dict.fromkeys(_lens(camera) for camera in oriented))
-    seen = _KeptTies(oriented, cameras.ties)
-    write_text(folder / "cameras.txt", _cameras_text(lenses))
-    write_text(folder / "images.txt", _images_text(oriented, lenses, seen))
-    write_text(folder / "points3D.txt", _points_text(seen))
-    return ColmapModel(
-        n_cameras=len(lenses), n_images=len(oriented), n_points=len(seen.points_world)
+    pycolmap = _pycolmap("writing a COLMAP model")
+    model = pycolmap.Reconstruction()
+    for number, lens in enumerate(lenses, start=1):
+        k1, k2, p1, p2, k3 = lens.distortion
+        params = [lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, p1, p2]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=number,
+                model="FULL_OPENCV" if k3 else "OPENCV",
+                width=lens.width,
+                height=lens.height,
+                params=[*params, k3, 0.0, 0.0, 0.0] if k3 else params,
+            )
+        )
+    seen = [_kept_ties(cameras.ties, camera.photo) for camera in oriented]
+    for number, (camera, ties) in enumerate(zip(oriented, seen, strict=True), start=1):
+        viewer = camera.viewing()
+        image = pycolmap.Image(
+            name=camera.photo, camera_id=lenses.index(_lens(camera)) + 1, image_id=number
+        )
+        image.points2D = [pycolmap.Point2D(xy) for xy in ties[:, :2]]
+        pose = pycolmap.Rigid3d(np.column_stack([viewer.rotation, viewer.translation]))
+        model.add_image_with_trivial_frame(image, pose)
+    # A place that several photos see is one point.
+    image_of = np.concatenate([np.full(len(ties), k) for k, ties in enumerate(seen, start=1)])
+    nth = np.concatenate([np.arange(len(ties)) for ties in seen])
+    tied = np.concatenate(seen)
+    places, of_place, counts = np.unique(
+        tied[:, 2:5], axis=0, return_inverse=True, return_counts=True
     )
+    groups = np.split(np.argsort(of_place.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+    for place, own in zip(places, groups, strict=False):
+        track = pycolmap.Track()
+        for at in own:
+            track.add_element(int(image_of[at]), int(nth[at]))
+        point = model.add_point3D(place, track, np.full(3, 128, dtype=np.uint8))
+        model.points3D[point].error = float(tied[own, 5].mean())
+    try:
+        model.write_text(str(folder))
+    except Exception as error:  # pycolmap raises what its checks in C++ become
+        raise StoreError(f"the COLMAP model cannot be written: {error}; free some space") from error
+    return ColmapModel(n_cameras=len(lenses), n_images=len(oriented), n_points=len(places))
 
 
-class _KeptTies:
-    """The ties that count: places on the walls, and where the photos have them."""
+def _pycolmap(purpose: str) -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise PluginError(f"{purpose} needs pycolmap: pip install pycolmap") from error
+    return pycolmap
 
-    def __init__(self, oriented: list[Camera], ties: Ties | None) -> None:
-        self.observations: list[NDArray[np.intp]] = [np.empty(0, np.intp) for _ in oriented]
-        self.pixels, self.points_world = np.empty((0, 2)), np.empty((0, 3))
-        self.point, self.errors_px = np.empty(0, np.intp), np.empty(0)
-        self.image, self.nth = np.empty(0, np.intp), np.empty(0, np.intp)
-        if ties is None:
-            return
-        names = {camera.photo: index for index, camera in enumerate(oriented)}
-        image = np.array([names.get(name, -1) for name in ties.photo_names], dtype=np.intp)
-        kept = np.flatnonzero((ties.role != TieRole.REJECTED) & (image[ties.photo] >= 0))
-        self.image, self.pixels = image[ties.photo[kept]], ties.pixels_photo[kept]
-        self.errors_px = np.linalg.norm(ties.residual_px[kept], axis=1)
-        # A place that several photos see is one point.
-        self.points_world, place = np.unique(ties.points_world[kept], axis=0, return_inverse=True)
-        self.point = place.ravel()
-        self.observations = [np.flatnonzero(self.image == index) for index in range(len(oriented))]
-        self.nth = np.zeros(len(kept), dtype=np.intp)
-        for mine in self.observations:
-            self.nth[mine] = np.arange(len(mine))
+
+def _kept_ties(ties: Ties | None, photo: str) -> NDArray[np.float64]:
+    """Ties of a photo that its orientation kept (n, 6): pixel, place, length of the residual."""
+    if ties is None or photo not in ties.photo_names:
+        return np.empty((0, 6))
+    mine = (ties.photo == ties.photo_names.index(photo)) & (ties.role != TieRole.REJECTED)
+    errors_px = np.linalg.norm(ties.residual_px[mine], axis=1)
+    return np.column_stack([ties.pixels_photo[mine], ties.points_world[mine], errors_px])
 
 
 def _lens(camera: Camera) -> Intrinsics:
@@ -131,50 +157,6 @@ def _lens(camera: Camera) -> Intrinsics:
     return camera.intrinsics
 
 
-def _cameras_text(lenses: list[Intrinsics]) -> str:
-    lines = ["# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for number, lens in enumerate(lenses, start=1):
-        k1, k2, p1, p2, k3 = lens.distortion
-        values = [lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, p1, p2]
-        model = "OPENCV"
-        if k3 != 0.0:
-            model, values = "FULL_OPENCV", [*values, k3, 0.0, 0.0, 0.0]
-        lines.append(f"{number} {model} {lens.width} {lens.height} {_words(values)}")
-    return "\n".join(lines) + "\n"
-
-
-def _images_text(oriented: list[Camera], lenses: list[Intrinsics], seen: _KeptTies) -> str:
-    lines = [
-        "# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "# and on a second line POINTS2D[] as X, Y, POINT3D_ID",
-    ]
-    for index, camera in enumerate(oriented):
-        viewer = camera.viewing()
-        pose = [*quaternion_from_rotation(viewer.rotation), *viewer.translation]
-        lens = lenses.index(_lens(camera)) + 1
-        lines.append(f"{index + 1} {_words(pose)} {lens} {camera.photo}")
-        lines.append(
-            " ".join(
-                f"{_words(seen.pixels[at])} {int(seen.point[at]) + 1}"
-                for at in seen.observations[index]
-            )
-        )
-    return "\n".join(lines) + "\n"
-
-
-def _points_text(seen: _KeptTies) -> str:
-    lines = ["# Point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as IMAGE_ID, POINT2D_IDX"]
-    order = np.argsort(seen.point, kind="stable")
-    ends = np.searchsorted(seen.point[order], np.arange(len(seen.points_world)), side="right")
-    for index, (first, last) in enumerate(pairwise([0, *ends.tolist()])):
-        own = order[first:last]
-        track = " ".join(f"{seen.image[at] + 1} {seen.nth[at]}" for at in own)
-        error = float(np.mean(seen.errors_px[own]))
-        place = _words(seen.points_world[index])
-        lines.append(f"{index + 1} {place} 128 128 128 {error!r} {track}")
-    return "\n".join(lines) + "\n"
-
-
 def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     """Read the orientations of a model by pycolmap, as text or binary, with rigs where it has them.
 
@@ -186,12 +168,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
         InputError: the model is damaged.
         PluginError: pycolmap is missing.
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise PluginError(
-            f"reading the COLMAP model of {parts[0].name} needs pycolmap: pip install pycolmap"
-        ) from error
+    pycolmap = _pycolmap(f"reading the COLMAP model of {parts[0].name}")
     images = next(path for path in parts if path.stem.lower() == "images")
     suffix = images.suffix.lower()
     for path in parts:
@@ -328,8 +305,3 @@ def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | FisheyeLens | str, s
     rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64)
     nearest, worst_px = nearest_lens(lens, rays, pixels)
     return lens_or_reason(f"its camera of the model {model}", nearest, worst_px, _UNDISTORT)
-
-
-def _words(values: list[float] | NDArray[np.float64]) -> str:
-    """Shortest texts that give the numbers back."""
-    return " ".join(repr(float(value)) for value in values)

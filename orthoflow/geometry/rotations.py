@@ -34,24 +34,6 @@ def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrices
 
 
-def quaternion_from_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion (4,) = (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
-
-    The eigenvector after Bar-Itzhack 2000, which is exact at every angle.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    matrix = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quaternion: NDArray[np.float64] = np.linalg.eigh(matrix)[1][:, -1]
-    return -quaternion if quaternion[0] < 0.0 else quaternion
-
-
 def rotation_from_quaternion(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrix (3, 3) of a unit quaternion (4,) = (w, x, y, z)."""
     w, vector = quaternion[0], quaternion[1:]

@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
+from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import InputError
 from orthoflow.files import e57_images
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images, read_e57_images
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
-from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Cameras, InputFiles, Photos
 from orthoflow.sdk import StepContext
 from tests import photo_files, scan_files, scenes
@@ -40,7 +40,7 @@ def pinhole(**more: Any) -> dict[str, Any]:
         "kind": "pinhole",
         "content": encode_jpeg(PICTURE),
         "numbers": NUMBERS,
-        "rotation": quaternion_from_rotation(ROTATION),
+        "rotation": Rotation.from_matrix(ROTATION).as_quat(scalar_first=True),
         "translation": CENTRE,
         **more,
     }
@@ -121,7 +121,7 @@ def spherical(width: int = 720, height: int = 360, **more: Any) -> dict[str, Any
             "pixelWidth": 2 * np.pi / width,
             "pixelHeight": np.pi / height,
         },
-        "rotation": quaternion_from_rotation(ROTATION),
+        "rotation": Rotation.from_matrix(ROTATION).as_quat(scalar_first=True),
         "translation": CENTRE,
         **more,
     }

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from orthoflow.geometry.rotations import (
     cross_matrices,
     cross_matrix,
-    quaternion_from_rotation,
     rotation_from_vector,
 )
 
@@ -28,15 +27,3 @@ def test_cross_matrices_multiply_like_the_cross_product() -> None:
     found = np.einsum("nij,nj->ni", cross_matrices(first), second)
     np.testing.assert_allclose(found, np.cross(first, second), atol=1e-14)
     np.testing.assert_array_equal(cross_matrix(first[3]), cross_matrices(first)[3])
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_quaternions_are_those_of_their_rotation(angle: float) -> None:
-    rotation = Rotation.from_rotvec(angle * np.array([0.48, -0.6, 0.64]))
-    found = quaternion_from_rotation(rotation.as_matrix())
-    x, y, z, w = rotation.as_quat(canonical=True)
-    assert found[0] >= 0.0
-    side = 1.0 if found @ [w, x, y, z] > 0.0 else -1.0
-    np.testing.assert_allclose(side * found, [w, x, y, z], atol=1e-12)
-    # Which of two is meant is open at half a turn only.
-    assert side == 1.0 or abs(w) < 1e-12
