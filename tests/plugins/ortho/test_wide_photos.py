@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
+from scipy.spatial.transform import Rotation
 
 from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import InputFiles, Layer, LayerMask
 from tests import scan_files
 from tests.box_rooms import BoxRoom
@@ -56,7 +57,7 @@ def fisheye(folder: Path) -> tuple[Path, tuple[Path, ...]]:
     lens = [FISHEYE.fx, FISHEYE.fy, FISHEYE.cx, FISHEYE.cy, *FISHEYE.radial]
     model[0].write_text(f"1 OPENCV_FISHEYE {FISHEYE.width} {FISHEYE.height} {words(lens)}\n")
     turn = WORLD_FROM_CAMERA.T
-    pose = words([*quaternion_from_rotation(turn), *(-turn @ CENTRE)])
+    pose = words([*Rotation.from_matrix(turn).as_quat(scalar_first=True), *(-turn @ CENTRE)])
     model[1].write_text(f"1 {pose} 1 fish.png\n\n")
     return photo, tuple(model)
 
@@ -93,7 +94,7 @@ def panorama_inside_e57(folder: Path) -> tuple[Path, tuple[Path, ...]]:
             "pixelWidth": 2 * np.pi / width,
             "pixelHeight": np.pi / height,
         },
-        rotation=quaternion_from_rotation(rotation),
+        rotation=Rotation.from_matrix(rotation).as_quat(scalar_first=True),
     )
 
 
@@ -115,7 +116,9 @@ def pinhole_inside_e57(folder: Path) -> tuple[Path, tuple[Path, ...]]:
             "principalPointX": cx,
             "principalPointY": cy,
         },
-        rotation=quaternion_from_rotation(WORLD_FROM_CAMERA @ np.diag([1.0, -1.0, -1.0])),
+        rotation=Rotation.from_matrix(WORLD_FROM_CAMERA @ np.diag([1.0, -1.0, -1.0])).as_quat(
+            scalar_first=True
+        ),
     )
 
 
