@@ -5,19 +5,20 @@ from __future__ import annotations
 import csv
 import difflib
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
-from typing import ClassVar, Final, TypeVar
+from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.sidecars import MOST_WALLS
 from orthoflow.foreign_text import text_of_file
 
-_MEASURED: Final = ("wall", "u_px", "v_px")
+_POSITION: Final = ("x", "y", "z")
+_IN_IMAGE: Final = ("u_px", "v_px")
 _IN_MAP: Final = ("map_x", "map_y")
 _IN_SPACE: Final = ("shown_x", "shown_y", "shown_z")
-_TWICE: Final = "measured twice, as {} and as {}: leave one of them out"
 _SEPARATORS: Final = (";", "\t", ",")
 MOST_BYTES: Final = 20_000_000
 MOST_POINTS: Final = 100_000
@@ -73,8 +74,28 @@ def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
     Raises:
         InputError: the file cannot be used; one line per problem, `file:line: ...`.
     """
-    reader = _TieReader(path.name)
-    return reader.checked(reader.ties(_text_of(path, reader.form)))
+    required = ("photo", *_IN_IMAGE, *_POSITION)
+    table = _Table(path, content="ties", required=required, single=("sigma_px",))
+    ties = []
+    for line, cells in table.rows():
+        if not cells["photo"]:
+            table.add(line, "the name of the photo is missing")
+        u, v, x, y, z = table.numbers(line, cells, required[1:])
+        sigma_px = None
+        if cells.get("sigma_px"):
+            (sigma_px,) = table.numbers(line, cells, ("sigma_px",))
+            if sigma_px <= 0.0:
+                table.add(line, f"sigma_px must be positive, got {cells['sigma_px']}")
+        tie = MeasuredTie(
+            where=f"{path.name}:{line}",
+            photo=cells["photo"],
+            pixel=(u, v),
+            position=(x, y, z),
+            sigma_px=sigma_px,
+        )
+        ties.append(tie)
+    table.check()
+    return tuple(ties)
 
 
 def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
@@ -89,289 +110,192 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     Raises:
         InputError: the file cannot be used; one line per problem, `file:line: ...`.
     """
-    reader = _PointReader(path.name)
-    return reader.checked(reader.points(_text_of(path, reader.form)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Form:
-    """Columns of a table.
-
-    Attributes:
-        content: what its lines are.
-        required: columns that are always there.
-        known: all columns, in the order of a table whose first line does not name them.
-        bare: how many such a table may have.
-        together: columns of which all are there or none.
-        instead: groups of columns that stand for them, of each of which all are there or none;
-            the first of `together` may go with them.
-    """
-
-    content: str
-    required: tuple[str, ...]
-    known: tuple[str, ...]
-    bare: tuple[int, ...]
-    together: tuple[str, ...] = ()
-    instead: tuple[tuple[str, ...], ...] = ()
-
-
-_POINTS: Final = _Form(
-    content="points",
-    required=("name", "x", "y", "z"),
-    known=("name", "x", "y", "z", "class", *_MEASURED, *_IN_MAP, *_IN_SPACE),
-    bare=(4, 5),
-    together=_MEASURED,
-    instead=(_IN_MAP, _IN_SPACE),
-)
-_TIES: Final = _Form(
-    content="ties",
-    required=("photo", "u_px", "v_px", "x", "y", "z"),
-    known=("photo", "u_px", "v_px", "x", "y", "z", "sigma_px"),
-    bare=(6, 7),
-)
-
-
-def _text_of(path: Path, form: _Form) -> str:
-    what = f"a CSV file of {form.content} with the columns {','.join(form.required)}"
-    return text_of_file(path, MOST_BYTES, what)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Row:
-    line: int
-    cells: tuple[str, ...]
-
-
-_Item = TypeVar("_Item")
-
-
-class _TableReader:
-    """Turns lines into rows of a table and collects everything that is wrong with them."""
-
-    form: ClassVar[_Form]
-
-    def __init__(self, file_name: str) -> None:
-        self.file_name = file_name
-        self.problems: list[str] = []
-
-    def checked(self, items: tuple[_Item, ...]) -> tuple[_Item, ...]:
-        """Give what was read, or say what is wrong with it."""
-        if self.problems:
-            left_out = len(self.problems) - _MAX_PROBLEMS
-            more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
-        return items
-
-    def _table(self, text: str) -> Iterator[tuple[_Row, dict[str, str]]]:
-        """Give the rows that have a cell for every column."""
-        form, rows = self.form, list(_rows(text))
-        if rows and len(rows[-1].cells) == 0:
-            self._add(
-                rows[-1],
-                f"the line is longer than {MOST_LINE} letters: this is no list"
-                if len(rows) <= MOST_POINTS
-                else f"the file holds more than {MOST_POINTS} {form.content}: split it",
-            )
-            return
-        if not rows:
-            self.problems.append(
-                f"{self.file_name} holds no {form.content}: expected {','.join(form.required)} "
-                "per line"
-            )
-            return
-        columns = self._columns(rows[0])
-        if columns is None:
-            return
-        body = rows[1:] if _is_header(rows[0]) else rows
-        if not body:
-            self._add(rows[0], f"only the names of the columns, no {form.content}")
-        for row in body:
-            if len(row.cells) == len(columns):
-                yield row, dict(zip(columns, row.cells, strict=True))
-                continue
-            hint = "; write decimal points, not commas" if len(row.cells) > len(columns) else ""
-            self._add(row, f"expected {len(columns)} columns, got {len(row.cells)}{hint}")
-
-    def _columns(self, first: _Row) -> tuple[str, ...] | None:
-        form = self.form
-        if not _is_header(first):
-            if len(first.cells) in form.bare:
-                return form.known[: len(first.cells)]
-            single = [
-                name
-                for name in form.known[len(form.required) :]
-                if name not in sum(form.instead, form.together)
-            ]
-            optional = [f"[,{name}]" for name in single]
-            optional += [f"[,{','.join(form.together)}]"] if form.together else []
-            self._add(
-                first,
-                f"expected the names of the columns, {','.join(form.required)}"
-                f"{''.join(optional)}, got {len(first.cells)} values without names",
-            )
-            return None
-        names = tuple(cell.lower() for cell in first.cells)
-        n_before = len(self.problems)
-        for name in names:
-            if name not in form.known:
-                near = difflib.get_close_matches(name, form.known, n=1)
-                hint = f" (did you mean {near[0]}?)" if near else ""
-                self._add(first, f"unknown column {name}{hint}; known are {', '.join(form.known)}")
-            elif names.count(name) > 1:
-                self._add(first, f"the column {name} is there {names.count(name)} times")
-        missing = [name for name in form.required if name not in names]
-        if missing:
-            self._add(first, f"the column {', '.join(missing)} is missing")
-        self._check_groups(first, names)
-        return names if len(self.problems) == n_before else None
-
-    def _check_groups(self, first: _Row, names: tuple[str, ...]) -> None:
-        """Say which columns lack others that belong to them."""
-        together = self.form.together
-        given = [name for name in together if name in names]
-        groups = [([name for name in group if name in names], group) for group in self.form.instead]
-        if any(there for there, _ in groups) and given == [together[0]]:
-            given = []
-        for there, group in (*groups, (given, together)):
-            if there and len(there) < len(group):
-                only = ", ".join(there)
-                self._add(first, f"{', '.join(group)} belong together, got only {only}")
-
-    def _number(self, row: _Row, key: str, cell: str) -> float:
-        number = _as_number(cell)
-        if number is None or not math.isfinite(number):
-            has_decimal_comma = "," in cell and _as_number(cell.replace(",", ".")) is not None
-            hint = "; write a decimal point" if has_decimal_comma else ""
-            self._add(row, f"{key} must be a number, got {cell or 'nothing'}{hint}")
-            return math.nan
-        return number
-
-    def _add(self, row: _Row, message: str) -> None:
-        self.problems.append(f"{self.file_name}:{row.line}: {message}")
-
-
-class _PointReader(_TableReader):
-    form = _POINTS
-
-    def points(self, text: str) -> tuple[SurveyPoint, ...]:
-        points = []
-        lines: dict[str, int] = {}
-        for row, cells in self._table(text):
-            point = self._point(row, cells)
-            if point is None:
-                continue
-            if point.name in lines:
-                self._add(
-                    row, f"the name {point.name} is there already, in line {lines[point.name]}"
-                )
-            lines.setdefault(point.name, row.line)
-            points.append(point)
-        return tuple(points)
-
-    def _point(self, row: _Row, cells: dict[str, str]) -> SurveyPoint | None:
-        n_before = len(self.problems)
-        if not cells["name"]:
-            self._add(row, "the name is missing")
-        x, y, z = (self._number(row, key, cells[key]) for key in "xyz")
-        place = self._instead(row, cells, _IN_MAP)
-        shown = self._instead(row, cells, _IN_SPACE)
-        if place and shown:
-            self._add(row, _TWICE.format(", ".join(_IN_MAP), ", ".join(_IN_SPACE)))
-        wall, pixel = self._measured(row, cells, is_placed=bool(place or shown))
-        if len(self.problems) > n_before:
-            return None
-        return SurveyPoint(
-            name=cells["name"],
+    measured = ("wall", *_IN_IMAGE, *_IN_MAP, *_IN_SPACE)
+    table = _Table(
+        path,
+        content="points",
+        required=("name", *_POSITION),
+        single=("class",),
+        measured=measured,
+    )
+    points = []
+    lines: dict[str, int] = {}
+    for line, cells in table.rows():
+        name = cells["name"]
+        if not name:
+            table.add(line, "the name is missing")
+        elif lines.setdefault(name, line) != line:
+            table.add(line, f"the name {name} is there already, in line {lines[name]}")
+        x, y, z = table.numbers(line, cells, _POSITION)
+        group = table.measured_by(line, {key for key in measured if cells.get(key)})
+        place = tuple(table.numbers(line, cells, group))
+        wall = None
+        if cells.get("wall"):
+            (number,) = table.numbers(line, cells, ("wall",))
+            if number.is_integer() and 0 <= number <= MOST_WALLS:
+                wall = int(number)
+            elif math.isfinite(number):
+                table.add(line, f"wall must be the number of a wall, from 0, got {cells['wall']}")
+        point = SurveyPoint(
+            name=name,
             position=(x, y, z),
             class_name=cells.get("class", ""),
             wall=wall,
-            pixel_wall=pixel,
-            place_m=(place[0], place[1]) if place else None,
-            shown_m=(shown[0], shown[1], shown[2]) if shown else None,
+            pixel_wall=(place[0], place[1]) if group == _IN_IMAGE else None,
+            place_m=(place[0], place[1]) if group == _IN_MAP else None,
+            shown_m=(place[0], place[1], place[2]) if group == _IN_SPACE else None,
         )
-
-    def _instead(
-        self, row: _Row, cells: dict[str, str], group: tuple[str, ...]
-    ) -> tuple[float, ...]:
-        """Numbers of one of the groups that stand for a pixel; empty where there are none."""
-        given = [key for key in group if cells.get(key)]
-        if not given:
-            return ()
-        if len(given) < len(group):
-            only = ", ".join(given)
-            self._add(row, f"{', '.join(group)} belong together, got only {only}")
-            return ()
-        if cells.get("u_px") or cells.get("v_px"):
-            self._add(row, _TWICE.format("u_px, v_px", ", ".join(group)))
-        return tuple(self._number(row, key, cells[key]) for key in group)
-
-    def _measured(
-        self, row: _Row, cells: dict[str, str], *, is_placed: bool
-    ) -> tuple[int | None, tuple[float, float] | None]:
-        given = [key for key in _MEASURED if cells.get(key)]
-        if not given:
-            return None, None
-        if len(given) < len(_MEASURED) and not (is_placed and given == ["wall"]):
-            self._add(row, f"{', '.join(_MEASURED)} belong together, got only {', '.join(given)}")
-            return None, None
-        wall = self._number(row, "wall", cells["wall"])
-        if math.isfinite(wall) and not (wall.is_integer() and 0 <= wall <= MOST_WALLS):
-            self._add(row, f"wall must be the number of a wall, from 0, got {cells['wall']}")
-            return None, None
-        number = int(wall) if math.isfinite(wall) else None
-        if is_placed:
-            return number, None
-        pixel = (self._number(row, "u_px", cells["u_px"]), self._number(row, "v_px", cells["v_px"]))
-        return number, pixel
+        points.append(point)
+    table.check()
+    return tuple(points)
 
 
-class _TieReader(_TableReader):
-    form = _TIES
+@dataclass(kw_only=True)
+class _Table:
+    """Lines of a file as rows, with everything that is wrong with them.
 
-    def ties(self, text: str) -> tuple[MeasuredTie, ...]:
-        ties = (self._tie(row, cells) for row, cells in self._table(text))
-        return tuple(tie for tie in ties if tie is not None)
+    Attributes:
+        path: the file.
+        content: what its lines are.
+        required: columns that are always there.
+        single: a column that may be there; also in a table without names.
+        measured: further columns, of which some belong together.
+    """
 
-    def _tie(self, row: _Row, cells: dict[str, str]) -> MeasuredTie | None:
-        n_before = len(self.problems)
-        if not cells["photo"]:
-            self._add(row, "the name of the photo is missing")
-        u, v, x, y, z = (self._number(row, key, cells[key]) for key in self.form.required[1:])
-        sigma_px = (
-            self._number(row, "sigma_px", cells["sigma_px"]) if cells.get("sigma_px") else None
+    path: Path = field(kw_only=False)
+    content: str
+    required: tuple[str, ...]
+    single: tuple[str, ...]
+    measured: tuple[str, ...] = ()
+    problems: list[str] = field(default_factory=list)
+
+    def add(self, line: int, message: str) -> None:
+        """Keep a problem."""
+        self.problems.append(f"{self.path.name}:{line}: {message}")
+
+    def check(self) -> None:
+        """Raise what was found, if anything."""
+        left_out = len(self.problems) - _MAX_PROBLEMS
+        more = [f"... and {left_out} more problems"] if left_out > 0 else []
+        if self.problems:
+            raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
+
+    def rows(self) -> Iterator[tuple[int, dict[str, str]]]:
+        """Give line and cells of each row that has a cell for every column."""
+        names = ",".join(self.required)
+        text = text_of_file(
+            self.path, MOST_BYTES, f"a CSV file of {self.content} with the columns {names}"
         )
-        if sigma_px is not None and sigma_px <= 0.0:
-            self._add(row, f"sigma_px must be positive, got {cells['sigma_px']}")
-        if len(self.problems) > n_before:
-            return None
-        return MeasuredTie(
-            where=f"{self.file_name}:{row.line}",
-            photo=cells["photo"],
-            pixel=(u, v),
-            position=(x, y, z),
-            sigma_px=sigma_px,
-        )
-
-
-def _rows(text: str) -> Iterator[_Row]:
-    lines = text.splitlines()
-    first = next((line for line in lines if line.strip() and line.strip()[0] != "#"), "")
-    # A comma may be part of a number; the others may not.
-    separator = next((mark for mark in _SEPARATORS if mark in first), ",")
-    n_rows = 0
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.strip()[0] == "#":
-            continue
-        n_rows += 1
-        if len(line) > MOST_LINE or n_rows > MOST_POINTS:
-            yield _Row(line=number, cells=())
+        rows = self._cells(text.splitlines())
+        line, first = next(rows, (0, []))
+        if not first:
+            if not self.problems:
+                self.problems.append(
+                    f"{self.path.name} holds no {self.content}: expected {names} per line"
+                )
             return
-        cells = next(csv.reader([line], delimiter=separator))
-        yield _Row(line=number, cells=tuple(cell.strip() for cell in cells))
+        # A header has no number where points and ties have theirs.
+        is_header = not any(_as_number(cell) is not None for cell in first[1:4])
+        columns = self._columns(line, [cell.lower() for cell in first], is_header=is_header)
+        if not columns:
+            return
+        n_rows = 0
+        body = rows if is_header else chain([(line, first)], rows)
+        for number, cells in body:
+            n_rows += 1
+            if len(cells) == len(columns):
+                yield number, dict(zip(columns, cells, strict=True))
+                continue
+            hint = "; write decimal points, not commas" if len(cells) > len(columns) else ""
+            self.add(number, f"expected {len(columns)} columns, got {len(cells)}{hint}")
+        if not n_rows and not self.problems:
+            self.add(line, f"only the names of the columns, no {self.content}")
 
+    def numbers(self, line: int, cells: Mapping[str, str], keys: Collection[str]) -> list[float]:
+        """Give finite numbers; NaN for what is none."""
+        found = []
+        for key in keys:
+            cell = cells[key]
+            number = _as_number(cell)
+            if number is None or not math.isfinite(number):
+                is_decimal = "," in cell and _as_number(cell.replace(",", ".")) is not None
+                hint = "; write a decimal point" if is_decimal else ""
+                self.add(line, f"{key} must be a number, got {cell or 'nothing'}{hint}")
+                number = math.nan
+            found.append(number)
+        return found
 
-def _is_header(row: _Row) -> bool:
-    return not any(_as_number(cell) is not None for cell in row.cells[1:4])
+    def measured_by(
+        self, line: int, given: Collection[str], *, is_row: bool = True
+    ) -> tuple[str, ...]:
+        """Which columns say where a point was measured; none where they are not all there."""
+        groups = [
+            group
+            for group in (_IN_IMAGE, _IN_MAP, _IN_SPACE)
+            if any(name in given for name in group)
+        ]
+        if "wall" in given and not groups:
+            groups = [_IN_IMAGE]
+        n_before = len(self.problems)
+        for group in groups:
+            whole = ("wall", *group) if group == _IN_IMAGE else group
+            there = [name for name in whole if name in given]
+            if len(there) < len(whole):
+                self.add(line, f"{', '.join(whole)} belong together, got only {', '.join(there)}")
+        if is_row and len(groups) > 1:
+            one, other = (", ".join(group) for group in groups[:2])
+            self.add(line, f"measured twice, as {one} and as {other}: leave one of them out")
+        return groups[0] if groups and len(self.problems) == n_before else ()
+
+    def _cells(self, lines: list[str]) -> Iterator[tuple[int, list[str]]]:
+        numbered = [
+            (number, line)
+            for number, line in enumerate(lines, start=1)
+            if line.strip() and line.strip()[0] != "#"
+        ]
+        # A comma may be part of a number; the others may not.
+        first = numbered[0][1] if numbered else ""
+        separator = next((mark for mark in _SEPARATORS if mark in first), ",")
+        for place, (number, line) in enumerate(numbered):
+            if len(line) > MOST_LINE:
+                problem = f"the line is longer than {MOST_LINE} letters: this is no list"
+            elif place >= MOST_POINTS:
+                problem = f"the file holds more than {MOST_POINTS} {self.content}: split it"
+            else:
+                cells = next(csv.reader([line], delimiter=separator))
+                yield number, [cell.strip() for cell in cells]
+                continue
+            self.problems = []
+            self.add(number, problem)
+            return
+
+    def _columns(self, line: int, names: list[str], *, is_header: bool) -> tuple[str, ...]:
+        known = (*self.required, *self.single, *self.measured)
+        if not is_header:
+            if len(self.required) <= len(names) <= len(self.required) + len(self.single):
+                return known[: len(names)]
+            optional = f"[,{','.join(self.single)}]"
+            optional += f"[,wall,{','.join(_IN_IMAGE)}]" if self.measured else ""
+            self.add(
+                line,
+                f"expected the names of the columns, {','.join(self.required)}{optional}, got "
+                f"{len(names)} values without names",
+            )
+            return ()
+        n_before = len(self.problems)
+        for name in names:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f" (did you mean {near[0]}?)" if near else ""
+                self.add(line, f"unknown column {name}{hint}; known are {', '.join(known)}")
+            elif names.count(name) > 1:
+                self.add(line, f"the column {name} is there {names.count(name)} times")
+        missing = [name for name in self.required if name not in names]
+        if missing:
+            self.add(line, f"the column {', '.join(missing)} is missing")
+        if self.measured:
+            self.measured_by(line, names, is_row=False)
+        return tuple(names) if len(self.problems) == n_before else ()
 
 
 def _as_number(cell: str) -> float | None:

@@ -161,7 +161,7 @@ def test_walls_are_counted(tmp_path: Path, wall: str) -> None:
 @pytest.mark.parametrize("n", [20, 21, 30])
 def test_all_mistakes_come_at_once_and_many_are_counted(tmp_path: Path, n: int) -> None:
     with pytest.raises(InputError) as caught:
-        read(tmp_path, "name,x,y,z\n" + "P,1,x,3\n" * n)
+        read(tmp_path, "name,x,y,z\n" + "".join(f"P{k},1,x,3\n" for k in range(n)))
     expected = [f"p.csv:{k}: y must be a number, got x" for k in range(2, 22)]
     more = [] if n == 20 else [f"... and {n - 20} more problems"]
     assert str(caught.value).splitlines() == expected + more
