@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 from plane_streaming import measured
 
+from orthoflow.files.open3d_guard import load_open3d
+
 Fields = dict[str, Any]
 WAYS = ("library", "reader", "read.scan")
 
@@ -104,24 +106,19 @@ def read_e57(path: Path) -> list[Any]:
 
 
 def write_pcd(path: Path, fields: Fields) -> None:
-    """Write binary PCD by pypcd4."""
-    from pypcd4 import PointCloud
-
-    packed = PointCloud.encode_rgb(np.column_stack([fields[c] for c in ("red", "green", "blue")]))
-    values = [fields[name].astype(np.float32) for name in ("x", "y", "z", "intensity")]
-    types = (np.float32,) * 5
-    PointCloud.from_points(
-        np.column_stack([*values, packed]), ("x", "y", "z", "intensity", "rgb"), types
-    ).save(str(path))
+    """Write binary PCD by open3d, without intensity, which it does not keep."""
+    open3d = load_open3d("the benchmark")
+    cloud = open3d.geometry.PointCloud()
+    cloud.points = open3d.utility.Vector3dVector(np.column_stack([fields[a] for a in "xyz"]))
+    colours = np.column_stack([fields[name] for name in ("red", "green", "blue")])
+    cloud.colors = open3d.utility.Vector3dVector(colours / 255.0)
+    open3d.io.write_point_cloud(str(path), cloud)
 
 
 def read_pcd(path: Path) -> list[Any]:
-    """Read it by pypcd4, whole."""
-    from pypcd4 import PointCloud
-
-    cloud = PointCloud.from_path(str(path))
-    values = cloud.numpy(("x", "y", "z", "intensity"))
-    return [values, PointCloud.decode_rgb(cloud.pc_data["rgb"])]
+    """Read it by open3d, whole."""
+    cloud = load_open3d("the benchmark").io.read_point_cloud(str(path))
+    return [np.asarray(cloud.points), np.asarray(cloud.colors)]
 
 
 def write_xyz(path: Path, fields: Fields) -> None:
@@ -156,6 +153,7 @@ def read(path: Path, way: str) -> float:
     import pandas as pd  # noqa: F401
     import pye57  # noqa: F401
 
+    load_open3d("the benchmark")
     from orthoflow.files.points import open_scan
     from orthoflow.products import InputFiles
     from orthoflow.sdk import StepContext
