@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from plane_streaming import measured
 
-from orthoflow.files.open3d_guard import load_open3d
+from plugins.orthoflow_plugins.plane.open3d_library import load_open3d
 
 Fields = dict[str, Any]
 WAYS = ("library", "reader", "read.scan")
