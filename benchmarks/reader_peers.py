@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from orthoflow_plugins.plane.open3d_library import load_open3d
 from plane_streaming import measured
-
-from plugins.orthoflow_plugins.plane.open3d_library import load_open3d
 
 Fields = dict[str, Any]
 WAYS = ("library", "reader", "read.scan")
