@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.threads import in_threads
-from orthoflow_plugins.plane.block_kernels import PlanCounts, PlanGrid
 from orthoflow_plugins.plane.candidates import Candidate
+from orthoflow_plugins.plane.kernels import PlanCounts, PlanGrid
 from orthoflow_plugins.plane.neighbouring import summed_around
 from orthoflow_plugins.plane.sample import PreparedCloud, Sample, Unassigned
 from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_image, vote_lines, vote_points

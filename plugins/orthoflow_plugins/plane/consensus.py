@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.candidates import Candidate, Family
-from orthoflow_plugins.plane.consensus_kernels import consensus_sums, distance_histograms
 from orthoflow_plugins.plane.fitting import refine_plane
 from orthoflow_plugins.plane.hypotheses import (
     MODEL_POINTS,
@@ -27,6 +26,7 @@ from orthoflow_plugins.plane.hypotheses import (
     scores_of,
     scores_of_sums,
 )
+from orthoflow_plugins.plane.kernels import consensus_sums, distance_histograms
 from orthoflow_plugins.plane.sample import Unassigned
 from orthoflow_plugins.plane.support import INNER_SHARE
 

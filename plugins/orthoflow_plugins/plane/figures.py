@@ -19,8 +19,8 @@ from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import Planes, PointCloud, Spread, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly
-from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.measuring import Materials, Normality, RowPoints
+from orthoflow_plugins.plane.slab_kernels import HISTOGRAM_BINS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.threads import in_threads
-from orthoflow_plugins.plane.assignment_kernels import assign_points, name_labels, sum_assigned
-from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, each_part, piece_of
 from orthoflow_plugins.plane.candidates import (
     PASSES_MOST,
     SETTLED_SHARE,
@@ -26,7 +24,9 @@ from orthoflow_plugins.plane.candidates import (
     carried,
     verification,
 )
+from orthoflow_plugins.plane.kernels import BLOCK_POINTS, each_part, piece_of
 from orthoflow_plugins.plane.sample import PreparedCloud
+from orthoflow_plugins.plane.slab_kernels import assign_points, name_labels, sum_assigned
 from orthoflow_plugins.plane.support import INNER_SHARE, CellSums, SurfaceRaster, cell_for
 
 # Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow_plugins.plane.covariance import CellFit, CellHeights, Stated, stated_covariance
-from orthoflow_plugins.plane.fit_kernels import FREE, LEVEL, VERTICAL, refine_robustly
+from orthoflow_plugins.plane.kernels import FREE, LEVEL, VERTICAL, refine_robustly
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
 

@@ -28,10 +28,13 @@ from orthoflow.geometry import wall_axes
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Planes, PointCloud, ScanRow, Spread, Thickness
-from orthoflow_plugins.plane.block_kernels import each_part, piece_of
-from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS, measure_deviations
+from orthoflow_plugins.plane.kernels import each_part, piece_of
 from orthoflow_plugins.plane.sample import PreparedCloud
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
+from orthoflow_plugins.plane.slab_kernels import (
+    HISTOGRAM_BINS,
+    STEPS_PER_TOLERANCE,
+    measure_deviations,
+)
 
 # Lowest and highest intensity of each material.
 Materials = Mapping[str, tuple[float, float]]

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow_plugins.plane.block_kernels import BlockedPoints
 from orthoflow_plugins.plane.candidates import Candidate, Family, FoundPlane
-from orthoflow_plugins.plane.region_kernels import grow_regions, sum_regions
+from orthoflow_plugins.plane.kernels import BlockedPoints
 from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
 from orthoflow_plugins.plane.surface_voxels import POINTS_LEAST, SurfaceVoxels, coarser
+from orthoflow_plugins.plane.voxel_kernels import grow_regions, sum_regions
 
 # Parts of a wall are regions of their own: together they may hold what each alone does not.
 PART_SHARE: Final = 0.2

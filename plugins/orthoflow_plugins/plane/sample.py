@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.products import PointCloud
-from orthoflow_plugins.plane.block_kernels import (
+from orthoflow_plugins.plane.kernels import (
     BlockedPoints,
     PlanCounts,
     PlanGrid,

@@ -17,8 +17,8 @@ from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.accumulators import Accumulator
-from orthoflow_plugins.plane.block_kernels import PlanGrid
 from orthoflow_plugins.plane.figures import Margins, space_out
+from orthoflow_plugins.plane.kernels import PlanGrid
 from orthoflow_plugins.plane.regions import Regions
 from orthoflow_plugins.plane.space_accumulators import SpacePicture
 

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.accumulators import VOTE_CAUTION, contrast, parabola
-from orthoflow_plugins.plane.block_kernels import (
+from orthoflow_plugins.plane.candidates import Candidate, Family
+from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
     PlanGrid,
@@ -27,7 +28,6 @@ from orthoflow_plugins.plane.block_kernels import (
     piece_of,
     plan_frame,
 )
-from orthoflow_plugins.plane.candidates import Candidate, Family
 from orthoflow_plugins.plane.sample import Claim, PreparedCloud, Unassigned
 from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, best_bins, vote_planes, vote_tilts
 from orthoflow_plugins.plane.voxel_kernels import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow_plugins.plane.block_kernels import BlockedPoints, each_part, piece_of
+from orthoflow_plugins.plane.kernels import BlockedPoints, each_part, piece_of
 from orthoflow_plugins.plane.neighbouring import closed, summed_around
 from orthoflow_plugins.plane.slab_kernels import sum_cells
 

@@ -18,7 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow_plugins.plane.block_kernels import (
+from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
     PlanGrid,
@@ -26,7 +26,6 @@ from orthoflow_plugins.plane.block_kernels import (
     piece_of,
     plan_frame,
 )
-from orthoflow_plugins.plane.region_kernels import fit_neighbourhoods
 from orthoflow_plugins.plane.sample import PreparedCloud
 from orthoflow_plugins.plane.voxel_kernels import (
     BRICK_SIDE,
@@ -36,6 +35,7 @@ from orthoflow_plugins.plane.voxel_kernels import (
     claim_voxels,
     coarsened,
     find_voxels,
+    fit_neighbourhoods,
     gather_moments,
     merge_moments,
     voxel_places,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow_plugins.plane.block_kernels import BlockedPoints
+from orthoflow_plugins.plane.kernels import BlockedPoints
 
 # A vote is counted in quarters, so that it can be shared between two bins without a rounding that
 # would not cancel when it is taken back.

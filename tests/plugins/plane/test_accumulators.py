@@ -15,7 +15,7 @@ from orthoflow_plugins.plane.accumulators import (
     vote_counts,
     voters,
 )
-from orthoflow_plugins.plane.block_kernels import Boxes, PlanCounts, PlanGrid, blocked, box_blocks
+from orthoflow_plugins.plane.kernels import Boxes, PlanCounts, PlanGrid, blocked, box_blocks
 from orthoflow_plugins.plane.sample import PreparedCloud, Sample, Unassigned, prepare
 
 from orthoflow.geometry.point_kernels import read_only

@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.accumulators import Accumulator
 from orthoflow_plugins.plane.assembling import Assembly
-from orthoflow_plugins.plane.block_kernels import PlanGrid
-from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.figures import (
     Margins,
     draw_deviations,
@@ -21,6 +19,7 @@ from orthoflow_plugins.plane.figures import (
     draw_thickness,
     space_out,
 )
+from orthoflow_plugins.plane.kernels import PlanGrid
 from orthoflow_plugins.plane.measuring import Deviations, RowPoints, normality
 from orthoflow_plugins.plane.regions import Growth, grow
 from orthoflow_plugins.plane.sample import prepare
@@ -31,6 +30,7 @@ from orthoflow_plugins.plane.search_figures import (
     draw_sections,
     draw_space,
 )
+from orthoflow_plugins.plane.slab_kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.space_accumulators import SpacePicture
 from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
 

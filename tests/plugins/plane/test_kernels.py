@@ -7,20 +7,31 @@ from typing import Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.assignment_kernels import assign_points, name_labels, sum_assigned
-from orthoflow_plugins.plane.block_kernels import (
+from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
+    FREE,
+    LEVEL,
+    VERTICAL,
     BlockedPoints,
     PlanGrid,
     blocked,
     box_blocks,
+    consensus_sums,
     count_over_plan,
+    distance_histograms,
+    flattest,
+    refine_robustly,
 )
-from orthoflow_plugins.plane.consensus_kernels import consensus_sums, distance_histograms
-from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS, measure_deviations
-from orthoflow_plugins.plane.fit_kernels import FREE, LEVEL, VERTICAL, flattest, refine_robustly
 from orthoflow_plugins.plane.neighbouring import closed, summed_around
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, sum_cells
+from orthoflow_plugins.plane.slab_kernels import (
+    HISTOGRAM_BINS,
+    STEPS_PER_TOLERANCE,
+    assign_points,
+    measure_deviations,
+    name_labels,
+    sum_assigned,
+    sum_cells,
+)
 from scipy import ndimage
 
 from orthoflow.geometry import wall_axes

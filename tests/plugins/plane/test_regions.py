@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.region_kernels import grow_regions
 from orthoflow_plugins.plane.regions import (
     Growth,
     RegionProposer,
@@ -24,7 +23,7 @@ from orthoflow_plugins.plane.regions import (
 )
 from orthoflow_plugins.plane.sample import prepare
 from orthoflow_plugins.plane.surface_voxels import Neighbourhood, SurfaceVoxels, surface_voxels
-from orthoflow_plugins.plane.voxel_kernels import N_SUMS, STEPS_PER_VOXEL, VOXELS
+from orthoflow_plugins.plane.voxel_kernels import N_SUMS, STEPS_PER_VOXEL, VOXELS, grow_regions
 
 from orthoflow.geometry import Plane
 from tests import scenes

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import sample as sampling
-from orthoflow_plugins.plane.assignment_kernels import assign_points, sum_assigned
-from orthoflow_plugins.plane.block_kernels import PlanGrid, each_part, piece_of
+from orthoflow_plugins.plane.kernels import PlanGrid, each_part, piece_of
 from orthoflow_plugins.plane.sample import (
     Claim,
     PreparedCloud,
@@ -20,7 +19,7 @@ from orthoflow_plugins.plane.sample import (
     prepare,
     thinned,
 )
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, assign_points, sum_assigned
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
 from orthoflow.errors import MethodError, ProductError

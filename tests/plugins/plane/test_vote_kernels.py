@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.block_kernels import blocked, box_blocks
+from orthoflow_plugins.plane.kernels import blocked, box_blocks
 from orthoflow_plugins.plane.vote_kernels import (
     VOTE_SHARES,
     best_bins,

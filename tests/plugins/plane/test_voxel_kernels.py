@@ -8,14 +8,13 @@ from typing import Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.block_kernels import (
+from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
     blocked,
     box_blocks,
     piece_of,
 )
-from orthoflow_plugins.plane.region_kernels import fit_neighbourhoods, sum_regions
 from orthoflow_plugins.plane.voxel_kernels import (
     N_SUMS,
     STEPS_PER_VOXEL,
@@ -24,8 +23,10 @@ from orthoflow_plugins.plane.voxel_kernels import (
     coarsened,
     count_voxels,
     find_voxels,
+    fit_neighbourhoods,
     gather_moments,
     merge_moments,
+    sum_regions,
     voxel_places,
     with_room,
 )
