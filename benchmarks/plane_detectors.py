@@ -25,23 +25,22 @@ import numba
 import numpy as np
 from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
-from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
-from orthoflow_plugins.plane.detecting import Proposer, find_planes, rules_of
-from orthoflow_plugins.plane.final_fit import name_points
-from orthoflow_plugins.plane.measuring import measure_planes
-from orthoflow_plugins.plane.parameters import DetectorParams
-from orthoflow_plugins.plane.regions import Growth, RegionProposer, Regions, grow
-from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
-from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
-from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
+from orthoflow_plugins.plane.candidates import FoundPlane, name_points
+from orthoflow_plugins.plane.cloud import PreparedCloud, Search, prepare
+from orthoflow_plugins.plane.detector import DetectorParams
+from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
+from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
+from orthoflow_plugins.plane.planes import measure_planes
+from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
+from orthoflow_plugins.plane.region import Region, region_proposer
+from orthoflow_plugins.plane.search import Proposer, find_planes
 from plane_peers import PEERS, measured
 
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 CELL_M, SHARE = 0.02, 0.005
+TOLERANCE_M, FIT_TOLERANCE_M = 0.05, 0.015
 METHODS = ("hough2d", "hough3d", "hough3d-full", "ransac", "region")
 
 
@@ -68,83 +67,36 @@ def detect(
     method: str, cloud: PointCloud, *, most: int, cores: int
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
     """What a method does up to its labels, without statistics, files and figures."""
-    rules = replace(rules_of(DetectorParams()), n_planes_most=most, least_share=SHARE)
-    cell_m = CELL_M if method == "hough2d" else 0.5
+    params = {"n_planes_max": most, "min_share": SHARE}
     prepared = prepare(
         cloud,
         basis_from_up(cloud.up),
-        cell_m=cell_m,
+        cell_m=CELL_M if method == "hough2d" else 0.5,
         least_share=SHARE,
         parts=cores,
         counts_plan=method == "hough2d",
     )
-    if method == "ransac":
-        search = Search(
-            model="3d",
-            scoring="msac",
-            n_hypotheses=1000,
-            find_m=rules.find_m,
-            family="any",
-            tilt_most_deg=rules.tilt_most_deg,
-            least_share=SHARE,
-        )
-        rng = np.random.default_rng(0)
-
-        def proposer_of(_: PreparedCloud, unassigned: Unassigned, __: Rules) -> Proposer:
-            return ConsensusProposer(unassigned, search, rng)
-
-    elif method == "region":
-        wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, voxel_m=0.1 / 3.0)
-        growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=0.2 * SHARE * len(cloud))
-
-        def proposer_of(cloud: PreparedCloud, unassigned: Unassigned, _: Rules) -> Proposer:
-            regions = grow(surface_voxels(cloud, wanted), growth, np.zeros(3))
-            return region_proposer(regions, unassigned)
-
-    elif method.startswith("hough3d"):
-        coarser = 1.0 if method == "hough3d-full" else 2.0
-        space = SpaceVoting(
-            cell_m=coarser * CELL_M,
-            angle_step_deg=coarser,
-            least_points=SHARE * len(cloud),
-            tilt_most_deg=10.0,
-            is_raw=False,
-        )
-
-        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
-            return SpaceProposer(cloud, space)
-
-    else:
-        voting = Voting(
-            angle_step_deg=1.0,
-            least_points=SHARE * len(cloud),
-            walls=True,
-            levels=True,
-            is_raw=False,
-        )
-
-        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
-            return PlanProposer(cloud, voting)
-
-    found = find_planes(prepared, proposer_of, rules, _listen)
+    search = Search(
+        cloud=prepared,
+        params=DetectorParams.model_validate(params),
+        tolerance_m=TOLERANCE_M,
+        fit_tolerance_m=FIT_TOLERANCE_M,
+    )
+    found = find_planes(search, proposer_of(method, search, params))
     labels = np.empty(len(cloud), dtype=np.int16)
     name_points(prepared, np.arange(len(found) + 1, dtype=np.int16), labels)
     return prepared, found
 
 
-def region_proposer(regions: Regions, unassigned: Unassigned) -> RegionProposer:
-    return RegionProposer(
-        regions=regions,
-        region_of_sample=regions.region_of(unassigned.sample.points),
-        family="any",
-        tilt_most_deg=10.0,
-        least_points=SHARE * len(unassigned.claims),
-        proposes_once=False,
-    )
-
-
-def _listen(_part: float, _text: str) -> None:
-    """Hear progress and say nothing."""
+def proposer_of(method: str, search: Search, params: dict[str, float]) -> Proposer:
+    if method == "ransac":
+        return ConsensusProposer(search, Ransac.Params(**params), np.random.default_rng(0))
+    if method == "region":
+        return region_proposer(search, Region.Params(**params), viewer_m=np.zeros(3))
+    if method == "hough2d":
+        return PlanProposer(search, Hough2d.Params(**params))
+    mode = "full" if method == "hough3d-full" else "coarse-to-fine"
+    return SpaceProposer(search, Hough3d.Params(search=mode, **params))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +193,9 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
     for task in (
         lambda: detect(method, cloud, most=1, cores=cores),
         lambda: detect(method, cloud, most=16, cores=cores),
-        lambda: measure_planes(prepared, slabs, bounds, find_m=0.05, fit_m=0.015),
+        lambda: measure_planes(
+            prepared, slabs, bounds, tolerance_m=TOLERANCE_M, fit_tolerance_m=FIT_TOLERANCE_M
+        ),
     ):
         fastest, slowest, cpu_s = times_s(task, options.repeats)
         # Measured beside each task: other work on the machine slows both.

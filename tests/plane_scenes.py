@@ -7,23 +7,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.candidates import Rules
+from orthoflow_plugins.plane.cloud import PreparedCloud, Search, prepare
+from orthoflow_plugins.plane.detector import DetectorParams
 
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
 
 NOISE_M = 0.002
-RULES = Rules(
-    find_m=0.05,
-    fit_m=0.015,
-    n_planes_most=10,
-    least_share=0.1,
-    stop_unclassified_share=0.05,
-    tilt_most_deg=10.0,
-    stop_rest_share=0.0,
-    is_exact=False,
-    joins_parts=True,
-)
+TOLERANCE_M, FIT_TOLERANCE_M = 0.05, 0.015
 
 
 @dataclass(frozen=True)
@@ -102,3 +93,27 @@ def context(folder: Path, *, cores: int = 2) -> StepContext:
     """A step context with a scratch folder of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     return StepContext(rng=np.random.default_rng(0), cores=cores, scratch=folder)
+
+
+def prepared(
+    points: NDArray[np.float64], *, parts: int = 1, cell_m: float = 0.5, counts_plan: bool = False
+) -> PreparedCloud:
+    """A cloud of points (n, 3) as the passes take it."""
+    return prepare(
+        cloud_of(points),
+        np.eye(3),
+        cell_m=cell_m,
+        least_share=0.005,
+        parts=parts,
+        counts_plan=counts_plan,
+    )
+
+
+def search_in(cloud: PreparedCloud, **params: object) -> Search:
+    """A search in a cloud that has taken nothing yet."""
+    return Search(
+        cloud=cloud,
+        params=DetectorParams.model_validate({"min_share": 0.1, "n_planes_max": 10, **params}),
+        tolerance_m=TOLERANCE_M,
+        fit_tolerance_m=FIT_TOLERANCE_M,
+    )

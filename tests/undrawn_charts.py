@@ -48,12 +48,12 @@ def build_plane_charts_once(
     request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, test: str = ""
 ) -> None:
     """Let a test set up the charts of its detections once; see `_build_charts_once`."""
-    from orthoflow_plugins.plane import detecting, figures, search_figures
+    from orthoflow_plugins.plane import figures, search
 
     common = ("draw_deviations", "draw_planes", "draw_thickness")
     own = ("draw_accumulator", "draw_space", "draw_sections", "_draw_normals")
-    _build_charts_once(request, patch, (detecting, common, figures), test)
-    _build_charts_once(request, patch, (search_figures, own, search_figures), test)
+    _build_charts_once(request, patch, (search, common, figures), test)
+    _build_charts_once(request, patch, (figures, own, figures), test)
 
 
 def build_orient_charts_once(

@@ -1,21 +1,27 @@
-"""Candidates: what detectors propose, moved to the surface near it, and verified to be a plane.
+"""Candidates moved to the surface near them, verified to be planes, fitted to all points, labelled.
 
 The same for every detector, so that methods differ in how they look, not in how they fit. A
 candidate is refined on the free points of the sample with a shrinking tolerance, must hold crowded
-cells of enough of them, and is fitted to those cells; `final_fit` then takes all points.
+cells of enough of them, and is fitted to those cells. Then all points take part, one pass for all
+planes; or of more than 24 million every so many'th block of neighbours, drawn over the whole cloud:
+neighbours share their errors, so that those left out say the same.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow_plugins.plane.fitting import (
+from orthoflow.geometry.threads import in_threads
+from orthoflow_plugins.plane.cloud import Claim, Criterion, PreparedCloud, Search
+from orthoflow_plugins.plane.detector import Candidate, leans_as_asked
+from orthoflow_plugins.plane.fit import (
     SETTLED_M,
     AdjustedPlane,
     Freedom,
@@ -23,30 +29,31 @@ from orthoflow_plugins.plane.fitting import (
     refine_plane,
     shrinking_tolerances,
 )
-from orthoflow_plugins.plane.sample import Claim, Unassigned
+from orthoflow_plugins.plane.kernels import BLOCK_POINTS, each_part, piece_of
+from orthoflow_plugins.plane.slab_kernels import assign_points, name_labels, sum_assigned
 from orthoflow_plugins.plane.support import (
+    INNER_SHARE,
     CellSums,
     Support,
     SurfaceRaster,
     cell_for,
+    covering_rectangles,
     crowded_cells,
     measure_cells,
     support_of,
-    surface_raster,
 )
-
-# What a detector may mean by a candidate: a wall or a level within the tilt allowed, or anything.
-Family = Literal["wall", "level", "any"]
 
 # Share of the points in a plane's slab and rectangle that must lie in crowded cells.
 _CROWDED_LEAST: Final = 0.5
+# Cells that form a line, about which a plane may turn as it likes, are narrower than this.
+_STRIP_CELLS: Final = 2.5
 # Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.5
 # Passes over the points that one plane may take, and the share of the fit tolerance by which a fit
 # may move without asking for another.
-PASSES_MOST: Final = 3
-SETTLED_SHARE: Final = 0.1
+_PASSES_MOST: Final = 3
+_SETTLED_SHARE: Final = 0.1
 # Planes of a sample are fitted to all points later.
 _SETTLED_ON_SAMPLE_M: Final = 2e-5
 # A candidate may miss a plane's share by this much before its cells are fitted.
@@ -59,70 +66,11 @@ _SAME_M: Final = 2e-4
 _FIT_POINTS: Final = 20_000
 # Points that are enough to see how far a candidate's points spread.
 _SPREAD_POINTS: Final = 5_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """A plane that a detector proposes.
-
-    Attributes:
-        plane: in the cloud's offsets, a few centimetres or a degree off.
-        family: what it may be.
-        votes: the points that speak for it, by the detector's own count.
-        own_tolerance_m: the tolerance that the detector found by itself, or None.
-        start: where the common fit starts, if not from the plane itself.
-    """
-
-    plane: Plane
-    family: Family
-    votes: float
-    own_tolerance_m: float | None = None
-    start: Plane | None = None
-
-
-# What may refuse a candidate: too few points, none that crowd about it, a strip as narrow as a
-# line, points that only pass through, a rounded surface, or a tilt that was not asked for.
-Criterion = Literal["few", "scattered", "strip", "smear", "bent", "tilt"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why a candidate is no plane.
-
-    Attributes:
-        criterion: what refused it.
-        share: share of all points that it held.
-    """
-
-    criterion: Criterion
-    share: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rules:
-    """When a plane counts, and when the search ends.
-
-    Attributes:
-        find_m: points this near to a plane belong to it.
-        fit_m: points this near to a plane take part in its fit.
-        n_planes_most: the search ends with so many planes.
-        least_share: share of all points that a plane must hold.
-        stop_unclassified_share: the search ends when fewer points remain.
-        stop_rest_share: the search ends at a plane with a smaller share of those that remain.
-        tilt_most_deg: walls and floors may be off vertical and level by this.
-        is_exact: keep walls exactly vertical and floors exactly level.
-        joins_parts: parts that do not touch are one plane.
-    """
-
-    find_m: float
-    fit_m: float
-    n_planes_most: int
-    least_share: float
-    stop_unclassified_share: float
-    tilt_most_deg: float
-    stop_rest_share: float
-    is_exact: bool
-    joins_parts: bool
+# Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
+_FITTED_MOST: Final = 12_000_000
+# Rectangles that one plane is cut into at most: a frame has four sides. Claims are bytes.
+_RECTANGLES_MOST: Final = 8
+_SLABS_MOST: Final = 127
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,317 +91,337 @@ class FoundPlane:
     candidate: Candidate
     freedom: Freedom
 
-    def claim(self, find_m: float) -> Claim:
-        """What it takes of the sample."""
-        return Claim(slab=self.raster.slab(), bounds_m=self.label_bounds(find_m))
+    def claim(self, tolerance_m: float) -> Claim:
+        """What it takes: points within the tolerance of its plane and of its rectangle."""
+        grown = self.support.bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
+        return Claim(self.raster.slab(), np.concatenate([[tolerance_m], grown]))
 
-    def label_bounds(self, find_m: float) -> NDArray[np.float64]:
-        """(5,) find tolerance, and the rectangle in (u, v) in which points belong to the plane."""
-        grown = self.support.bounds_m + find_m * np.array([-1.0, 1.0, -1.0, 1.0])
-        return np.concatenate([[find_m], grown])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verification:
-    """What points say about a plane that is nearly right.
-
-    Attributes:
-        support: the cells that belong.
-        adjusted: the fit to them.
-    """
-
-    support: Support
-    adjusted: AdjustedPlane
+    def as_proposed(self, up: NDArray[np.float64]) -> FoundPlane:
+        """Give it back as its detector proposed it, with the rectangle that was found for it."""
+        plane = self.candidate.plane
+        if float(plane.normal @ self.raster.plane.normal) < 0.0:
+            plane = plane.flipped()
+        return replace(self, raster=self.raster.moved_to(plane, up))
 
 
-def verify(
-    candidate: Candidate,
-    unassigned: Unassigned,
-    rules: Rules,
-    refusals: list[Refusal] | None = None,
-) -> FoundPlane | None:
+def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
     """Refine a candidate and see whether it is a plane of points that no other has.
 
-    Args:
-        candidate: what a detector proposed.
-        unassigned: the points that remain.
-        rules: when a plane counts.
-        refusals: gets the criterion that refused the candidate.
+    None when it is not; `search.refusals` then says by which criterion.
     """
-    refused = [] if refusals is None else refusals
-    corners, up = unassigned.box_corners_m, unassigned.up
-    freedom = _freedom_of(candidate, up, rules)
-    refined = _refined(candidate, unassigned, rules, freedom, refused)
+    up, params = search.cloud.up, search.params
+    freedom = _freedom_of(candidate, search)
+    refined = _refined(candidate, search, freedom)
     if refined is None:
         return None
-    if not _leans_little(refined, candidate, up, rules):
-        refused.append(Refusal(criterion="tilt", share=0.0))
+    plane, cell_m = refined
+    leans = leans_as_asked(plane.normal[None], up, candidate.constraint, params.max_tilt_deg)
+    if not leans.all():
+        search.refuse("tilt")
         return None
-    rough = surface_raster(refined.plane, corners, up, cell_m=refined.cell_m)
-    found = _verified_on(rough, unassigned, rules, freedom, refused)
-    for _ in range(PASSES_MOST - 1):
+    for _ in range(_PASSES_MOST):
+        raster = SurfaceRaster.over(plane, search.box_corners_m, up, cell_m)
+        sums = _cells_of(search, raster, search.cloud.parts)
+        verdict = _verdict(
+            raster, sums, search, freedom, search.least_points, settled_m=_SETTLED_ON_SAMPLE_M
+        )
+        if isinstance(verdict, str):
+            return None
+        support, adjusted = verdict
+        plane, cell_m = adjusted.plane, raster.cell_m
         # A plane that moved saw its points through a tolerance that lay askew: look again.
-        if found is None or found.adjusted.moved_m < SETTLED_SHARE * rules.fit_m:
+        if adjusted.moved_m < _SETTLED_SHARE * search.fit_tolerance_m:
             break
-        rough = surface_raster(found.adjusted.plane, corners, up, cell_m=rough.cell_m)
-        found = _verified_on(rough, unassigned, rules, freedom, refused)
-    if found is None:
-        return None
     return FoundPlane(
-        raster=carried(rough, found.adjusted.plane, up),
-        support=found.support,
-        adjusted=found.adjusted,
+        raster=raster.moved_to(plane, up),
+        support=support,
+        adjusted=adjusted,
         candidate=candidate,
         freedom=freedom,
     )
 
 
-def verification(
-    raster: SurfaceRaster,
-    sums: CellSums,
-    rules: Rules,
-    freedom: Freedom,
-    *,
-    n_least: float,
-    settled_m: float = SETTLED_M,
-    refusals: list[Refusal] | None = None,
-) -> Verification | None:
-    """Return which cells belong to a plane and how it fits them; None when it is none."""
-    place = support_of(raster, crowded_cells(sums), sums, joins_parts=rules.joins_parts)
-    adjusted = None
-    criterion = _refused_by(place, raster, sums, n_least)
-    if place is not None and not criterion:
-        adjusted = adjust_plane(
-            raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom, settled_m=settled_m
-        )
-        criterion = "bent" if adjusted is None or _is_bent(adjusted) else ""
-    if place is None or adjusted is None or criterion:
-        if refusals is not None:
-            n_points = 0.0 if place is None else float(place.n_points)
-            share = rules.least_share * n_points / max(n_least, 1e-9)
-            refusals.append(Refusal(criterion=criterion or "bent", share=share))
-        return None
-    return Verification(support=place, adjusted=adjusted)
+def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
+    """Fit planes of the sample to all points; those that these do not bear out are left out."""
+    cloud = search.cloud
+    every = max(1, len(cloud.claims) // _FITTED_MOST)
+    least_points = search.params.min_share * len(cloud.claims) / every
+    is_open = [True] * len(found)
+    for _ in range(_PASSES_MOST):
+        rasters = [_fine_raster(item, search, every) for item in found]
+        sums = _sums_of_all(found, rasters, is_open, search, every)
+        verdicts = _verdicts(found, rasters, sums, is_open, search, least_points)
+        kept, moves = [], []
+        for item, raster, verdict in zip(found, rasters, verdicts, strict=True):
+            if not isinstance(verdict, str):
+                support, adjusted = verdict
+                moved = raster.moved_to(adjusted.plane, cloud.up)
+                kept.append(replace(item, raster=moved, support=support, adjusted=adjusted))
+                moves.append(adjusted.moved_m > _SETTLED_SHARE * search.fit_tolerance_m)
+            elif verdict == "settled":
+                kept.append(item)
+                moves.append(False)
+        found, is_open = kept, moves
+        if not any(is_open):
+            break
+    return found
 
 
-def _refused_by(
-    place: Support | None, raster: SurfaceRaster, sums: CellSums, n_least: float
-) -> Criterion | Literal[""]:
-    """The criterion that refuses the cells of a plane, before it is fitted; empty for none."""
-    if place is None:
-        return "scattered"
-    if place.n_points < n_least:
-        return "few"
-    if _is_strip(place, raster):
-        return "strip"
-    return "smear" if _is_smear(place, raster, sums) else ""
+def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> None:
+    """Claim all points for the nearest plane in whose rectangles they lie."""
+    slabs, bounds, plane_of_slab = _slabs(found, tolerance_m)
+    # The last entry is for a claim of -1.
+    names = np.append(plane_of_slab, -1).astype(np.int8)
+
+    def give(_part: int, piece: slice) -> None:
+        claims = cloud.claims[piece]
+        assign_points(piece_of(cloud.points, piece), claims, slabs, bounds)
+        if len(slabs) > len(found):
+            claims[:] = names[claims]
+
+    each_part(len(cloud.claims), cloud.parts, give)
 
 
-def carried(raster: SurfaceRaster, plane: Plane, up: NDArray[np.float64]) -> SurfaceRaster:
-    """Give the raster on the plane after its last small correction, with the same cells."""
-    return SurfaceRaster(
-        plane=plane,
-        axes=wall_axes(plane.normal, up),
-        low_m=raster.low_m,
-        cell_m=raster.cell_m,
-        shape=raster.shape,
-    )
+def name_points(cloud: PreparedCloud, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
+    """Write the label (n,) of each point; the last of (k + 1,) names is for points on no plane."""
+    by_byte = np.full(256, names[-1], dtype=np.int16)
+    by_byte[: len(names) - 1] = names[:-1]
+    claims = cloud.claims.view(np.uint8)
+
+    def write(_part: int, piece: slice) -> None:
+        name_labels(claims[piece], by_byte, labels[piece])
+
+    each_part(len(labels), cloud.parts, write)
 
 
-def as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
-    """Give a plane back as its detector proposed it, with the rectangle that was found for it."""
-    plane = item.candidate.plane
-    if float(plane.normal @ item.raster.plane.normal) < 0.0:
-        plane = plane.flipped()
-    return replace(item, raster=carried(item.raster, plane, up))
-
-
-def _freedom_of(candidate: Candidate, up: NDArray[np.float64], rules: Rules) -> Freedom:
+def _freedom_of(candidate: Candidate, search: Search) -> Freedom:
     """What the fit of a candidate may change."""
-    if not rules.is_exact:
+    normal, up, limit_deg = (
+        candidate.plane.normal[None],
+        search.cloud.up,
+        search.params.max_tilt_deg,
+    )
+    if not search.params.exact:
         return "free"
-    tilt_deg = math.degrees(math.asin(min(1.0, abs(float(candidate.plane.normal @ up)))))
-    if candidate.family == "wall" or tilt_deg <= rules.tilt_most_deg:
+    if (
+        candidate.constraint == "vertical"
+        or leans_as_asked(normal, up, "vertical", limit_deg).all()
+    ):
         return "vertical"
-    return "level" if tilt_deg >= 90.0 - rules.tilt_most_deg else "free"
+    return "horizontal" if leans_as_asked(normal, up, "horizontal", limit_deg).all() else "free"
 
 
-def _verified_on(
-    raster: SurfaceRaster,
-    unassigned: Unassigned,
-    rules: Rules,
-    freedom: Freedom,
-    refusals: list[Refusal],
-) -> Verification | None:
-    """One pass over the free points: the cells that belong, and the fit to them."""
-    sums = measure_cells(
-        unassigned.free().points,
-        raster,
-        find_m=rules.find_m,
-        fit_m=rules.fit_m,
-        parts=unassigned.parts,
-    )
-    return verification(
-        raster,
-        sums,
-        rules,
-        freedom,
-        n_least=rules.least_share * len(unassigned.claims),
-        settled_m=_SETTLED_ON_SAMPLE_M,
-        refusals=refusals,
-    )
+def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Plane, float] | None:
+    """Move a candidate to the surface near it; gives the side of the cells that suit it, too.
 
-
-def _leans_little(
-    refined: _Refined, candidate: Candidate, up: NDArray[np.float64], rules: Rules
-) -> bool:
-    tilt_deg = math.degrees(math.asin(min(1.0, abs(float(refined.plane.normal @ up)))))
-    if candidate.family == "level":
-        return tilt_deg >= 90.0 - rules.tilt_most_deg
-    return candidate.family == "any" or tilt_deg <= rules.tilt_most_deg
-
-
-def _is_strip(place: Support, raster: SurfaceRaster) -> bool:
-    """Whether the cells form a line, about which a plane may turn as it likes."""
-    width_m = min(place.bounds_m[1] - place.bounds_m[0], place.bounds_m[3] - place.bounds_m[2])
-    return bool(width_m < 2.5 * raster.cell_m)
-
-
-def _is_smear(place: Support, raster: SurfaceRaster, sums: CellSums) -> bool:
-    """Whether most points in the rectangle's slab only pass through it, as on a rounded body."""
-    u, v = raster.centres_m()
-    left, right, top, bottom = place.bounds_m
-    within = (u > left) & (u < right) & (v > top) & (v < bottom)
-    return bool(place.n_points < _CROWDED_LEAST * sums.n_find[within].sum())
-
-
-def _is_bent(adjusted: AdjustedPlane) -> bool:
-    """Whether the cells lie on a column or barrel that the plane only touches."""
-    return adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Refined:
-    """A candidate after the sample has seen it.
-
-    Attributes:
-        plane: the plane, in offsets.
-        cell_m: side of the cells that suit its points.
+    None where too few points of the sample crowd there.
     """
-
-    plane: Plane
-    cell_m: float
-
-
-def _refined(
-    candidate: Candidate,
-    unassigned: Unassigned,
-    rules: Rules,
-    freedom: Freedom,
-    refusals: list[Refusal],
-) -> _Refined | None:
-    """Move a candidate to the surface near it; None where too few of the sample crowd there."""
-    free_points = unassigned.free().offsets_m
-    first, *rest = shrinking_tolerances(rules.find_m, rules.fit_m)
+    free_points, up = search.free().offsets_m, search.cloud.up
+    first, *rest = shrinking_tolerances(search.tolerance_m, search.fit_tolerance_m)
     start = candidate.plane if candidate.start is None else candidate.start
-    some = _thinned(free_points, _FIT_POINTS)
-    plane = refine_plane(some, start, first, freedom=freedom, up=unassigned.up)
+    plane = refine_plane(_some(free_points, _FIT_POINTS), start, first, freedom=freedom, up=up)
     if plane is None:
-        refusals.append(Refusal(criterion="scattered", share=0.0))
+        search.refuse("scattered")
         return None
     distances_m = free_points @ plane.normal - plane.offset_m
-    near = free_points.take(np.flatnonzero(np.abs(distances_m) <= rules.find_m), axis=0)
-    sums, raster = _cells_near(near, plane, unassigned, rules)
-    place = support_of(raster, crowded_cells(sums), sums, joins_parts=rules.joins_parts)
-    least = _SAMPLE_CAUTION * rules.least_share * len(unassigned.claims)
-    if place is None or place.n_points < least:
-        n_points = 0.0 if place is None else float(place.n_points)
-        share = n_points / max(1, len(unassigned.claims))
-        refusals.append(Refusal(criterion="scattered" if place is None else "few", share=share))
+    near = free_points.take(np.flatnonzero(np.abs(distances_m) <= search.tolerance_m), axis=0)
+    raster = _raster_for(near, plane, search)
+    sums = _cells_of(search, raster, 1)
+    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+    if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
+        search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
         return None
-    plane = _fitted_to_parts(
-        plane, _thinned(near, _FIT_POINTS), raster, place, (first, *rest), freedom, unassigned.up
-    )
-    if plane is None:
-        refusals.append(Refusal(criterion="scattered", share=0.0))
+    # A door and a niche in one wall, at different depths, both lie near one plane that leans by
+    # some degrees and runs through them askew; fitted alone, the largest shows that it does not.
+    fit = partial(refine_plane, freedom=freedom, up=up)
+    near = _some(near, _FIT_POINTS)
+    together = fit(near[raster.covers(near, support.cells)], plane, first, *rest)
+    if len(support.parts_m) > 1:
+        largest = near[raster.covers(near, support.part_of_cell == 0)]
+        alone = fit(largest, plane, first, *rest)
+        if together is None or alone is None or _is_askew(together, alone, largest):
+            together = alone
+    if together is None:
+        search.refuse("scattered")
         return None
-    n_held = float(sums.n_find[place.cells].sum())
-    area_m2 = float(place.cells.sum()) * raster.cell_m**2
-    return _Refined(plane=plane, cell_m=cell_for(n_held, area_m2))
+    area_m2 = float(support.cells.sum()) * raster.cell_m**2
+    return together, cell_for(float(sums.n_near[support.cells].sum()), area_m2)
 
 
-def _thinned(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
+def _is_askew(plane: Plane, own: Plane, points: NDArray[np.float64]) -> bool:
+    """Whether a plane lies much further from points than their own does."""
+    joint_m, own_m = (float(np.median(np.abs(p.distances_m(points)))) for p in (plane, own))
+    return joint_m > _ASKEW * own_m + _SAME_M
+
+
+def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     """Some of the points (m, 3), about so many if there are more."""
-    return points[:: max(1, len(points) // n_most)]
+    return points[:: max(1, len(points) // most)]
 
 
-def _fitted_to_parts(
-    plane: Plane,
-    near: NDArray[np.float64],
+def _raster_for(near: NDArray[np.float64], plane: Plane, search: Search) -> SurfaceRaster:
+    """Cells on a plane; their side follows from the spread of the points (m, 3) near it."""
+    placed = _some(near @ wall_axes(plane.normal, search.cloud.up).T, _SPREAD_POINTS)
+    low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near) else np.zeros((2, 2))
+    cell_m = max(search.tolerance_m, cell_for(len(near), float(np.prod(high - low))))
+    return SurfaceRaster.over(plane, search.box_corners_m, search.cloud.up, cell_m)
+
+
+def _cells_of(search: Search, raster: SurfaceRaster, parts: int) -> CellSums:
+    """Sums of the free points of the sample in the cells on a plane."""
+    return measure_cells(
+        search.free().points,
+        raster,
+        tolerance_m=search.tolerance_m,
+        fit_tolerance_m=search.fit_tolerance_m,
+        parts=parts,
+    )
+
+
+def _verdict(
     raster: SurfaceRaster,
-    place: Support,
-    tolerances_m: tuple[float, ...],
+    sums: CellSums,
+    search: Search,
     freedom: Freedom,
-    up: NDArray[np.float64],
-) -> Plane | None:
-    """Fit a plane to all its parts, or to the largest alone when the others pull it askew.
+    least_points: float,
+    *,
+    settled_m: float = SETTLED_M,
+) -> tuple[Support, AdjustedPlane] | str:
+    """The cells that belong to a plane and how it fits them, or the criterion that refuses it."""
+    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+    if support is None:
+        search.refuse("scattered")
+        return "scattered"
+    adjusted = None
+    criterion: Criterion | None = None
+    u, v = raster.centres_m()
+    left, right, top, bottom = support.bounds_m
+    if support.n_points < least_points:
+        criterion = "few"
+    elif min(right - left, bottom - top) < _STRIP_CELLS * raster.cell_m:
+        criterion = "strip"
+    elif support.n_points < _CROWDED_LEAST * int(
+        sums.n_near[(u > left) & (u < right) & (v > top) & (v < bottom)].sum()
+    ):
+        criterion = "smear"
+    else:
+        adjusted = adjust_plane(
+            raster,
+            sums,
+            support.cells,
+            fit_tolerance_m=search.fit_tolerance_m,
+            freedom=freedom,
+            settled_m=settled_m,
+        )
+        # On a column or barrel that the plane only touches.
+        if adjusted is None or (
+            adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
+        ):
+            criterion = "bent"
+    if adjusted is not None and criterion is None:
+        return support, adjusted
+    # As a share of all points, however many of them were asked.
+    share = search.params.min_share * support.n_points / max(least_points, 1e-9)
+    search.refusals.append((criterion or "bent", share))
+    return criterion or "bent"
 
-    A door and a niche in one wall, at different depths, both lie near one plane that leans by some
-    degrees and runs through them askew; fitted alone, each shows that it does not.
+
+def _verdicts(
+    found: list[FoundPlane],
+    rasters: list[SurfaceRaster],
+    sums: list[CellSums],
+    is_open: list[bool],
+    search: Search,
+    least_points: float,
+) -> list[tuple[Support, AdjustedPlane] | str]:
+    """What the sums say of each plane that is open, several planes at a time."""
+    verdicts: list[tuple[Support, AdjustedPlane] | str] = ["settled"] * len(found)
+    parts = search.cloud.parts
+
+    def judge(first: int) -> None:
+        for k in range(first, len(found), parts):
+            if is_open[k]:
+                freedom = found[k].freedom
+                verdicts[k] = _verdict(rasters[k], sums[k], search, freedom, least_points)
+
+    in_threads([partial(judge, first) for first in range(parts)])
+    return verdicts
+
+
+def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
+    """Cells over the plane's rectangle alone, as fine as the points that are summed allow."""
+    area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
+    cloud = search.cloud
+    share = len(cloud.claims) / max(1, len(cloud.sample.index)) / every
+    cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
+    left, right, top, bottom = item.claim(search.tolerance_m).bounds_m[1:]
+    rows, columns = math.ceil((bottom - top) / cell_m), math.ceil((right - left) / cell_m)
+    return replace(
+        item.raster,
+        low_m=np.array([left, top]),
+        cell_m=cell_m,
+        shape=(max(1, rows), max(1, columns)),
+    )
+
+
+def _sums_of_all(
+    found: list[FoundPlane],
+    rasters: list[SurfaceRaster],
+    is_open: list[bool],
+    search: Search,
+    every: int,
+) -> list[CellSums]:
+    """Sums of all points in the cells of each plane that is open; others give no cells."""
+    cloud = search.cloud
+    shapes = [r.shape if wanted else (0, 0) for r, wanted in zip(rasters, is_open, strict=True)]
+    starts = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in shapes])])
+    reaches_m = (search.fit_tolerance_m, INNER_SHARE * search.tolerance_m)
+    rows = np.array(
+        [
+            (*r.low_m, 1.0 / r.cell_m, *shape, start, *reaches_m)
+            for r, shape, start in zip(rasters, shapes, starts, strict=False)
+        ]
+    ).reshape(-1, 8)
+    # Flat tables over the cells of all rasters, of each part its own.
+    counts = np.zeros((cloud.parts, int(starts[-1]), 3), dtype=np.int32)
+    sums = np.zeros((cloud.parts, int(starts[-1]), 2), dtype=np.int64)
+    slabs, bounds, plane_of_slab = _slabs(found, search.tolerance_m)
+    rows = rows[plane_of_slab]
+
+    def add(part: int, piece: slice) -> None:
+        points, drawn = piece_of(cloud.points, piece), (every, piece.start // BLOCK_POINTS)
+        sum_assigned(points, slabs, bounds, rows, counts[part], sums[part], drawn)
+
+    each_part(len(cloud.claims), cloud.parts, add)
+    all_counts, all_sums = counts.sum(axis=0, dtype=np.int64), sums.sum(axis=0)
+    return [
+        CellSums.of(
+            all_counts[start:end].reshape(*shape, 3), all_sums[start:end].reshape(*shape, 2)
+        )
+        for shape, start, end in zip(shapes, starts[:-1], starts[1:], strict=True)
+    ]
+
+
+def _slabs(
+    found: list[FoundPlane], tolerance_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return slabs (k, 12), their bounds (k, 5), and (k,) the plane that each slab is of.
+
+    A plane has one slab over its rectangle, or several where its cells cover little of that.
     """
-    on_plane = near[_inside(near, raster, place.cells)]
-    together = _shrunk(on_plane, plane, tolerances_m, freedom, up)
-    if len(place.parts_m) < 2:
-        return together
-    largest = near[_inside(near, raster, place.cells & (place.part_of_cell == 0))]
-    alone = _shrunk(largest, plane, tolerances_m, freedom, up)
-    if together is None or alone is None:
-        return alone
-    apart_m, joint_m = (float(np.median(np.abs(p.distances_m(largest)))) for p in (alone, together))
-    return together if joint_m <= _ASKEW * apart_m + _SAME_M else alone
-
-
-def _shrunk(
-    points: NDArray[np.float64],
-    start: Plane,
-    tolerances_m: tuple[float, ...],
-    freedom: Freedom,
-    up: NDArray[np.float64],
-) -> Plane | None:
-    plane: Plane | None = start
-    for tolerance_m in tolerances_m:
-        if plane is not None:
-            plane = refine_plane(points, plane, tolerance_m, freedom=freedom, up=up)
-    return plane
-
-
-def _cells_near(
-    near: NDArray[np.float64], plane: Plane, unassigned: Unassigned, rules: Rules
-) -> tuple[CellSums, SurfaceRaster]:
-    """Cells of free points on a plane; their side follows from the points' own spread."""
-    corners_m, up = unassigned.box_corners_m, unassigned.up
-    probe = surface_raster(plane, corners_m, up, cell_m=rules.find_m)
-    placed = near @ probe.axes.T
-    low, high = _spread(placed) if len(near) else np.zeros((2, 2))
-    cell_m = max(rules.find_m, cell_for(len(near), float(np.prod(high - low))))
-    raster = surface_raster(plane, corners_m, up, cell_m=cell_m)
-    points = unassigned.free().points
-    sums = measure_cells(points, raster, find_m=rules.find_m, fit_m=rules.fit_m, parts=1)
-    return sums, raster
-
-
-def _spread(placed_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 2) where the middle 96 % of points (m, 2) begin and end along both axes."""
-    some = _thinned(placed_m, _SPREAD_POINTS)
-    return np.quantile(some, (0.02, 0.98), axis=0)
-
-
-def _inside(
-    points: NDArray[np.float64], raster: SurfaceRaster, cells: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """(m,) whether points project into cells that belong."""
-    placed = np.floor((points @ raster.axes.T - raster.low_m) / raster.cell_m).astype(np.int64)
-    n_rows, n_columns = raster.shape
-    column = np.clip(placed[:, 0], 0, n_columns - 1)
-    row = np.clip(placed[:, 1], 0, n_rows - 1)
-    return cells[row, column]
+    bounds: list[NDArray[np.float64]] = []
+    n_spare = _SLABS_MOST - len(found)
+    for item in found:
+        most = min(_RECTANGLES_MOST, n_spare + 1)
+        own = covering_rectangles(item.raster, item.support.cells, most)
+        n_spare -= len(own) - 1
+        own = own + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
+        own = np.column_stack([np.full(len(own), tolerance_m), own])
+        bounds.append(own if len(own) > 1 else item.claim(tolerance_m).bounds_m[None])
+    counts = [len(own) for own in bounds]
+    slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)
+    return (
+        np.repeat(slabs, counts, axis=0),
+        np.concatenate(bounds) if bounds else np.zeros((0, 5)),
+        np.repeat(np.arange(len(found), dtype=np.int64), counts),
+    )

@@ -3,30 +3,42 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry import Plane, basis_from_up, plane_through
+from orthoflow.geometry import Plane, basis_from_up, plane_through, wall_axes
 from orthoflow.products import PointCloud, PointLabels
 from orthoflow.sdk import Method, MethodParams, MetricSpec, StepContext
-from orthoflow_plugins.plane.parameters import DetectorIn, DetectorOut
+from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.reference import Reference
-    from orthoflow_plugins.plane.sample import PreparedCloud
+    from orthoflow_plugins.plane.cloud import PreparedCloud
+    from orthoflow_plugins.plane.planes import FacedPlane
+    from orthoflow_plugins.plane.support import Support, SurfaceRaster
 
 Vector = tuple[float, float, float]
 
 # The horizontal plane lies below this share of the points: below the scene, above stray echoes.
 _GROUND_SHARE: Final = 0.01
 # So many points beside the rectangle are no few echoes.
-_STRAY_TOLD: Final = 1e-3
+_STRAY_REPORTED: Final = 1e-3
 # The paper's buffer of three tolerances on either side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
+# Steps of the robust box; of so small a share of the points per side it does not depend.
+_PLAN_CELL_M: Final = 0.05
+_STRAY_SHARE: Final = 0.002
+_EVERYWHERE_M: Final = 1e9
+_NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
+
+_TOO_FAR: Final = (
+    "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
+    "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
+    "or height_m, or raise buffer_m (plane.given)"
+)
 
 
 class StatedPlane(MethodParams):
@@ -150,101 +162,184 @@ class GivenPlane(Method):
     In = DetectorIn
     Out = DetectorOut
 
-    _too_far: ClassVar[str] = (
-        "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
-        "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
-        "or height_m, or raise buffer_m (plane.given)"
-    )
-
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Lay the planes and find which points are on them."""
-        from orthoflow_plugins.plane.reference import lay_references, prepare_for_references
+        from orthoflow_plugins.plane.cloud import prepare
+        from orthoflow_plugins.plane.planes import measure_planes, planes_of, report_planes
+        from orthoflow_plugins.plane.support import slab_of
 
-        cloud = inputs.cloud
+        cloud, tolerance_m = inputs.cloud, params.tolerance_m
         if len(cloud) < 3:
             cloud.require_points(3)
         ctx.progress(0.0, "placing the plane")
-        prepared = prepare_for_references(cloud, parts=ctx.cores, part_share=params.part_min_share)
-        references = []
-        for nth, stated in enumerate(params.planes or (params,)):
-            which = f"planes[{nth}]" if params.planes else "the given plane"
-            try:
-                references.append(self._placed(stated, params, cloud, prepared))
-            except MethodError as error:
-                raise MethodError(f"{which}: {error}") from error
+        prepared = prepare(
+            cloud,
+            basis_from_up(cloud.up),
+            cell_m=_PLAN_CELL_M,
+            # With a part_min_share of 0 no point is stray.
+            least_share=_STRAY_SHARE if params.part_min_share else 0.0,
+            parts=ctx.cores,
+        )
+        laid = _laid(params, cloud, prepared, ctx)
         ctx.progress(0.4, "labelling points")
-        for reference in references:
-            _warn_of_stray(reference.n_beside, len(cloud), params.part_min_share, ctx)
+        axes = [wall_axes(item.plane.normal, cloud.up) for item, _ in laid]
+        slabs = np.array(
+            [
+                slab_of(item.plane, own, np.zeros(2))
+                for (item, _), own in zip(laid, axes, strict=True)
+            ]
+        )
+        prepared.claim_in_turn(slabs, np.array([tolerance_m, *_NO_BOUNDS_M]))
+        counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(laid))
+        order = np.argsort(-counts, kind="stable")
+        # The plane with the most points first; the last entry is for points on none.
+        prepared.claims[:] = np.append(np.argsort(order), -1).astype(np.int8)[prepared.claims]
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
-        planes = lay_references(
-            references, cloud, prepared, labels, tolerance_m=params.tolerance_m, ctx=ctx
+        labels[:] = prepared.claims
+        deviations = measure_planes(
+            prepared,
+            slabs[order],
+            np.tile(_NO_BOUNDS_M, (len(laid), 1)),
+            tolerance_m=tolerance_m,
+            fit_tolerance_m=tolerance_m,
+        )
+        faced, viewpoints = zip(*(laid[k] for k in order), strict=True)
+        planes = planes_of(
+            faced,
+            deviations,
+            cloud,
+            covariances=[np.zeros((4, 4))] * len(laid),
+            # One word for all of them: the least certain.
+            viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
+        )
+        report_planes(
+            ctx, planes, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess")
         )
         return DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
 
-    @classmethod
-    def _placed(
-        cls, stated: StatedPlane, params: Params, cloud: PointCloud, prepared: PreparedCloud
-    ) -> Reference:
-        from orthoflow_plugins.plane.reference import place_reference
 
-        plane, is_settled = cls._stated(stated, cloud)
-        buffer_m = params.buffer_m
-        if buffer_m is None and (stated.normal is not None or stated.points is not None):
-            buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
-        reference = place_reference(
-            plane,
-            cloud,
-            prepared,
-            buffer_m=buffer_m,
-            keeps_side=is_settled,
-            part_share=params.part_min_share,
-        )
-        if reference is None:
-            low_m, high_m = _reach(plane, cloud)
-            raise MethodError(
-                cls._too_far.format(buffer=buffer_m or math.inf, low=low_m, high=high_m)
+def _laid(
+    params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud, ctx: StepContext
+) -> list[tuple[FacedPlane, str]]:
+    """Put a rectangle about the points near each plane; gives how its side was chosen, too."""
+    laid = []
+    for nth, stated in enumerate(params.planes or (params,)):
+        try:
+            faced, viewpoint, n_beside = _placed(stated, params, cloud, prepared)
+        except MethodError as error:
+            which = f"planes[{nth}]" if params.planes else "the given plane"
+            raise MethodError(f"{which}: {error}") from error
+        laid.append((faced, viewpoint))
+        if n_beside > _STRAY_REPORTED * len(cloud):
+            ctx.warn(
+                f"{n_beside} points ({n_beside / len(cloud):.2%}) lie beside the rectangle of the "
+                f"plane, in parts that cover less than {params.part_min_share:.0%} of what all "
+                "cover: part_min_share set to 0 keeps them"
             )
-        return reference
-
-    @staticmethod
-    def _stated(params: StatedPlane, cloud: PointCloud) -> tuple[Plane, bool]:
-        """The plane in the cloud's offsets, and whether its side is settled."""
-        if params.normal is not None and params.offset_m is not None:
-            normal = np.array(params.normal) / math.hypot(*params.normal)
-            normal = normal / np.linalg.norm(normal)
-            offset_m = params.offset_m - float(normal @ cloud.origin)
-            return Plane(normal=normal, offset_m=offset_m), True
-        if params.points is not None:
-            try:
-                return plane_through(np.array(params.points) - cloud.origin), False
-            except GeometryError as error:
-                raise MethodError(
-                    f"plane.given needs three points that span a plane, got {params.points}, "
-                    "which lie on one line"
-                ) from error
-        up = basis_from_up(cloud.up)[2]
-        if params.height_m is not None:
-            return Plane(normal=up, offset_m=params.height_m - float(up @ cloud.origin)), True
-        return Plane(normal=up, offset_m=_ground_m(cloud, up)), True
+    return laid
 
 
-def _warn_of_stray(n_beside: int, n_points: int, part_share: float, ctx: StepContext) -> None:
-    if n_beside > _STRAY_TOLD * n_points:
-        ctx.warn(
-            f"{n_beside} points ({n_beside / n_points:.2%}) lie beside the rectangle of the plane, "
-            f"in parts that cover less than {part_share:.0%} of what all cover: part_min_share "
-            "set to 0 keeps them"
-        )
+def _placed(
+    stated: StatedPlane, params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud
+) -> tuple[FacedPlane, str, int]:
+    """Turn a plane to the viewer; gives how the side was chosen, and the points beside it."""
+    from orthoflow_plugins.plane.planes import (
+        face,
+        known_viewpoint,
+        measure_planes,
+        rectangle_m,
+        side_of_remaining,
+        side_of_stations,
+    )
+
+    plane, is_settled = _plane_of(stated, cloud, prepared)
+    members = prepared.sample.offsets_m
+    distances_m = plane.distances_m(members)
+    buffer_m = params.buffer_m
+    if buffer_m is None and (stated.normal is not None or stated.points is not None):
+        buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
+    reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
+    near = np.abs(distances_m) <= reach_m
+    raster, support, n_near = _support_of(
+        plane, members[near], reach_m, params.part_min_share, prepared
+    )
+    if support is None:
+        low_m, high_m = float(distances_m.min()), float(distances_m.max())
+        raise MethodError(_TOO_FAR.format(buffer=reach_m, low=low_m, high=high_m))
+    prepared.claim_in_turn(raster.slab()[None], np.concatenate([[reach_m], support.bounds_m]))
+    deviations = measure_planes(
+        prepared,
+        raster.slab()[None],
+        support.bounds_m[None],
+        tolerance_m=reach_m,
+        fit_tolerance_m=reach_m,
+    )
+    extent_m = deviations.extents_m[0]
+    side, viewpoint = 1, "given"
+    if not is_settled:
+        corners_m = rectangle_m(plane, raster.axes, extent_m)
+        index = prepared.sample.index[near]
+        side, viewpoint = side_of_stations(plane, corners_m.mean(axis=0), cloud, index), "guess"
+        if side:
+            viewpoint = known_viewpoint(cloud)
+        else:
+            nowhere = np.zeros(len(members), dtype=bool)
+            clear_m = (buffer_m or 0.0) / _BUFFER_TOLERANCES
+            side = side_of_remaining(plane, corners_m, members, nowhere, clear_m=clear_m)
+    n_beside = n_near - int(deviations.n_points[0]) if buffer_m is None else 0
+    faced = face(raster, extent_m, support.parts_m, side, cloud.up, is_guessed=viewpoint == "guess")
+    return faced, viewpoint, max(0, n_beside)
 
 
-def _ground_m(cloud: PointCloud, up: NDArray[np.float64]) -> float:
-    from orthoflow_plugins.plane.sample import draw_sample
+def _plane_of(
+    stated: StatedPlane, cloud: PointCloud, prepared: PreparedCloud
+) -> tuple[Plane, bool]:
+    """The plane in the cloud's offsets, and whether its side is settled."""
+    if stated.normal is not None and stated.offset_m is not None:
+        normal = np.array(stated.normal) / math.hypot(*stated.normal)
+        normal = normal / np.linalg.norm(normal)
+        offset_m = stated.offset_m - float(normal @ cloud.origin)
+        return Plane(normal=normal, offset_m=offset_m), True
+    if stated.points is not None:
+        try:
+            return plane_through(np.array(stated.points) - cloud.origin), False
+        except GeometryError as error:
+            raise MethodError(
+                f"plane.given needs three points that span a plane, got {stated.points}, "
+                "which lie on one line"
+            ) from error
+    up = prepared.up
+    if stated.height_m is not None:
+        return Plane(normal=up, offset_m=stated.height_m - float(up @ cloud.origin)), True
+    ground_m = float(np.quantile(prepared.sample.offsets_m @ up, _GROUND_SHARE))
+    return Plane(normal=up, offset_m=ground_m), True
 
-    return float(np.quantile(draw_sample(cloud).offsets_m @ up, _GROUND_SHARE))
 
+def _support_of(
+    plane: Plane,
+    near_m: NDArray[np.float64],
+    reach_m: float,
+    part_share: float,
+    prepared: PreparedCloud,
+) -> tuple[SurfaceRaster, Support | None, int]:
+    """Cells of the points near a plane that hang together, and how many points are near.
 
-def _reach(plane: Plane, cloud: PointCloud) -> tuple[float, float]:
-    from orthoflow_plugins.plane.sample import draw_sample
+    Args:
+        plane: the plane.
+        near_m: (m, 3) points of the sample that are near.
+        reach_m: what is near.
+        part_share: parts that cover a smaller share of what all cover do not count.
+        prepared: the cloud.
+    """
+    from orthoflow_plugins.plane.support import SurfaceRaster, cell_for, measure_cells, support_of
 
-    distances_m = plane.distances_m(draw_sample(cloud).offsets_m)
-    return float(distances_m.min()), float(distances_m.max())
+    placed = near_m @ wall_axes(plane.normal, prepared.up).T
+    # Not the full range: three echoes far away would make the cells as large as the scene.
+    low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(near_m) else np.zeros((2, 2))
+    cell_m = cell_for(len(near_m) * prepared.sample.n_represented, float(np.prod(high - low)))
+    raster = SurfaceRaster.over(plane, prepared.box_corners(), prepared.up, cell_m)
+    sums = measure_cells(
+        prepared.points, raster, tolerance_m=reach_m, fit_tolerance_m=reach_m, parts=prepared.parts
+    )
+    support = support_of(raster, sums.n_near > 0, sums, part_share=part_share)
+    return raster, support, int(sums.n_near.sum())

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane
 from orthoflow.sdk import Method, StepContext
-from orthoflow_plugins.plane.open3d_ransac import PART_SHARE, open3d_version
-from orthoflow_plugins.plane.parameters import (
+from orthoflow_plugins.plane.detector import (
     DETECTOR_METRICS,
+    Candidate,
     DetectorIn,
     DetectorOut,
     DetectorParams,
 )
+from orthoflow_plugins.plane.open3d_ransac import PART_SHARE, open3d_version
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Candidate, Rules
-    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+    from orthoflow_plugins.plane.cloud import Search
 
 
 class Open3dPatches(Method):
@@ -67,19 +66,11 @@ class Open3dPatches(Method):
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.detecting import Detector, detect
         from orthoflow_plugins.plane.open3d_library import load_open3d
+        from orthoflow_plugins.plane.search import detect
 
-        open3d = load_open3d(self.id)
-
-        def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> PatchProposer:
-            least_points = PART_SHARE * rules.least_share * len(unassigned.claims)
-            points_m = unassigned.sample.offsets_m
-            return patches(open3d, points_m, params, least_points=max(10, int(least_points)))
-
-        detector = Detector(method=self.id, proposer_of=proposer_of)
-        detection = detect(inputs.cloud, params, ctx, detector)
-        return DetectorOut(planes=detection.planes, labels=detection.labels)
+        proposer_of = partial(PatchProposer, params=params, open3d=load_open3d(self.id))
+        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id).out
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
@@ -87,60 +78,52 @@ class Open3dPatches(Method):
         return open3d_version()
 
 
-@dataclass(kw_only=True)
 class PatchProposer:
-    """Proposes the patches of `detect_planar_patches`, largest first."""
+    """Proposes the patches of `detect_planar_patches`, that with most points in its box first."""
 
-    candidates: list[Candidate]
+    # Any: the library has no types.
+    def __init__(self, search: Search, params: Open3dPatches.Params, open3d: Any) -> None:
+        """Find all patches at once.
 
-    def propose(self, unassigned: Unassigned) -> Candidate | None:
+        Raises:
+            MethodError: open3d gave up.
+        """
+        points_m = search.cloud.sample.offsets_m
+        cloud = open3d.geometry.PointCloud()
+        cloud.points = open3d.utility.Vector3dVector(points_m)
+        neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=params.n_neighbours)
+        try:
+            cloud.estimate_normals(neighbours)
+            boxes = cloud.detect_planar_patches(
+                normal_variance_threshold_deg=params.normal_variance_deg,
+                coplanarity_deg=params.coplanarity_deg,
+                outlier_ratio=params.outlier_share,
+                min_num_points=max(10, int(PART_SHARE * search.least_points)),
+                search_param=neighbours,
+            )
+        except RuntimeError as error:
+            raise MethodError(
+                f"open3d's detect_planar_patches gave up on the {len(points_m)} points "
+                f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
+            ) from error
+        self._candidates = []
+        for box in boxes:
+            normal = np.asarray(box.R, dtype=np.float64)[:, 2]
+            offset_m = float(normal @ np.asarray(box.center, dtype=np.float64))
+            inside = len(box.get_point_indices_within_bounding_box(cloud.points))
+            self._candidates.append(
+                Candidate(
+                    plane=Plane(normal=normal, offset_m=offset_m),
+                    constraint=params.constraint,
+                    votes=float(inside),
+                )
+            )
+        self._candidates.sort(key=lambda candidate: -candidate.votes)
+
+    def propose(self, search: Search) -> Candidate | None:
         """Name the next patch."""
-        del unassigned
-        return self.candidates.pop(0) if self.candidates else None
+        del search
+        return self._candidates.pop(0) if self._candidates else None
 
     def reject(self, candidate: Candidate) -> None:
-        """Patches are named once in any case."""
-
-
-# Any: the library has no types.
-def patches(
-    open3d: Any, points_m: NDArray[np.float64], params: Open3dPatches.Params, *, least_points: int
-) -> PatchProposer:
-    """Find all patches at once; a patch counts the points in its box.
-
-    Raises:
-        MethodError: open3d gave up.
-    """
-    from orthoflow_plugins.plane.candidates import Candidate
-
-    cloud = open3d.geometry.PointCloud()
-    cloud.points = open3d.utility.Vector3dVector(points_m)
-    neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=params.n_neighbours)
-    try:
-        cloud.estimate_normals(neighbours)
-        boxes = cloud.detect_planar_patches(
-            normal_variance_threshold_deg=params.normal_variance_deg,
-            coplanarity_deg=params.coplanarity_deg,
-            outlier_ratio=params.outlier_share,
-            min_num_points=least_points,
-            search_param=neighbours,
-        )
-    except RuntimeError as error:
-        raise MethodError(
-            f"open3d's detect_planar_patches gave up on the {len(points_m)} points "
-            f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
-        ) from error
-    candidates = []
-    for box in boxes:
-        normal = np.asarray(box.R, dtype=np.float64)[:, 2]
-        centre_m = np.asarray(box.center, dtype=np.float64)
-        inside = len(box.get_point_indices_within_bounding_box(cloud.points))
-        candidates.append(
-            Candidate(
-                plane=Plane(normal=normal, offset_m=float(normal @ centre_m)),
-                family=params.family,
-                votes=float(inside),
-            )
-        )
-    candidates.sort(key=lambda candidate: -candidate.votes)
-    return PatchProposer(candidates=candidates)
+        """Do nothing: patches are named once in any case."""

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.geometry import Plane
 from orthoflow.sdk import Method, StepContext
-from orthoflow_plugins.plane.parameters import (
+from orthoflow_plugins.plane.detector import (
     DETECTOR_METRICS,
+    Candidate,
     DetectorIn,
     DetectorOut,
     DetectorParams,
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
-    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+    from orthoflow_plugins.plane.cloud import Search
 
 # Points of a candidate, as a share of those that a plane needs.
 PART_SHARE: Final = 0.2
@@ -66,24 +65,13 @@ class Open3dRansac(Method):
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.detecting import Detector, detect
         from orthoflow_plugins.plane.open3d_library import load_open3d
+        from orthoflow_plugins.plane.search import detect
 
         open3d = load_open3d(self.id)
         open3d.utility.random.seed(int(ctx.rng.integers(2**31)))
-
-        def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> SegmentProposer:
-            return SegmentProposer(
-                open3d=open3d,
-                family=params.family,
-                tolerance_m=rules.find_m,
-                n_iterations=params.n_iterations,
-                least_points=rules.least_share * len(unassigned.claims),
-            )
-
-        detector = Detector(method=self.id, proposer_of=proposer_of)
-        detection = detect(inputs.cloud, params, ctx, detector)
-        return DetectorOut(planes=detection.planes, labels=detection.labels)
+        proposer_of = partial(SegmentProposer, params=params, open3d=open3d)
+        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id).out
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
@@ -91,52 +79,36 @@ class Open3dRansac(Method):
         return open3d_version()
 
 
-@dataclass(kw_only=True)
 class SegmentProposer:
-    """Proposes the plane of `segment_plane` among the points that remain, again and again.
-
-    Attributes:
-        open3d: the library.
-        family: which planes are looked for; open3d cannot be told, so others are passed over.
-        tolerance_m: distance of an inlier.
-        n_iterations: hypotheses.
-        least_points: a plane needs.
-    """
+    """Proposes the plane of `segment_plane` among the points that remain, again and again."""
 
     # Any: the library has no types.
-    open3d: Any
-    family: Family
-    tolerance_m: float
-    n_iterations: int
-    least_points: float
-    _passed_over: NDArray[np.bool_] | None = None
-    _last: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
+        """Get ready to propose; open3d takes no constraint, so other planes are passed over."""
+        self._params, self._open3d = params, open3d
+        self._passed_over = np.zeros(len(search.claims), dtype=bool)
+        self._last = np.zeros(0, dtype=np.int64)
 
-    def propose(self, unassigned: Unassigned) -> Candidate | None:
+    def propose(self, search: Search) -> Candidate | None:
         """Name the plane with most inliers, or None when it has too few."""
-        from orthoflow_plugins.plane.candidates import Candidate
-
-        if self._passed_over is None:
-            self._passed_over = np.zeros(len(unassigned.claims), dtype=bool)
-        free = np.flatnonzero((unassigned.claims < 0) & ~self._passed_over)
-        if len(free) < max(3.0, self.least_points):
+        free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
+        if len(free) < max(3.0, search.least_points):
             return None
-        cloud = self.open3d.geometry.PointCloud()
-        cloud.points = self.open3d.utility.Vector3dVector(unassigned.sample.offsets_m[free])
-        model, inliers = cloud.segment_plane(self.tolerance_m, 3, self.n_iterations)
+        cloud = self._open3d.geometry.PointCloud()
+        cloud.points = self._open3d.utility.Vector3dVector(search.cloud.sample.offsets_m[free])
+        model, inliers = cloud.segment_plane(search.tolerance_m, 3, self._params.n_iterations)
         normal = np.array(model[:3], dtype=np.float64)
         length = float(np.linalg.norm(normal))
-        if len(inliers) < PART_SHARE * self.least_points or not length > 0.0:
+        if len(inliers) < PART_SHARE * search.least_points or not length > 0.0:
             return None
         self._last = free[np.asarray(inliers, dtype=np.int64)]
         return Candidate(
             plane=Plane(normal=normal / length, offset_m=-float(model[3]) / length),
-            family=self.family,
+            constraint=self._params.constraint,
             votes=float(len(inliers)),
         )
 
     def reject(self, candidate: Candidate) -> None:
         """Leave the inliers of what was no plane out of the next search."""
         del candidate
-        if self._passed_over is not None:
-            self._passed_over[self._last] = True
+        self._passed_over[self._last] = True

@@ -1,23 +1,82 @@
-"""`plane.ransac`: the planes that most points of a sample agree on, fitted to all points."""
+"""`plane.ransac`: the planes that most points of a sample agree on, fitted to all points.
+
+Three points drawn from all of a room are on one small wall once in a million draws. The sample is
+put along a space-filling curve, and the points of a hypothesis come from one stretch of it, of a
+length that is drawn too: short stretches find small planes, long ones fix large planes well.
+
+What a hypothesis is worth follows from the distances of points to it.
+
+- count (Max-Consensus): the points within the tolerance.
+- msac: a point within the tolerance counts 1 - (distance / tolerance)^2 (Torr and Zisserman 2000).
+- a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms that the tolerance with
+  the fewest gives; the tolerance is an outcome (Moisan and Stival 2004; Moisan, Moulon, Monasse
+  2012). The chance that a point of the background lies within a distance of the plane is the share
+  of the scene's box that the slab fills.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from orthoflow.geometry import Plane
+from orthoflow.geometry.rows import Rows
+from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow.sdk import Method, MetricSpec, StepContext
-from orthoflow_plugins.plane.parameters import (
+from orthoflow_plugins.plane.detector import (
     DETECTOR_METRICS,
+    PAPER,
+    Candidate,
     DetectorIn,
     DetectorOut,
     DetectorParams,
+    leans_as_asked,
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Rules
-    from orthoflow_plugins.plane.detecting import Proposer
-    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+    from orthoflow_plugins.plane.cloud import Search
+
+Model = Literal["3d", "2d"]
+Scoring = Literal["count", "msac", "a-contrario"]
+
+# Bins of 0..tolerance that distances are counted in.
+_BINS: Final = 100
+# Points of the sample that hypotheses are drawn from, and that they are scored on, at most.
+_DRAWN_MOST: Final = 50_000
+_ASKED_MOST: Final = 150_000
+# Points that all hypotheses are scored on, and those that the better ones are scored on again.
+_FIRST_POINTS: Final = 2_000
+_SECOND_POINTS: Final = 20_000
+_SECOND_SHARE: Final = 0.1
+_SECOND_LEAST: Final = 50
+# Few points fix a plane badly: it may lean by this much more than what is looked for.
+_LEAN_CAUTION_DEG: Final = 5.0
+# Points within the tolerance may fall short of what a plane needs: the hypothesis is rough.
+_SUPPORT_CAUTION: Final = 0.4
+_POLISHED: Final = 4
+# So many hypotheses near each other are scored again; the best of them fits better than any one.
+_ALIKE_MOST: Final = 5
+# Of the points within the tolerance so many must lie in its inner part; chance puts 0.4 there.
+_CROWDED_SHARE: Final = 0.5
+# Fresh draws after all hypotheses turned out to be none.
+_REDRAWS: Final = 2
+# Stretches hold at least so many points, and each length is half of the one before.
+_STRETCH_LEAST: Final = 32
+# Triangles flatter than this (height over longest side) fix no plane.
+_FLATTEST: Final = 0.02
+_CURVE_BITS: Final = 10
+# Bits of a number spread to every third place, step by step.
+_SPREADS: Final = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
+# A hypothesis this near, within a tolerance, to one that turned out to be none is not proposed
+# again; unless so many of the points near it are gone since then.
+_ALIKE_DEG: Final = 2.0
+_LOST_SHARE: Final = 0.05
 
 
 class Ransac(Method):
@@ -48,19 +107,16 @@ class Ransac(Method):
             "Moisan, Stival 2004: A probabilistic criterion to detect rigid point matches, "
             "doi:10.1023/B:VISI.0000013094.38752.54 (a contrario)"
         ),
-        (
-            "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "
-            "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
-        ),
+        PAPER,
     )
 
     class Params(DetectorParams):
         """What may be set; the defaults suit rooms and facades scanned at millimetres."""
 
-        model: Literal["3d", "2d"] = Field(
+        model: Model = Field(
             "3d", description="Planes through three points, or upright ones through two."
         )
-        scoring: Literal["count", "msac", "a-contrario"] = Field(
+        scoring: Scoring = Field(
             "msac",
             description="What a hypothesis is worth: its points, its points the more the nearer "
             "they are, or how little they look like chance at its own tolerance.",
@@ -83,24 +139,387 @@ class Ransac(Method):
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
-        from orthoflow_plugins.plane.detecting import Detector, detect
+        from orthoflow_plugins.plane.search import detect
 
-        def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> Proposer:
-            search = Search(
-                model=params.model,
-                scoring=params.scoring,
-                n_hypotheses=params.n_hypotheses,
-                find_m=rules.find_m,
-                family=params.family,
-                tilt_most_deg=params.max_tilt_deg,
-                least_share=params.min_share,
-            )
-            return ConsensusProposer(unassigned, search, ctx.rng)
-
-        detector = Detector(method=self.id, proposer_of=proposer_of)
-        detection = detect(inputs.cloud, params, ctx, detector)
+        proposer_of = partial(ConsensusProposer, params=params, rng=ctx.rng)
+        detection = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
         own_m = detection.raw[0].own_tolerance_m
         if own_m is not None:
             ctx.metric("own_tolerance_mm", 1000.0 * own_m, "mm")
-        return DetectorOut(planes=detection.planes, labels=detection.labels)
+        return detection.out
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hypotheses(Rows):
+    """Planes in the frame of the points they were drawn from.
+
+    Attributes:
+        normals: (h, 3) unit vectors.
+        offsets_m: (h,) normal times point.
+    """
+
+    normals: NDArray[np.float64]
+    offsets_m: NDArray[np.float64]
+
+    def are_near(self, others: Hypotheses, tolerance_m: float) -> NDArray[np.bool_]:
+        """(h, o) whether hypotheses are much the same as others."""
+        cosines = self.normals @ others.normals.T
+        apart_m = np.abs(self.offsets_m[:, None] - np.copysign(1.0, cosines) * others.offsets_m)
+        limit = math.cos(math.radians(_ALIKE_DEG))
+        return (np.abs(cosines) > limit) & (apart_m < tolerance_m)
+
+    def plane(self, place: int) -> Plane:
+        """Return one of them."""
+        normal = self.normals[place]
+        return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(self.offsets_m[place]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores(Rows):
+    """What hypotheses are worth.
+
+    Attributes:
+        value: (h,) the larger the better; for a-contrario positive when meaningful.
+        tolerance_m: (h,) tolerance within which the points speak for it.
+        n_points: (h,) points within that.
+    """
+
+    value: NDArray[np.float64]
+    tolerance_m: NDArray[np.float64]
+    n_points: NDArray[np.int64]
+
+
+class ConsensusProposer:
+    """Proposes planes that many points of a sample lie on.
+
+    Hypotheses that were good stay for the next plane and are scored anew on what remains. Those
+    that turned out to be no planes stay out until points near them are taken: a verification asks
+    those points, so that until then it would end as before.
+    """
+
+    def __init__(self, search: Search, params: Ransac.Params, rng: np.random.Generator) -> None:
+        """Get ready to propose; `rng` is the source of chance."""
+        self._params, self._rng, self._search = params, rng, search
+        points_m = search.cloud.sample.offsets_m
+        self._centre_m = np.median(points_m, axis=0)
+        # Shuffled once, so that any first part of the free points is an even choice of them.
+        self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
+        drawn = self._shuffled[:_DRAWN_MOST]
+        self._order = drawn[curve_order(points_m[drawn])]
+        self._ordered_m = points_m[self._order] - self._centre_m
+        corners = search.box_corners_m
+        self._box_m = corners.max(axis=0) - corners.min(axis=0)
+        self._drawn_for = -1
+        self._hypotheses: Hypotheses | None = None
+        # Of those, in the same order, the best first; on the points that were asked.
+        self._scores = Scores(value=np.zeros(0), tolerance_m=np.zeros(0), n_points=np.zeros(0, int))
+        self._asked_m = points_m[:0]
+        self._witnesses = self._shuffled[:_SECOND_POINTS]
+        self._witnesses_m = points_m[self._witnesses] - self._centre_m
+        self._free_m = self._witnesses_m
+        self._rejected = Hypotheses(normals=np.zeros((0, 3)), offsets_m=np.zeros(0))
+        self._n_near = np.zeros(0, dtype=np.int64)
+
+    def propose(self, search: Search) -> Candidate | None:
+        """Name the best hypothesis about the points that remain."""
+        if self._drawn_for != search.n_points:
+            self._free_m = self._witnesses_m[search.claims[self._witnesses] < 0]
+            stays = self._count_near(self._rejected) >= (1.0 - _LOST_SHARE) * self._n_near
+            self._rejected, self._n_near = self._rejected.take(stays), self._n_near[stays]
+            self._drawn_for = search.n_points
+            self._draw()
+        for _ in range(_REDRAWS):
+            candidate = self._best()
+            if candidate is not None:
+                return candidate
+            self._draw()
+        return self._best()
+
+    def reject(self, candidate: Candidate) -> None:
+        """Bar the surroundings of a hypothesis that turned out to be no plane."""
+        plane = candidate.plane
+        offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
+        self._bar(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
+
+    def _bar(self, hypothesis: Hypotheses) -> None:
+        self._rejected = Hypotheses.joined([self._rejected, hypothesis])
+        self._n_near = np.append(self._n_near, self._count_near(hypothesis))
+
+    def _is_barred(self, hypotheses: Hypotheses) -> NDArray[np.bool_]:
+        """(h,) whether hypotheses are much the same as a rejected one."""
+        near = hypotheses.are_near(self._rejected, self._search.tolerance_m)
+        return np.asarray(np.logical_or.reduce(near, axis=1))
+
+    def _count_near(self, hypotheses: Hypotheses) -> NDArray[np.int64]:
+        """(h,) free witnesses near each hypothesis."""
+        apart_m = np.abs(self._free_m @ hypotheses.normals.T - hypotheses.offsets_m)
+        return np.asarray(np.sum(apart_m <= self._search.tolerance_m, axis=0, dtype=np.int64))
+
+    def _best(self) -> Candidate | None:
+        hypotheses = self._hypotheses
+        if hypotheses is None:
+            return None
+        is_barred = self._is_barred(hypotheses)
+        for place in range(len(hypotheses)):
+            if is_barred[place] or not self._is_worth_it(place):
+                continue
+            hypothesis = hypotheses.take(np.array([place]))
+            layer = self._crowded_layer(hypothesis)
+            if layer is not None:
+                return self._candidate(hypothesis, place, layer)
+            # Not asked about again; the full verification would cost ten times as much.
+            self._bar(hypothesis)
+            is_barred |= hypotheses.are_near(hypothesis, self._search.tolerance_m)[:, 0]
+        return None
+
+    def _draw(self) -> None:
+        """Draw hypotheses, score them with the earlier ones on a few points, the best on more."""
+        search, params = self._search, self._params
+        points_m, claims = search.cloud.sample.offsets_m, search.claims
+        free = np.flatnonzero(claims[self._order] < 0)
+        earlier, self._hypotheses = self._hypotheses, None
+        if len(free) < 3:
+            return
+        hypotheses = draw_hypotheses(
+            self._ordered_m.take(free, axis=0),
+            params.n_hypotheses if earlier is None else params.n_hypotheses // 2,
+            params.model,
+            search.cloud.up,
+            self._rng,
+        )
+        if earlier is not None:
+            hypotheses = Hypotheses.joined([hypotheses, earlier])
+        limit_deg = params.max_tilt_deg + _LEAN_CAUTION_DEG
+        hypotheses = hypotheses.take(
+            leans_as_asked(hypotheses.normals, search.cloud.up, params.constraint, limit_deg)
+        )
+        hypotheses = hypotheses.take(~self._is_barred(hypotheses))
+        if len(hypotheses) == 0:
+            return
+        # Among the first of them there nearly always are enough.
+        asked = self._shuffled[: 4 * _SECOND_POINTS]
+        asked = asked[claims[asked] < 0]
+        if len(asked) < _SECOND_POINTS:
+            asked = self._shuffled[claims[self._shuffled] < 0]
+        self._asked_m = points_m.take(asked[:_SECOND_POINTS], axis=0) - self._centre_m
+        first = self._scored(hypotheses, self._asked_m[:_FIRST_POINTS])
+        n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
+        kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
+        hypotheses = hypotheses.take(kept)
+        scores = self._scored(hypotheses, self._asked_m)
+        ranked = np.argsort(-scores.value, kind="stable")
+        self._hypotheses, self._scores = hypotheses.take(ranked), scores.take(ranked)
+
+    def _scored(self, hypotheses: Hypotheses, points_m: NDArray[np.float64]) -> Scores:
+        from orthoflow_plugins.plane.kernels import consensus_sums, distance_histograms
+
+        columns = np.ascontiguousarray(points_m.T, dtype=np.float32)
+        rows = np.column_stack([hypotheses.normals, hypotheses.offsets_m]).astype(np.float32)
+        reach_m, parts = self._search.tolerance_m, self._search.cloud.parts
+
+        shares = even_parts(len(rows), parts)
+        if self._params.scoring == "a-contrario":
+            histograms = np.zeros((len(rows), _BINS), dtype=np.int32)
+            count = partial(distance_histograms, columns)
+            in_threads([partial(count, rows[k], reach_m, histograms[k]) for k in shares])
+            extents_m = np.abs(hypotheses.normals) @ self._box_m
+            n_corners = 3 if self._params.model == "3d" else 2
+            return fewest_false_alarms(histograms, reach_m, len(points_m), extents_m, n_corners)
+        sums = np.zeros((len(rows), 2), dtype=np.int64)
+        add = partial(consensus_sums, columns)
+        in_threads([partial(add, rows[k], reach_m, _BINS, sums[k]) for k in shares])
+        n_points = sums[:, 0].copy()
+        is_msac = self._params.scoring == "msac"
+        return Scores(
+            value=sums[:, 1] / (4.0 * _BINS**2) if is_msac else n_points.astype(np.float64),
+            tolerance_m=np.full(len(rows), reach_m),
+            n_points=n_points,
+        )
+
+    def _distinct(
+        self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
+    ) -> NDArray[np.intp]:
+        """The best of some ranked hypotheses, no more than `_ALIKE_MOST` of them much the same."""
+        # The best ones nearly always hold enough that differ.
+        for n_asked in (min(len(ranked), _ALIKE_MOST * n_most), len(ranked)):
+            asked = ranked[:n_asked]
+            some = hypotheses.take(asked)
+            near = some.are_near(some, self._search.tolerance_m)
+            kept: list[int] = []
+            alike = np.zeros(n_asked, dtype=np.int64)
+            for place in range(n_asked):
+                if alike[place] < _ALIKE_MOST and len(kept) < n_most:
+                    kept.append(place)
+                    alike += near[place]
+            if len(kept) == n_most:
+                break
+        return asked[kept]
+
+    def _is_worth_it(self, place: int) -> bool:
+        if self._params.scoring == "a-contrario" and self._scores.value[place] <= 0.0:
+            return False
+        asked = min(_SECOND_POINTS, self._search.n_points)
+        n_points = self._scores.n_points[place] / max(1, asked) * self._search.n_points
+        return bool(n_points >= _SUPPORT_CAUTION * self._search.least_points)
+
+    def _crowded_layer(self, hypothesis: Hypotheses) -> Plane | None:
+        """The densest layer near a hypothesis, about the centre, if points crowd about it.
+
+        A plane through mouldings and clutter holds many points too, but spread over its slab.
+        """
+        from orthoflow_plugins.plane.fit import refine_plane
+        from orthoflow_plugins.plane.support import INNER_SHARE
+
+        reach_m, start = self._search.tolerance_m, hypothesis.plane(0)
+        up = self._search.cloud.up
+        moved = refine_plane(self._asked_m, start, reach_m, freedom="free", up=up)
+        if moved is None:
+            return None
+        sizes_m = np.abs(moved.distances_m(self._asked_m))
+        inner = np.count_nonzero(sizes_m <= INNER_SHARE * reach_m)
+        return moved if inner >= _CROWDED_SHARE * np.count_nonzero(sizes_m <= reach_m) else None
+
+    def _candidate(self, hypothesis: Hypotheses, place: int, layer: Plane) -> Candidate:
+        own_m = None
+        if self._params.scoring == "a-contrario":
+            hypothesis, own_m = self._polished(hypothesis)
+        return Candidate(
+            plane=self._in_offsets(hypothesis.plane(0)),
+            constraint="vertical" if self._params.model == "2d" else self._params.constraint,
+            votes=float(self._scores.value[place]),
+            own_tolerance_m=own_m,
+            start=self._in_offsets(layer),
+        )
+
+    def _in_offsets(self, plane: Plane) -> Plane:
+        offset_m = plane.offset_m + float(plane.normal @ self._centre_m)
+        return Plane(normal=plane.normal, offset_m=offset_m)
+
+    def _polished(self, hypothesis: Hypotheses) -> tuple[Hypotheses, float]:
+        """Fit to the points within the own tolerance, find that anew, while it gets better."""
+        search = self._search
+        relative_m = (search.cloud.sample.offsets_m - self._centre_m)[search.claims < 0]
+        best = self._scored(hypothesis, relative_m)
+        for _ in range(_POLISHED):
+            distances_m = relative_m @ hypothesis.normals[0] - hypothesis.offsets_m[0]
+            near_m = relative_m[np.abs(distances_m) <= best.tolerance_m[0]]
+            fitted = _fitted(near_m, self._params.model, search.cloud.up)
+            if fitted is None:
+                break
+            score = self._scored(fitted, relative_m)
+            if score.value[0] <= best.value[0]:
+                break
+            hypothesis, best = fitted, score
+        return hypothesis, float(best.tolerance_m[0])
+
+
+def draw_hypotheses(
+    points_m: NDArray[np.float64],
+    count: int,
+    model: Model,
+    up: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> Hypotheses:
+    """Draw planes through points.
+
+    Args:
+        points_m: (m, 3) in curve order.
+        count: how many are drawn; those that fix no plane are left out.
+        model: `3d` through three points, `2d` upright through two.
+        up: (3,) unit vector.
+        rng: source of chance.
+    """
+    n_points = len(points_m)
+    n_lengths = max(1, int(np.log2(max(1.0, n_points / _STRETCH_LEAST))) + 1)
+    stretch = np.ceil(n_points / 2.0 ** rng.integers(0, n_lengths, count)).astype(np.int64)
+    first = (rng.random(count) * (n_points - stretch + 1)).astype(np.int64)
+    n_corners = 3 if model == "3d" else 2
+    chosen = first[:, None] + (rng.random((count, n_corners)) * stretch[:, None]).astype(np.int64)
+    corners = points_m[chosen]
+    a = corners[:, 1] - corners[:, 0]
+    b = corners[:, 2] - corners[:, 0] if model == "3d" else np.broadcast_to(up, a.shape)
+    normals = np.cross(a, b)
+    lengths = np.linalg.norm(normals, axis=1)
+    longest = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+    fixed = lengths > (_FLATTEST * longest**2 if model == "3d" else 1e-6)
+    normals = normals[fixed] / lengths[fixed, None]
+    return Hypotheses(
+        normals=normals, offsets_m=np.einsum("ij,ij->i", normals, corners[fixed].mean(axis=1))
+    )
+
+
+def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Order points (m, 3) along a Morton curve, so that neighbours on it are near each other."""
+    low, high = np.quantile(points_m, (0.01, 0.99), axis=0)
+    scale = (2**_CURVE_BITS - 1) / max(float((high - low).max()), 1e-9)
+    cells = np.clip((points_m - low) * scale, 0, 2**_CURVE_BITS - 1).astype(np.uint32)
+    key = np.zeros(len(points_m), dtype=np.uint32)
+    for axis in range(3):
+        bits = cells[:, axis]
+        for shift, mask in _SPREADS:
+            bits = (bits | (bits << np.uint32(shift))) & np.uint32(mask)
+        key |= bits << np.uint32(axis)
+    return np.argsort(key, kind="stable")
+
+
+def fewest_false_alarms(
+    histograms: NDArray[np.int32],
+    reach_m: float,
+    n_points: int,
+    extents_m: NDArray[np.float64],
+    n_corners: int,
+) -> Scores:
+    """Score hypotheses by the tolerance at which their points least look like chance.
+
+    Args:
+        histograms: (h, bins) points per bin of distance, 0..reach.
+        reach_m: the largest tolerance that is considered.
+        n_points: points that were asked.
+        extents_m: (h,) extent of the scene's box along each normal.
+        n_corners: points that fix a hypothesis.
+    """
+    within = np.cumsum(histograms, axis=1, dtype=np.int64)
+    n_bins = within.shape[1]
+    tolerances_m = (np.arange(n_bins) + 1.0) * (reach_m / n_bins)
+    k = np.maximum(within, n_corners + 1).astype(np.float64)
+    chance = np.minimum(2.0 * tolerances_m / np.maximum(extents_m[:, None], 1e-9), 1.0)
+    log_alarms = (
+        np.log(max(n_points - n_corners, 1))
+        + _log_choose(float(n_points), k)
+        + _log_choose(k, float(n_corners))
+        + (k - n_corners) * np.log(chance)
+    )
+    log_alarms = np.where(within > n_corners, log_alarms, np.inf)
+    best = np.argmin(log_alarms, axis=1)
+    rows = np.arange(len(within))
+    return Scores(
+        value=-log_alarms[rows, best] / np.log(10.0),
+        tolerance_m=tolerances_m[best],
+        n_points=within[rows, best],
+    )
+
+
+def _log_choose(
+    n: float | NDArray[np.float64], k: float | NDArray[np.float64]
+) -> NDArray[np.float64]:
+    from scipy.special import gammaln
+
+    apart = gammaln(np.subtract(n, k) + 1.0)
+    return gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - apart
+
+
+def _fitted(
+    points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
+) -> Hypotheses | None:
+    """Plane of least squared distances, upright for the 2D model."""
+    if len(points_m) < 4:
+        return None
+    mean = points_m.mean(axis=0)
+    centred = points_m - mean
+    if model == "2d":
+        centred = centred - np.outer(centred @ up, up)
+    values, directions = np.linalg.eigh(centred.T @ centred)
+    normal = directions[:, 1 if model == "2d" else 0]
+    if values[1] <= 0.0 or abs(float(normal @ up)) > 1.0:
+        return None
+    return Hypotheses(normals=normal[None], offsets_m=np.array([float(normal @ mean)]))

@@ -1,27 +1,40 @@
-"""`plane.region`: regions grown over neighbouring points with like normals and a common plane."""
+"""`plane.region`: regions grown over neighbouring points with like normals and a common plane.
+
+Regions are of voxels: grown over neighbours, or grouped by normals alone. The region with most free
+points comes first. A point may also be labelled by its region.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from orthoflow.geometry import Plane
 from orthoflow.sdk import Method, MetricSpec, StepContext
-from orthoflow_plugins.plane.parameters import (
+from orthoflow_plugins.plane.detector import (
     DETECTOR_METRICS,
+    PAPER,
+    Candidate,
     DetectorIn,
     DetectorOut,
     DetectorParams,
+    leans_as_asked,
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.regions import RegionProposer, Regions
-    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
-    from orthoflow_plugins.plane.surface_voxels import Neighbourhood
+    from orthoflow_plugins.plane.candidates import FoundPlane
+    from orthoflow_plugins.plane.cloud import PreparedCloud, Search
+    from orthoflow_plugins.plane.kernels import BlockedPoints
+    from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
 
-# What `preset: paper` sets where nothing else is said: markiewicz2015, 4.1.2.
-_PAPER: Final[dict[str, object]] = {
+# What `preset: paper` sets where nothing else is set: markiewicz2015, 4.1.2.
+_PAPER_PRESET: Final[dict[str, object]] = {
     "criterion": "normal",
     "neighbourhood": "cube",
     "neighbourhood_m": 0.01,
@@ -31,6 +44,24 @@ _PAPER: Final[dict[str, object]] = {
     "labels": "region",
     "stop_unclassified_share": 0.1,
 }
+# Parts of a wall are regions of their own: together they may hold what each alone does not.
+_PART_SHARE: Final = 0.2
+# A region's plane may lean by this much more than what is looked for; the fit decides.
+_LEAN_CAUTION_DEG: Final = 3.0
+# What voxels hold that no region has: such as may join one, and such as may not.
+_FREE: Final = -2
+_NONE: Final = -1
+# Voxels whose neighbourhood is rounder than this (deviation over the shorter extent) show no plane.
+_ROUNDEST: Final = 0.5
+# A neighbourhood must reach this far both ways, in sides of a voxel, lest it be a line.
+_NARROWEST: Final = 0.2
+# Seeds are taken flattest first, in steps of this share of a voxel.
+_FLATNESS_STEP: Final = 1.0 / 2000.0
+_MEAN_SHIFTS: Final = 12
+# How often voxels become twice as wide where neighbourhoods hold less than so many times the points
+# that a normal needs.
+_WIDENINGS: Final = 2
+_THIN: Final = 3.0
 
 
 class Region(Method):
@@ -63,10 +94,7 @@ class Region(Method):
         MetricSpec("normal_scatter_deg", label="scatter of the normals"),
     )
     citations = (
-        (
-            "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "
-            "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
-        ),
+        PAPER,
         (
             "Rabbani, van den Heuvel, Vosselman 2006: Segmentation of point clouds using "
             "smoothness constraint. ISPRS Archives 36(5)"
@@ -122,75 +150,346 @@ class Region(Method):
         def _preset_fills_in(cls, given: Any) -> Any:
             # Any: what a user wrote, before it is checked.
             if isinstance(given, dict) and given.get("preset") == "paper":
-                return {**_PAPER, **given}
+                return {**_PAPER_PRESET, **given}
             return given
+
+        def neighbourhood_of(self, fit_tolerance_m: float) -> Neighbourhood:
+            """Return the neighbourhood for a cloud that is fitted with a tolerance."""
+            from orthoflow_plugins.plane.voxels import Neighbourhood
+
+            auto_m = min(2.0, max(0.1, 3.0 * fit_tolerance_m))
+            size_m = auto_m if self.neighbourhood_m == "auto" else self.neighbourhood_m
+            share = 0.5 if self.neighbourhood == "radius" else 1.0 / 3.0
+            return Neighbourhood(
+                shape=self.neighbourhood,
+                size_m=size_m,
+                n_points=self.n_neighbours,
+                voxel_m=share * size_m if self.cell_m is None else self.cell_m,
+            )
+
+        def growth_distance_m(self, fit_tolerance_m: float) -> float | None:
+            """Return how far a cell may lie from its region; None where the normal alone counts."""
+            if self.criterion == "normal":
+                return None
+            auto_m = max(0.015, 0.5 * fit_tolerance_m)
+            return auto_m if self.distance_m == "auto" else self.distance_m
 
     In = DetectorIn
     Out = DetectorOut
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.assembling import middle_viewpoint_m
-        from orthoflow_plugins.plane.detecting import Detector, detect
-        from orthoflow_plugins.plane.regions import (
-            PART_SHARE,
-            Growth,
-            RegionProposer,
-            claim_by_region,
-            grow,
-        )
-        from orthoflow_plugins.plane.search_figures import draw_normals
-        from orthoflow_plugins.plane.surface_voxels import surface_voxels
+        from orthoflow_plugins.plane.figures import draw_normals
+        from orthoflow_plugins.plane.planes import middle_viewpoint_m
+        from orthoflow_plugins.plane.search import detect
 
-        by_normal = params.criterion == "normal"
-        grown: list[Regions] = []
+        cloud = inputs.cloud
 
-        def proposer_of(
-            cloud: PreparedCloud, unassigned: Unassigned, rules: Rules
-        ) -> RegionProposer:
-            growth = Growth(
-                angle_deg=params.angle_deg,
-                distance_m=None if by_normal else _distance_m(params, rules),
-                least_points=PART_SHARE * rules.least_share * len(cloud.claims),
-            )
-            voxels = surface_voxels(cloud, _neighbourhood(params, rules))
+        def proposer_of(search: Search) -> RegionProposer:
             ctx.progress(0.1, "growing regions")
-            viewer_m = middle_viewpoint_m(inputs.cloud, cloud.sample.offsets_m)
-            regions = grow(voxels, growth, viewer_m)
-            grown.append(regions)
-            return RegionProposer(
-                regions=regions,
-                region_of_sample=regions.region_of(unassigned.sample.points),
-                family=params.family,
-                tilt_most_deg=params.max_tilt_deg,
-                least_points=rules.least_share * len(unassigned.claims),
-                proposes_once=by_normal,
+            viewer_m = middle_viewpoint_m(cloud, search.cloud.sample.offsets_m)
+            return region_proposer(search, params, viewer_m=viewer_m)
+
+        relabel = RegionProposer.relabel if params.labels == "region" else None
+        detection = detect(cloud, params, ctx, proposer_of, method=self.id, relabel=relabel)
+        regions = detection.proposer.regions
+        draw_normals(ctx, regions.voxels, len(regions.planes), detection.out.planes, cloud)
+        return detection.out
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regions:
+    """Regions of voxels.
+
+    Attributes:
+        voxels: the voxels.
+        region_of_voxel: (m,) int32, -1 for none.
+        n_points: (r,) int64 points of each region.
+        planes: of the regions with points enough, by region: total least squares through all
+            their points, in the cloud's offsets.
+        starts: the planes that most points of a region are near; the same where it is one layer.
+    """
+
+    voxels: SurfaceVoxels
+    region_of_voxel: NDArray[np.int32]
+    n_points: NDArray[np.int64]
+    planes: dict[int, Plane]
+    starts: dict[int, Plane]
+
+    def region_of(self, points: BlockedPoints) -> NDArray[np.int32]:
+        """(n,) region of each point, -1 for none."""
+        voxel_of = self.voxels.voxel_of(points)
+        return np.where(voxel_of >= 0, self.region_of_voxel[voxel_of], np.int32(_NONE))
+
+
+class RegionProposer:
+    """Proposes the planes of regions, which were grown on all points.
+
+    Attributes:
+        regions: the regions.
+    """
+
+    def __init__(self, search: Search, params: Region.Params, regions: Regions) -> None:
+        """Get ready to propose."""
+        self.regions, self._params = regions, params
+        self._region_of_sample = regions.region_of(search.cloud.sample.points)
+        self._barred: set[int] = set()
+        self._last = -1
+
+    def propose(self, search: Search) -> Candidate | None:
+        """Name the plane of the region with most free points."""
+        free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
+        counts = np.bincount(free, minlength=len(self.regions.n_points))
+        constraint = self._params.constraint
+        limit_deg = self._params.max_tilt_deg + _LEAN_CAUTION_DEG
+        for region in np.argsort(-counts, kind="stable").tolist():
+            if counts[region] < _PART_SHARE * search.least_points:
+                return None
+            plane = self.regions.planes.get(region)
+            if plane is None or region in self._barred:
+                continue
+            leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg)
+            # By the normal alone a region has one plane, also where many of its points lie off it.
+            if self._params.criterion == "normal" or not leans.all():
+                self._barred.add(region)
+            if not leans.all():
+                continue
+            self._last = region
+            return Candidate(
+                plane=plane,
+                constraint=constraint,
+                votes=float(self.regions.n_points[region]),
+                start=self.regions.starts[region],
             )
+        return None
 
-        def relabel(found: list[FoundPlane], cloud: PreparedCloud) -> None:
-            if params.labels == "region":
-                claim_by_region(found, grown[0], cloud)
+    def reject(self, candidate: Candidate) -> None:
+        """Do not name the last region again."""
+        del candidate
+        self._barred.add(self._last)
 
-        detector = Detector(method=self.id, proposer_of=proposer_of, relabel=relabel)
-        detection = detect(inputs.cloud, params, ctx, detector)
-        draw_normals(ctx, grown[0], detection.planes, inputs.cloud)
-        return DetectorOut(planes=detection.planes, labels=detection.labels)
+    def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
+        """Give each point to the plane of its region instead of the plane it is near.
+
+        A region belongs to the plane that most of its points are near, if more than half of them
+        are near any; the claims of the cloud say which those are.
+        """
+        claims, n_regions = cloud.sample_claims, len(self.regions.n_points)
+        region_of_sample = self.regions.region_of(cloud.sample.points)
+        near = (region_of_sample >= 0) & (claims >= 0)
+        joint = np.zeros((n_regions, len(found)), dtype=np.int64)
+        np.add.at(joint, (region_of_sample[near], claims[near]), 1)
+        n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=n_regions)
+        owner = np.where(joint.sum(axis=1) * 2 > n_sampled, joint.argmax(axis=1), -1)
+        # The last entry stands for voxels in no region: a region of -1 picks it.
+        owners = np.append(owner, -1).astype(np.int8)[self.regions.region_of_voxel]
+        self.regions.voxels.claim(cloud, owners)
 
 
-def _distance_m(params: Region.Params, rules: Rules) -> float:
-    return max(0.015, 0.5 * rules.fit_m) if params.distance_m == "auto" else params.distance_m
+def region_proposer(
+    search: Search, params: Region.Params, *, viewer_m: NDArray[np.float64]
+) -> RegionProposer:
+    """Grow regions on all points of a search's cloud; `viewer_m` as `grow` takes it."""
+    from orthoflow_plugins.plane.voxels import surface_voxels
 
-
-def _neighbourhood(params: Region.Params, rules: Rules) -> Neighbourhood:
-    from orthoflow_plugins.plane.surface_voxels import Neighbourhood
-
-    given = params.neighbourhood_m
-    size_m = min(2.0, max(0.1, 3.0 * rules.fit_m)) if given == "auto" else given
-    share = 0.5 if params.neighbourhood == "radius" else 1.0 / 3.0
-    voxel_m = share * size_m if params.cell_m is None else params.cell_m
-    return Neighbourhood(
-        shape=params.neighbourhood,
-        size_m=size_m,
-        n_points=params.n_neighbours,
-        voxel_m=voxel_m,
+    fit_tolerance_m = search.fit_tolerance_m
+    regions = grow(
+        surface_voxels(search.cloud, params.neighbourhood_of(fit_tolerance_m)),
+        angle_deg=params.angle_deg,
+        distance_m=params.growth_distance_m(fit_tolerance_m),
+        least_points=_PART_SHARE * params.min_share * len(search.cloud.claims),
+        viewer_m=viewer_m,
     )
+    return RegionProposer(search, params, regions)
+
+
+def grow(
+    voxels: SurfaceVoxels,
+    *,
+    angle_deg: float,
+    distance_m: float | None,
+    least_points: float,
+    viewer_m: NDArray[np.float64],
+) -> Regions:
+    """Join voxels to regions.
+
+    Args:
+        voxels: the voxels with their normals.
+        angle_deg: largest angle between the normal of a voxel and its region's.
+        distance_m: largest distance of its middle from the region's plane; None asks for the
+            normal alone, wherever the voxel lies.
+        least_points: groups by normal smaller than this are not looked for.
+        viewer_m: (3,) from where normals are told from their opposites when the normal alone
+            counts, in the cloud's offsets.
+    """
+    from orthoflow_plugins.plane.voxel_kernels import sum_regions
+
+    if distance_m is None:
+        region_of_voxel, n_regions = _grouped(voxels, angle_deg, least_points, viewer_m)
+    else:
+        once = partial(_grown_once, angle_deg=angle_deg, distance_m=distance_m)
+        region_of_voxel, n_regions = _grown(voxels, once, least_points)
+    sums = np.zeros((n_regions, 10))
+    sum_regions(voxels.places, voxels.sums, region_of_voxel, sums)
+    n_points = sums[:, 0].astype(np.int64)
+    planes = {
+        int(region): plane
+        for region in np.flatnonzero(n_points >= least_points)
+        if (plane := _plane(sums[region], voxels)) is not None
+    }
+    starts = planes
+    if distance_m is None:
+        starts = {
+            region: _densest(voxels, region_of_voxel == region, plane)
+            for region, plane in planes.items()
+        }
+    return Regions(
+        voxels=voxels,
+        region_of_voxel=region_of_voxel,
+        n_points=n_points,
+        planes=planes,
+        starts=starts,
+    )
+
+
+def _grown(
+    voxels: SurfaceVoxels,
+    once: partial[tuple[NDArray[np.int32], int]],
+    least_points: float,
+) -> tuple[NDArray[np.int32], int]:
+    """Grow regions; where the cloud is thin, those of wider voxels among what they leave."""
+    from orthoflow_plugins.plane.voxels import POINTS_LEAST, coarser
+
+    def crumbs_of(some: SurfaceVoxels, own: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Voxels in no region, or in one with too few points to be looked at."""
+        too_few = np.bincount(own + 1, some.counts) < least_points
+        too_few[0] = True
+        return np.asarray(too_few[own + 1])
+
+    regions, n_regions = once(voxels)
+    crumbs = np.flatnonzero(crumbs_of(voxels, regions))
+    left, wide_of_voxel = voxels, np.arange(len(regions))
+    for _ in range(_WIDENINGS):
+        n_left = left.counts[crumbs]
+        if n_left.sum() < least_points:
+            break
+        in_neighbourhood = float(n_left.mean()) * left.neighbourhood.width_voxels() ** 2
+        if in_neighbourhood >= _THIN * POINTS_LEAST:
+            break
+        wider, of_crumb = coarser(left, crumbs)
+        found, n_found = once(wider)
+        of_left = np.full(len(left.counts), -1)
+        of_left[crumbs] = of_crumb
+        wide_of_voxel = np.where(wide_of_voxel >= 0, of_left[wide_of_voxel], -1)
+        is_crumb = crumbs_of(wider, found)
+        joins = (wide_of_voxel >= 0) & ~is_crumb[wide_of_voxel]
+        regions[joins] = n_regions + found[wide_of_voxel[joins]]
+        n_regions += n_found
+        left, crumbs = wider, np.flatnonzero(is_crumb)
+    return regions, n_regions
+
+
+def _grown_once(
+    voxels: SurfaceVoxels, *, angle_deg: float, distance_m: float
+) -> tuple[NDArray[np.int32], int]:
+    from orthoflow_plugins.plane.voxel_kernels import grow_regions
+
+    reach = distance_m / voxels.grid.cell_m
+    deviation, width = voxels.spreads[:, 0], voxels.spreads[:, 1]
+    may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
+    regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
+    seeds = np.flatnonzero(may_join)
+    # Sixteen bits, so that the sort takes no comparisons.
+    flatness = np.minimum(deviation[seeds] / _FLATNESS_STEP, 65535.0).astype(np.uint16)
+    n_regions = grow_regions(
+        voxels.places,
+        voxels.bricks,
+        voxels.numbers,
+        voxels.sums,
+        voxels.normals,
+        seeds[np.argsort(flatness, kind="stable")],
+        np.array([math.cos(math.radians(angle_deg)), reach]),
+        regions,
+    )
+    return regions, n_regions
+
+
+def _grouped(
+    voxels: SurfaceVoxels, angle_deg: float, least_points: float, viewer_m: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], int]:
+    """Take the direction that most points share, then that of the rest, and so on."""
+    usable = (voxels.spreads[:, 0] <= _ROUNDEST * voxels.spreads[:, 1]) & (voxels.counts >= 1)
+    usable &= voxels.spreads[:, 1] > _NARROWEST
+    # Each towards the viewer.
+    normals: NDArray[np.float64] = voxels.normals.astype(np.float64)
+    to_viewer = voxels.grid.basis @ viewer_m - voxels.centroids()
+    normals *= np.where(np.einsum("ij,ij->i", normals, to_viewer) < 0.0, -1.0, 1.0)[:, None]
+    regions = np.full(len(normals), _NONE, dtype=np.int32)
+    free = np.flatnonzero(usable)
+    cosine = math.cos(math.radians(angle_deg))
+    n_regions = 0
+    while len(free):
+        weights = voxels.counts[free].astype(np.float64)
+        direction = _common_direction(normals[free], weights, angle_deg)
+        within = normals[free] @ direction >= cosine
+        if weights[within].sum() < least_points:
+            break
+        regions[free[within]] = n_regions
+        n_regions += 1
+        free = free[~within]
+    return regions, n_regions
+
+
+def _common_direction(
+    normals: NDArray[np.float64], weights: NDArray[np.float64], angle_deg: float
+) -> NDArray[np.float64]:
+    """The fullest bin of directions, moved to the mean of those within the angle."""
+    step = 2.0 * math.sin(0.5 * math.radians(max(angle_deg, 0.5)))
+    bins = np.round(normals / step).astype(np.int64) + 4096
+    keys, bin_of = np.unique(
+        (bins[:, 0] * 8192 + bins[:, 1]) * 8192 + bins[:, 2], return_inverse=True
+    )
+    fullest = int(np.argmax(np.bincount(bin_of, weights, minlength=len(keys))))
+    direction = _unit_mean(normals, weights * (bin_of == fullest))
+    cosine = math.cos(math.radians(angle_deg))
+    for _ in range(_MEAN_SHIFTS):
+        moved = _unit_mean(normals, weights * (normals @ direction >= cosine))
+        if float(moved @ direction) > 1.0 - 1e-12:
+            break
+        direction = moved
+    return direction
+
+
+def _unit_mean(normals: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = weights @ normals
+    return total / max(float(np.linalg.norm(total)), 1e-12)
+
+
+def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
+    """Total least squares through the points of a region; in the cloud's offsets."""
+    mean = sums[1:4] / sums[0]
+    second = sums[[[4, 5, 6], [5, 7, 8], [6, 8, 9]]]
+    variances, directions = np.linalg.eigh(second / sums[0] - np.outer(mean, mean))
+    if variances[1] <= 0.0:
+        return None
+    basis, side_m = voxels.grid.basis, voxels.grid.cell_m
+    # Sums count from the middle of the first voxel.
+    middle_m = (voxels.grid.low_m + side_m * (mean + 0.5)) @ basis
+    normal = directions[:, 0] @ basis
+    normal /= np.linalg.norm(normal)
+    return Plane(normal=normal, offset_m=float(normal @ middle_m))
+
+
+def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
+    """The plane in the mean direction of a group that most of its points are near."""
+    basis, side_m = voxels.grid.basis, voxels.grid.cell_m
+    weights = voxels.counts[member].astype(np.float64)
+    normals = voxels.normals[member].astype(np.float64)
+    best = int(np.argmax(np.abs(normals @ (basis @ plane.normal))))
+    signs = np.where(normals @ normals[best] < 0.0, -1.0, 1.0)
+    direction = _unit_mean(normals, weights * signs) @ basis
+    along_m = voxels.centroids()[member] @ basis @ direction
+    bins = ((along_m - float(along_m.min())) / side_m).astype(np.int64)
+    inside = bins == int(np.argmax(np.bincount(bins, weights)))
+    offset_m = float(np.average(along_m[inside], weights=weights[inside]))
+    return Plane(normal=direction, offset_m=offset_m)

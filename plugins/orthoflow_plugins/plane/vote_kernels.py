@@ -19,6 +19,9 @@ from orthoflow_plugins.plane.kernels import BlockedPoints
 # A vote is counted in quarters, so that it can be shared between two bins without a rounding that
 # would not cancel when it is taken back.
 VOTE_SHARES: Final = 4
+# A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
+# several bins until it is refined.
+VOTE_CAUTION: Final = 0.25
 # Side of the tiles that an image is turned by.
 _TILE: Final = 16
 
@@ -214,6 +217,7 @@ def best_bins(
     votes: NDArray[np.int32],
     rows: NDArray[np.int64],
     half: int,
+    is_plain: bool,  # noqa: FBT001 - compiled code takes no keywords
     barred: NDArray[np.uint8],
     scores: NDArray[np.int64],
     places: NDArray[np.int64],
@@ -224,6 +228,7 @@ def best_bins(
         votes: (d, bins).
         rows: (m,) which of them are asked about.
         half: a window has 2 half + 1 bins; the windows beside begin one bin further off.
+        is_plain: leave the windows beside out.
         barred: (d, bins) 1 where no window may have its middle.
         scores: (d,) set where asked.
         places: (d,) set to the middle bin.
@@ -248,7 +253,7 @@ def best_bins(
             windows[k] = high[k] - low[k]
         best = np.int64(-1)
         for k in range(n_bins):
-            score = middle[k] - min(before[k], after[k])
+            score = middle[k] - (np.int64(0) if is_plain else min(before[k], after[k]))
             line[k] = np.int64(-1) if is_barred[k] != 0 else score
         for k in range(n_bins):
             best = max(best, line[k])
@@ -381,3 +386,25 @@ def turn_image(
             for column in range(left, min(left + _TILE, window[3])):
                 for row in range(top, min(top + _TILE, window[1])):
                     turned[column, row] = image[row, column]
+
+
+def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
+    """Votes in a window of 2 half + 1 bins above those of the emptier neighbouring window."""
+    width = 2 * half + 1
+    gap = width + 1
+    padded = np.pad(votes, ((0, 0), (half + gap + 1, half + gap)))
+    running = np.cumsum(padded, axis=1)
+    window = (running[:, width:] - running[:, :-width]).astype(np.float64)
+    n_bins = votes.shape[1]
+    middle = window[:, gap : gap + n_bins]
+    left, right = window[:, :n_bins], window[:, 2 * gap : 2 * gap + n_bins]
+    return middle - np.minimum(left, right)
+
+
+def parabola(values: NDArray[np.float64], place: int) -> float:
+    """Return where between bins a maximum lies, -0.5..0.5."""
+    if not 0 < place < len(values) - 1:
+        return 0.0
+    before, here, after = values[place - 1 : place + 2]
+    bend = before - 2.0 * here + after
+    return 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.fitting import adjust_plane
+from orthoflow_plugins.plane.fit import adjust_plane
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
@@ -56,7 +56,7 @@ def wall_of_cells(
         shape=shape,
     )
     sums = CellSums(
-        n_find=number,
+        n_near=number,
         n_inner=number,
         n_fit=number,
         steps=steps.sum(axis=2),
@@ -97,11 +97,11 @@ def test_stated_sigmas_of_walls_are_their_errors(
         raster, sums = wall_of_cells(
             seed, reach_cells=reach_cells, relief_m=relief_m, mixed_share=mixed_share
         )
-        fit = adjust_plane(raster, sums, sums.n_fit > 0, fit_m=FIT_M, freedom="free")
+        fit = adjust_plane(raster, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
         assert fit is not None
         u, v = raster.centres_m()
         middle = np.array([u.mean(), v.mean()]) @ raster.axes - 2.0 * raster.plane.normal
-        trials.append(ratios(fit.plane, fit.stated().covariance, raster.plane, middle))
+        trials.append(ratios(fit.plane, fit.stated()[0], raster.plane, middle))
     assert (rms(trials) > CALIBRATED[0]).all(), rms(trials)
     assert (rms(trials) < CALIBRATED[1]).all(), rms(trials)
 
@@ -110,9 +110,9 @@ def test_waves_leave_few_independent_cells() -> None:
     counts = []
     for reach_cells in (0.0, 2.0):
         raster, sums = wall_of_cells(1, reach_cells=reach_cells, relief_m=0.002)
-        fit = adjust_plane(raster, sums, sums.n_fit > 0, fit_m=FIT_M, freedom="free")
+        fit = adjust_plane(raster, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
         assert fit is not None
-        counts.append(fit.stated().n_independent)
+        counts.append(fit.stated()[1])
     assert 500 < counts[0] <= 30 * 45
     # The integral of a Gaussian wave's correlation: 4 pi reach**2 = 50 cells go together.
     assert 30 * 45 / 50 / 2.5 < counts[1] < 30 * 45 / 50 * 2.5
@@ -123,13 +123,13 @@ def test_a_panel_over_a_third_of_a_wall_does_not_move_it() -> None:
     panel = np.zeros(raster.shape, dtype=np.int64)
     panel[:, :15] = round(0.005 * STEPS_PER_TOLERANCE / FIT_M)
     raised = CellSums(
-        n_find=sums.n_find,
+        n_near=sums.n_near,
         n_inner=sums.n_inner,
         n_fit=sums.n_fit,
         steps=sums.steps + panel * sums.n_fit,
         squared_steps=sums.squared_steps + 2 * panel * sums.steps + panel**2 * sums.n_fit,
     )
-    fit = adjust_plane(raster, raised, sums.n_fit > 0, fit_m=FIT_M, freedom="free")
+    fit = adjust_plane(raster, raised, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
     assert fit is not None
     assert angle_between_deg(fit.plane.normal, raster.plane.normal) < 0.01
     assert abs(fit.plane.offset_m - raster.plane.offset_m) < 3e-4

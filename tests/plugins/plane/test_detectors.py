@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane import final_fit
+from orthoflow_plugins.plane import candidates
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
@@ -473,7 +473,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
 
     whole = found(1)
     # 88 000 points in blocks of 256: one of three blocks is fitted.
-    monkeypatch.setattr(final_fit, "_FITTED_MOST", 25_000)
+    monkeypatch.setattr(candidates, "_FITTED_MOST", 25_000)
     one, three = found(1), found(3)
     np.testing.assert_array_equal(one.normal, three.normal)
     np.testing.assert_array_equal(one.offset, three.offset)
@@ -490,5 +490,5 @@ def test_the_fit_follows_a_tolerance_below_its_default(detector: str) -> None:
     # What is recorded is given back as it is when the step runs, and by a replay.
     again = type(params).model_validate_json(params.model_dump_json(), strict=True)
     assert again == params
-    assert again.tolerances_m(None) == (0.01, 0.01)
-    assert DETECTORS[detector][0].Params(tolerance_m=0.02).tolerances_m(None) == (0.02, 0.015)
+    assert again.tolerances_m(0.0, 0.0) == (0.01, 0.01)
+    assert DETECTORS[detector][0].Params(tolerance_m=0.02).tolerances_m(0.0, 0.0) == (0.02, 0.015)

@@ -10,29 +10,25 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.accumulators import Accumulator
-from orthoflow_plugins.plane.assembling import Assembly
+from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.figures import (
     Margins,
+    SpacePicture,
+    draw_accumulator,
     draw_deviations,
+    draw_normals,
     draw_planes,
+    draw_sections,
+    draw_space,
     draw_thickness,
     space_out,
 )
-from orthoflow_plugins.plane.kernels import PlanGrid
-from orthoflow_plugins.plane.measuring import Deviations, RowPoints, normality
-from orthoflow_plugins.plane.regions import Growth, grow
-from orthoflow_plugins.plane.sample import prepare
-from orthoflow_plugins.plane.search_figures import (
-    VotePicture,
-    draw_accumulator,
-    draw_normals,
-    draw_sections,
-    draw_space,
-)
+from orthoflow_plugins.plane.kernels import Boxes, PlanCounts, PlanGrid
+from orthoflow_plugins.plane.planes import Assembly, Deviations, normality
+from orthoflow_plugins.plane.region import grow
 from orthoflow_plugins.plane.slab_kernels import HISTOGRAM_BINS
-from orthoflow_plugins.plane.space_accumulators import SpacePicture
-from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
+from orthoflow_plugins.plane.thickness import RowPoints
+from orthoflow_plugins.plane.voxels import Neighbourhood, surface_voxels
 
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
@@ -113,17 +109,17 @@ def assembly_of(count: int) -> Assembly:
     histogram = np.array([np.histogram(values, edges_m)[0] for values in values_m])
     n_points = np.array([len(values) for values in values_m])
     deviations = Deviations(
-        n_find=n_points,
-        rms_find_m=np.full(count, 0.004),
+        n_points=n_points,
+        rms_m=np.full(count, 0.004),
         n_fit=n_points - 7,
         rms_fit_m=np.array([0.003] * (count - 1) + [0.0]),
         mean_fit_m=0.001 * np.arange(count),
         histogram=histogram,
         extents_m=np.zeros((count, 4)),
-        find_m=find_m,
-        fit_m=fit_m,
+        tolerance_m=find_m,
+        fit_tolerance_m=fit_m,
     )
-    shapes = [normality(row, find_m=find_m, fit_m=fit_m) for row in histogram]
+    shapes = [normality(row, tolerance_m=find_m, fit_tolerance_m=fit_m) for row in histogram]
     return Assembly(
         planes=planes_of(count=count),
         labels_from_claims=np.arange(count + 1, dtype=np.int16),
@@ -365,6 +361,27 @@ def test_the_caption_of_the_thickness_names_what_is_drawn(
 # --- how planes were looked for ---
 
 
+class PlanPicture:
+    """A plan and its votes, as a detector keeps them."""
+
+    voters = "cells vote"
+
+    def __init__(
+        self,
+        grid: PlanGrid,
+        plan: NDArray[np.int64],
+        votes: NDArray[np.int64],
+        *,
+        centre_m: NDArray[np.float64],
+        reach_m: float,
+    ) -> None:
+        boxes = Boxes(boxes=np.zeros((0, 6), dtype=np.float32), n_unusable=0)
+        self.grid = grid
+        self.plan = PlanCounts(cells=plan, heights=np.zeros(0, dtype=np.int64), boxed=boxes)
+        self.first: NDArray[np.int64] | None = votes
+        self.centre_m, self.reach_m = centre_m, reach_m
+
+
 def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -374,13 +391,7 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     )
     plan = rng.integers(0, 9, (16, 14))
     votes = rng.integers(0, 9, (12, 24))
-    accumulator = Accumulator(
-        angles_rad=np.arange(12) * math.pi / 12,
-        low_m=-6.0,
-        centre_m=np.array([0.0, 0.5]),
-        votes=votes,
-    )
-    picture = VotePicture(grid=grid, plan=plan, accumulator=accumulator, voters="cells vote")
+    picture = PlanPicture(grid, plan, votes, centre_m=np.array([0.0, 0.5]), reach_m=6.0)
     draw_accumulator(
         context(tmp_path), picture, planes_of(), cloud_of(np.zeros((3, 3)), origin=ORIGIN)
     )
@@ -408,16 +419,13 @@ def test_large_plans_are_summed_until_they_are_small_enough_to_draw(
 ) -> None:
     plan = np.random.default_rng(0).integers(0, 5, (2_001, 901))
     grid = PlanGrid(basis=np.eye(3), low_m=np.zeros(3), cell_m=0.01, shape=(2_001, 901, 3))
-    accumulator = Accumulator(
-        angles_rad=np.zeros(4), low_m=-1.0, centre_m=np.zeros(2), votes=plan[:4, :900]
-    )
     planes = planes_of()
     floor = replace(
         planes, normal=planes.normal[[2]], offset=planes.offset[[2]], corners=planes.corners[[2]],
         covariance=planes.covariance[:1], n_points=planes.n_points[:1], rms_m=planes.rms_m[:1],
         names=("floor",),
     )  # fmt: skip
-    picture = VotePicture(grid=grid, plan=plan, accumulator=accumulator, voters="cells vote")
+    picture = PlanPicture(grid, plan, plan[:4, :900], centre_m=np.zeros(2), reach_m=1.0)
     draw_accumulator(context(tmp_path), picture, floor, cloud_of(np.zeros((3, 3))))
     left, right = drawings["accumulator"].axes
     shown = np.expm1(image(left)[0])
@@ -506,14 +514,16 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     cloud = cloud_of(points, origin=ORIGIN)
     prepared = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
     cube = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
-    growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=100.0)
-    regions = grow(surface_voxels(prepared, cube), growth, np.zeros(3))
+    voxels = surface_voxels(prepared, cube)
+    regions = grow(
+        voxels, angle_deg=10.0, distance_m=0.015, least_points=100.0, viewer_m=np.zeros(3)
+    )
     planes = planes_of()
     half = np.array([[-1.5, 0, 1.0], [-1.5, 0, -1.0], [1.5, 0, -1.0], [1.5, 0, 1.0]])
     corners = planes.corners.copy()
     corners[0] = half + np.array([0.0, 2.0, 0.0]) + np.array(ORIGIN)
     ctx = context(tmp_path)
-    draw_normals(ctx, regions, replace(planes, corners=corners), cloud)
+    draw_normals(ctx, voxels, len(regions.planes), replace(planes, corners=corners), cloud)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["n_regions"] == len(regions.planes) == 2
     assert metrics["neighbourhood_mm"] == pytest.approx(150.0)

@@ -10,15 +10,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
-from orthoflow_plugins.plane.hough2d import Hough2d
-from orthoflow_plugins.plane.sample import Unassigned, prepare
+from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import angle_between_deg, frame_over
 from orthoflow.products import Planes, PointCloud
-from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled, turned
+from tests.plane_scenes import (
+    ROOM,
+    Rectangle,
+    cloud_of,
+    context,
+    prepared,
+    sampled,
+    search_in,
+    turned,
+)
 
 STATION = np.array([[0.3, -0.2, 0.1]])
 SURVEY = (634512.347, 486215.781, 112.193)
@@ -202,21 +209,13 @@ def test_other_accumulators_find_the_densest_wall(
 
 def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
     # Half of the floor's cells lie along any line through the room: a wall hardly stands out.
-    cloud = cloud_of(sampled(ROOM[:5]))
-    prepared = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1, counts_plan=True)
+    search = search_in(prepared(sampled(ROOM[:5]), cell_m=0.02, counts_plan=True))
     shares = []
     for accumulator in ("counts", "unit"):
-        voting = Voting(
-            angle_step_deg=1.0,
-            least_points=1.0,
-            walls=True,
-            levels=True,
-            accumulator=accumulator,
-            is_raw=False,
-        )
-        proposer = PlanProposer(prepared, voting)
-        proposer.propose(Unassigned.of(prepared))
-        votes = proposer.first.votes
+        proposer = PlanProposer(search, Hough2d.Params(accumulator=accumulator))
+        proposer.propose(search)
+        votes = proposer.first
+        assert votes is not None
         shares.append(votes.max() / votes.sum(axis=1).max())
     assert shares[0] > 2.0 * shares[1]
 

@@ -8,19 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.hough3d import Hough3d
-from orthoflow_plugins.plane.sample import Unassigned, prepare
-from orthoflow_plugins.plane.space_accumulators import (
-    SpaceProposer,
-    SpaceVoting,
-    directions_over,
-)
+from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer, directions_over
 from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_planes
 from scipy.spatial import KDTree
 
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Planes, PointCloud
-from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
+from tests.plane_scenes import (
+    ROOM,
+    Rectangle,
+    cloud_of,
+    context,
+    prepared,
+    sampled,
+    search_in,
+)
 
 STATION = np.array([[0.3, -0.2, 0.1]])
 
@@ -47,25 +49,6 @@ def test_other_ways_to_vote_find_the_same_room(options: dict[str, Any], tmp_path
     cloud = cloud_of(sampled(), stations=STATION)
     planes = detect(cloud, tmp_path, stop_unclassified_share=0.0, **options).planes
     assert all(has(planes, truth) for truth in ROOM)
-
-
-@pytest.mark.parametrize(("search", "coarser"), [("coarse-to-fine", 2.0), ("full", 1.0)])
-def test_the_first_search_is_as_coarse_as_it_says(
-    search: str, coarser: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[SpaceVoting] = []
-
-    def proposer(cloud: Any, voting: SpaceVoting) -> SpaceProposer:
-        asked.append(voting)
-        return SpaceProposer(cloud, voting)
-
-    monkeypatch.setattr("orthoflow_plugins.plane.space_accumulators.SpaceProposer", proposer)
-    cloud = cloud_of(sampled(), stations=STATION)
-    params = {"cell_m": 0.04, "angle_step_deg": 3.0, "min_share": 0.05, "n_planes_max": 1}
-    detect(cloud, tmp_path, search=search, **params)
-    assert asked[0].cell_m == pytest.approx(0.04 * coarser)
-    assert asked[0].angle_step_deg == pytest.approx(3.0 * coarser)
-    assert asked[0].least_points == pytest.approx(0.05 * len(cloud))
 
 
 def test_floor_and_ceiling_are_found_once_each(tmp_path: Path) -> None:
@@ -96,7 +79,9 @@ def test_directions_cover_the_hemisphere_evenly_and_the_pole_once(step_deg: floa
     assert len(normals) == pytest.approx(2.0 * np.pi / np.radians(step_deg) ** 2, rel=0.1)
 
 
-@pytest.mark.parametrize(("family", "least", "most"), [("wall", 0.0, 12.0), ("level", 78.0, 90.0)])
+@pytest.mark.parametrize(
+    ("family", "least", "most"), [("vertical", 0.0, 12.0), ("horizontal", 78.0, 90.0)]
+)
 def test_a_family_asks_about_its_directions_only(family: Any, least: float, most: float) -> None:
     directions = directions_over(2.0, family, 10.0)
     phis_deg = np.abs(np.degrees(directions.angles_rad[:, 1]))
@@ -143,12 +128,8 @@ def test_the_number_of_threads_does_not_change_a_bit(tmp_path: Path) -> None:
 def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-300.0, 300.0, (20_000, 3))
-    cloud = cloud_of(points)
-    prepared = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
-    voting = SpaceVoting(
-        cell_m=0.04, angle_step_deg=4.0, least_points=1_000, tilt_most_deg=10.0, is_raw=False
-    )
-    proposer = SpaceProposer(prepared, voting)
+    search = search_in(prepared(points))
+    proposer = SpaceProposer(search, Hough3d.Params(angle_step_deg=2.0, min_share=0.05))
     assert proposer._voxels.voxel_m > 0.3
-    found = proposer.propose(Unassigned.of(prepared))
+    found = proposer.propose(search)
     assert found is None or proposer._votes.nbytes < 500_000_000

@@ -22,7 +22,6 @@ from orthoflow_plugins.plane.kernels import (
     flattest,
     refine_robustly,
 )
-from orthoflow_plugins.plane.neighbouring import closed, summed_around
 from orthoflow_plugins.plane.slab_kernels import (
     HISTOGRAM_BINS,
     STEPS_PER_TOLERANCE,
@@ -32,6 +31,7 @@ from orthoflow_plugins.plane.slab_kernels import (
     sum_assigned,
     sum_cells,
 )
+from orthoflow_plugins.plane.support import closed, summed_around
 from scipy import ndimage
 
 from orthoflow.geometry import wall_axes

@@ -8,18 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.measuring import (
-    RowPoints,
-    _by_material,
-    _even_edges,
-    _spreads,
-    _stations_of,
-    measure_planes,
-    measure_thickness,
-    row_points,
-)
+from orthoflow_plugins.plane.cloud import prepare
+from orthoflow_plugins.plane.planes import measure_planes
 from orthoflow_plugins.plane.ransac import Ransac
-from orthoflow_plugins.plane.sample import prepare
+from orthoflow_plugins.plane.thickness import RowPoints, measure_thickness, row_points
 from pydantic import ValidationError
 
 from orthoflow.products import PointCloud
@@ -31,74 +23,6 @@ UP = np.array([0.0, 0.0, 1.0])
 def spread_of(values: NDArray[np.float64]) -> float:
     """Robust standard deviation about zero."""
     return float(1.4826 * np.median(np.abs(values)))
-
-
-# --- classes ---
-
-
-def test_classes_have_equally_many_points_and_their_own_spread() -> None:
-    rng = np.random.default_rng(0)
-    values = rng.gamma(2.0, size=1_200)
-    deviation = rng.normal(0.0, 1.0, 1_200) * values
-    edges = _even_edges(values)
-    assert len(edges) == 7
-    assert (edges[0], edges[-1]) == (values.min(), values.max())
-    found = _spreads(values, edges, deviation)
-    assert [spread.n_points for spread in found] == pytest.approx([200] * 6, abs=1)
-    for k, spread in enumerate(found):
-        inside = (values >= edges[k]) & (values < edges[k + 1])
-        inside |= (values == edges[-1]) & (k == 5)
-        assert (spread.low, spread.high) == (edges[k], edges[k + 1])
-        assert spread.n_points == np.count_nonzero(inside)
-        assert spread.sigma_m == pytest.approx(spread_of(deviation[inside]), rel=1e-4)
-
-
-def test_classes_with_fewer_than_fifty_points_are_left_out() -> None:
-    edges = np.array([0.0, 1.0, 2.0, 3.0])
-    values = np.repeat([0.5, 1.0, 2.5], [50, 49, 60])
-    found = _spreads(values, edges, np.ones(159))
-    assert [(spread.low, spread.n_points) for spread in found] == [(0.0, 50), (2.0, 60)]
-    # What lies beyond the edges belongs to the first and the last.
-    found = _spreads(values + 0.6, edges - 0.2, np.ones(159))
-    assert [spread.n_points for spread in found] == [99, 60]
-    assert _spreads(values, _even_edges(np.ones(60)), np.ones(159)) == ()
-
-
-def test_materials_hold_both_ends_of_their_intensities() -> None:
-    intensity = np.repeat([0.1, 0.2, 0.3, 0.31], 50)
-    deviation = np.repeat([1.0, 2.0, 3.0, 9.0], 50)
-    found = _by_material(
-        intensity, {"dark": (0.1, 0.3), "rest": (0.305, 1.0), "none": (0.5, 0.6)}, deviation
-    )
-    assert [(spread.name, spread.n_points) for spread in found] == [("dark", 150), ("rest", 50)]
-    assert found[0].sigma_m == pytest.approx(2.0 * 1.4826, rel=1e-4)
-    assert (found[0].low, found[0].high) == (0.1, 0.3)
-    few = _by_material(intensity[:49], {"dark": (0.1, 0.3)}, deviation[:49])
-    assert few == ()
-
-
-def cloud(**given: Any) -> PointCloud:
-    plain = cloud_of(np.zeros((4, 3)), origin=(10.0, 20.0, 30.0))
-    return replace(plain, **given)
-
-
-def test_points_are_seen_from_the_station_of_their_scan() -> None:
-    index = np.array([0, 2, 3])
-    stations = np.array([[11.0, 20.0, 30.0], [10.0, 23.0, 30.0]])
-    scan = np.array([0, 0, 1, 1], dtype=np.uint16)
-    of_file: Any = {"stations_source": "file"}
-    assert _stations_of(index, cloud()) is None
-    assert _stations_of(index, cloud(stations=stations[:0], **of_file)) is None
-    one = _stations_of(index, cloud(stations=stations[1:], **of_file))
-    np.testing.assert_allclose(one, [0.0, 3.0, 0.0])
-    two = cloud(stations=stations, scan=scan, **of_file)
-    np.testing.assert_allclose(_stations_of(index, two), [[1, 0, 0], [0, 3, 0], [0, 3, 0]])
-    assert _stations_of(index, cloud(stations=stations, **of_file)) is None
-    assert _stations_of(index[:0], two) is None
-    unknown = cloud(stations=stations, scan=scan + np.uint16(1), **of_file)
-    assert _stations_of(index, unknown) is None
-    stated = cloud(stations=stations[:1], stations_source="view_from")
-    assert _stations_of(index, stated) is None
 
 
 # --- a row ---
@@ -259,30 +183,30 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
         claims[np.abs(seen[:, 2] - heights[k]) <= find_m] = k
     prepared.claims[:] = claims
     bounds = np.array([[-0.9, 0.8, -0.7, 0.9]] * 3)
-    found = measure_planes(prepared, slabs, bounds, find_m=find_m, fit_m=fit_m)
+    found = measure_planes(prepared, slabs, bounds, tolerance_m=find_m, fit_tolerance_m=fit_m)
     for k in range(2):
         away = seen[claims == k, 2] - heights[k]
         fits = np.abs(away) <= fit_m
         u, v = seen[claims == k, 0] - 0.1, seen[claims == k, 1] + 0.2
         held = fits & (u >= -0.9) & (u <= 0.8) & (v >= -0.7) & (v <= 0.9)
-        assert (found.n_find[k], found.n_fit[k]) == (len(away), fits.sum())
-        assert found.rms_find_m[k] == pytest.approx(np.sqrt((away**2).mean()), rel=1e-4)
+        assert (found.n_points[k], found.n_fit[k]) == (len(away), fits.sum())
+        assert found.rms_m[k] == pytest.approx(np.sqrt((away**2).mean()), rel=1e-4)
         assert found.rms_fit_m[k] == pytest.approx(np.sqrt((away[fits] ** 2).mean()), rel=1e-4)
         assert found.mean_fit_m[k] == pytest.approx(away[fits].mean(), abs=1e-5)
         assert found.histogram[k].sum() == len(away)
         sides = [u[held].min(), u[held].max(), v[held].min(), v[held].max()]
         np.testing.assert_allclose(found.extents_m[k], sides, atol=1e-6)
-    assert (found.n_find[2], found.rms_find_m[2], found.mean_fit_m[2]) == (0, 0.0, 0.0)
+    assert (found.n_points[2], found.rms_m[2], found.mean_fit_m[2]) == (0, 0.0, 0.0)
     # Without points near it a plane reaches as far as its rectangle.
     np.testing.assert_array_equal(found.extents_m[2], bounds[2])
     # A fit tolerance beyond the find tolerance is none.
-    wide = measure_planes(prepared, slabs, bounds, find_m=fit_m, fit_m=find_m)
-    assert wide.fit_m == wide.find_m == fit_m
+    wide = measure_planes(prepared, slabs, bounds, tolerance_m=fit_m, fit_tolerance_m=find_m)
+    assert wide.fit_tolerance_m == wide.tolerance_m == fit_m
     order = np.array([1, 0, 2])
     turned = found.take(order)
-    for name in ("n_find", "rms_find_m", "n_fit", "rms_fit_m", "mean_fit_m", "histogram"):
+    for name in ("n_points", "rms_m", "n_fit", "rms_fit_m", "mean_fit_m", "histogram"):
         np.testing.assert_array_equal(getattr(turned, name), getattr(found, name)[order])
-    assert (turned.find_m, turned.fit_m) == (find_m, fit_m)
+    assert (turned.tolerance_m, turned.fit_tolerance_m) == (find_m, fit_m)
 
 
 def test_a_plane_of_one_point_deviates_by_its_distance() -> None:
@@ -290,7 +214,9 @@ def test_a_plane_of_one_point_deviates_by_its_distance() -> None:
     prepared = prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
     prepared.claims[:] = [0, -1, -1]
     slabs = np.array([[0, 0, 1.0, 0.0, 1.0, 0, 0, 0, 0, 1.0, 0, 0]])
-    found = measure_planes(prepared, slabs, np.array([[-1.0, 1, -1, 1]]), find_m=0.1, fit_m=0.05)
-    assert (found.n_find[0], found.n_fit[0]) == (1, 1)
-    for value in (found.rms_find_m[0], found.rms_fit_m[0], found.mean_fit_m[0]):
+    found = measure_planes(
+        prepared, slabs, np.array([[-1.0, 1, -1, 1]]), tolerance_m=0.1, fit_tolerance_m=0.05
+    )
+    assert (found.n_points[0], found.n_fit[0]) == (1, 1)
+    for value in (found.rms_m[0], found.rms_fit_m[0], found.mean_fit_m[0]):
         assert value == pytest.approx(0.03, rel=1e-3)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.cloud import measure_noise
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
-from orthoflow_plugins.plane.noise import measure_noise
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.region import Region
 

@@ -8,8 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.hypotheses import curve_order, draw_hypotheses, scores_of
-from orthoflow_plugins.plane.ransac import Ransac
+from orthoflow_plugins.plane.ransac import (
+    Ransac,
+    curve_order,
+    draw_hypotheses,
+    fewest_false_alarms,
+)
 from pydantic import ValidationError
 
 from orthoflow.geometry import angle_between_deg
@@ -92,30 +96,14 @@ def test_other_scores_have_no_tolerance_of_their_own(tmp_path: Path) -> None:
     assert out.planes.details["raw"][0]["own_tolerance_m"] is None
 
 
-def test_scores_are_what_their_formulas_say() -> None:
-    distances_m = np.random.default_rng(0).uniform(-0.1, 0.1, 5_000)
-    histogram = histogram_of(distances_m, 0.05)
-    shared = {
-        "reach_m": 0.05,
-        "n_points": 5_000,
-        "extents_m": np.array([4.0]),
-        "model_points": 3,
-    }
-    inside = distances_m[np.abs(distances_m) <= 0.05]
-    count = scores_of(histogram, "count", **shared)
-    msac = scores_of(histogram, "msac", **shared)
-    assert count.value[0] == len(inside)
-    assert msac.value[0] == pytest.approx(np.sum(1.0 - (inside / 0.05) ** 2), rel=1e-3)
-
-
 def test_chance_alone_is_not_meaningful_a_contrario_and_a_wall_is() -> None:
     rng = np.random.default_rng(0)
     background_m = rng.uniform(-2.0, 2.0, 5_000)
     wall_m = rng.normal(0.0, 0.002, 500)
-    shared = {"reach_m": 0.05, "extents_m": np.array([4.0]), "model_points": 3}
-    alone = scores_of(histogram_of(background_m, 0.05), "a-contrario", n_points=5_000, **shared)
+    extents_m = np.array([4.0])
+    alone = fewest_false_alarms(histogram_of(background_m, 0.05), 0.05, 5_000, extents_m, 3)
     both = np.concatenate([background_m, wall_m])
-    found = scores_of(histogram_of(both, 0.05), "a-contrario", n_points=5_500, **shared)
+    found = fewest_false_alarms(histogram_of(both, 0.05), 0.05, 5_500, extents_m, 3)
     assert alone.value[0] < 0.0
     assert found.value[0] > 100.0
     assert 0.003 < found.tolerance_m[0] < 0.007

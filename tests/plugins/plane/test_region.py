@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.region import Region
-from orthoflow_plugins.plane.regions import Growth, grow
-from orthoflow_plugins.plane.sample import prepare
-from orthoflow_plugins.plane.surface_voxels import (
-    Neighbourhood,
-    SurfaceVoxels,
-    coarser,
-    surface_voxels,
-)
+from orthoflow_plugins.plane.cloud import prepare
+from orthoflow_plugins.plane.region import Region, grow
 from orthoflow_plugins.plane.voxel_kernels import STEPS_PER_VOXEL
+from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels, coarser, surface_voxels
 
 from orthoflow.geometry import angle_between_deg, basis_from_up
 from orthoflow.sdk import StepContext
@@ -25,6 +19,7 @@ from tests.plane_scenes import Rectangle, cloud_of, context, sampled
 
 STATION = np.array([[0.0, -1.5, 0.0]])
 CUBE = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
+GROWTH: dict[str, Any] = {"angle_deg": 10.0, "distance_m": 0.015, "viewer_m": np.zeros(3)}
 # A wall with a niche a quarter of a metre deep, and a floor before them.
 WALL = Rectangle("wall", (0, 2, 0), (1.5, 0, 0), (0, 0, 1.0), 120_000)
 NICHE = Rectangle("niche", (2.0, 2.25, 0), (0.4, 0, 0), (0, 0, 0.8), 26_000)
@@ -121,8 +116,8 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     lean = np.radians(7.0)
     wall = Rectangle("lean", (1, 3, 2), (2, 0, 0), (0, np.sin(lean), np.cos(lean)), 80_000)
     points = sampled((wall,), noise_m=0.001)
-    growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=100.0)
-    regions = grow(voxels_of(points, CUBE), growth, np.zeros(3))
+    growth = {**GROWTH, "least_points": 100.0}
+    regions = grow(voxels_of(points, CUBE), **growth)
     assert len(regions.planes) == 1
     (plane,) = regions.planes.values()
     centred = points - points.mean(axis=0)
@@ -135,22 +130,22 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
 def test_wider_cells_have_the_moments_of_their_points() -> None:
     points = sampled((WALL, NICHE))[::7]
     voxels = voxels_of(points, CUBE)
-    wide = coarser(voxels, np.arange(len(voxels.counts)))
-    assert wide.voxels.grid.cell_m == 2.0 * voxels.grid.cell_m
+    wide, of_member = coarser(voxels, np.arange(len(voxels.counts)))
+    assert wide.grid.cell_m == 2.0 * voxels.grid.cell_m
     voxel_of = voxels.voxel_of(prepared_points(points))
     inside = voxel_of >= 0
-    wide_of = wide.of_member[voxel_of[inside]]
+    wide_of = of_member[voxel_of[inside]]
     count = np.bincount(wide_of)
-    np.testing.assert_array_equal(wide.voxels.counts, count)
+    np.testing.assert_array_equal(wide.counts, count)
     mean = (
         np.column_stack([np.bincount(wide_of, column) for column in points[inside].T])
         / count[:, None]
     )
-    step_m = wide.voxels.grid.cell_m / STEPS_PER_VOXEL
-    centroids = wide.voxels.centroids() @ wide.voxels.grid.basis
+    step_m = wide.grid.cell_m / STEPS_PER_VOXEL
+    centroids = wide.centroids() @ wide.grid.basis
     np.testing.assert_allclose(centroids, mean, atol=step_m)
     # The kernels find each wide voxel where its points are.
-    np.testing.assert_array_equal(wide.voxels.voxel_of(prepared_points(points))[inside], wide_of)
+    np.testing.assert_array_equal(wide.voxel_of(prepared_points(points))[inside], wide_of)
 
 
 def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
@@ -159,8 +154,8 @@ def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
     dense = Rectangle("dense", (0.0, 4.0, 0.0), (2.0, 0, 0), (0, 0, 2.0), 90_000)
     wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, voxel_m=0.1 / 3.0)
     voxels = voxels_of(sampled((thin, dense), noise_m=0.002), wanted)
-    growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=400.0)
-    regions = grow(voxels, growth, np.zeros(3))
+    growth = {**GROWTH, "least_points": 400.0}
+    regions = grow(voxels, **growth)
     assert len(regions.planes) == 2
     of_thin = min(regions.planes, key=lambda region: regions.n_points[region])
     assert regions.n_points[of_thin] > 0.9 * 2_400
@@ -171,13 +166,13 @@ def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
 def test_a_step_of_three_centimetres_parts_regions() -> None:
     upper = Rectangle("upper", (0, 2, 0.5), (1, 0, 0), (0, 0, 0.5), 30_000)
     lower = Rectangle("lower", (0, 2.03, -0.5), (1, 0, 0), (0, 0, 0.5), 25_000)
-    growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=2_000.0)
+    growth = {**GROWTH, "least_points": 2_000.0}
     voxels = voxels_of(sampled((upper, lower), noise_m=0.001), CUBE)
-    regions = grow(voxels, growth, np.zeros(3))
+    regions = grow(voxels, **growth)
     assert len(regions.planes) == 2
-    either_depth = Growth(angle_deg=10.0, distance_m=None, least_points=2_000.0)
+    either_depth = grow(voxels, **{**growth, "distance_m": None, "viewer_m": STATION[0]})
     # All but the voxels at the step itself, whose neighbourhoods lean.
-    assert grow(voxels, either_depth, STATION[0]).n_points.max() > 0.85 * 55_000
+    assert either_depth.n_points.max() > 0.85 * 55_000
 
 
 def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) -> None:

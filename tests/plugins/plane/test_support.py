@@ -13,7 +13,6 @@ from orthoflow_plugins.plane.support import (
     cell_for,
     crowded_cells,
     support_of,
-    surface_raster,
 )
 
 from orthoflow.geometry import Plane, wall_axes
@@ -32,15 +31,15 @@ def raster_of(shape: tuple[int, int]) -> SurfaceRaster:
     )
 
 
-def sums_of(n_find: NDArray[np.int64], n_inner: NDArray[np.int64] | None = None) -> CellSums:
-    inner = n_find if n_inner is None else n_inner
-    nothing = np.zeros_like(n_find)
-    return CellSums(n_find=n_find, n_inner=inner, n_fit=inner, steps=nothing, squared_steps=nothing)
+def sums_of(n_near: NDArray[np.int64], n_inner: NDArray[np.int64] | None = None) -> CellSums:
+    inner = n_near if n_inner is None else n_inner
+    nothing = np.zeros_like(n_near)
+    return CellSums(n_near=n_near, n_inner=inner, n_fit=inner, steps=nothing, squared_steps=nothing)
 
 
 def test_a_raster_covers_the_box_with_cells_of_the_side_asked_for() -> None:
     corners = np.array(list(itertools.product((-3.0, 2.0), (1.0, 2.5), (0.0, 1.05))))
-    raster = surface_raster(PLANE, corners, UP, cell_m=0.1)
+    raster = SurfaceRaster.over(PLANE, corners, UP, 0.1)
     placed = corners @ raster.axes.T
     np.testing.assert_allclose(raster.low_m, placed.min(axis=0))
     # 5 m across, 1.05 m down.
@@ -49,10 +48,10 @@ def test_a_raster_covers_the_box_with_cells_of_the_side_asked_for() -> None:
     assert u.shape == v.shape == (11, 50)
     np.testing.assert_allclose([u[0, 0], v[0, 0]], raster.low_m + 0.05)
     np.testing.assert_allclose([u[3, 7], v[3, 7]], raster.low_m + np.array([0.75, 0.35]))
-    wide = surface_raster(PLANE, 1000.0 * corners, UP, cell_m=0.1)
+    wide = SurfaceRaster.over(PLANE, 1000.0 * corners, UP, 0.1)
     assert wide.shape[0] * wide.shape[1] == pytest.approx(1e6, rel=0.01)
     assert wide.cell_m == pytest.approx(np.sqrt(5000.0 * 1050.0 / 1e6))
-    flat = surface_raster(PLANE, corners * [1.0, 1.0, 0.0], UP, cell_m=0.1)
+    flat = SurfaceRaster.over(PLANE, corners * [1.0, 1.0, 0.0], UP, 0.1)
     assert flat.shape == (1, 50)
 
 
@@ -71,22 +70,22 @@ def test_cells_hold_a_dozen_points_and_are_no_smaller_than_five_centimetres() ->
 
 
 def test_crowded_cells_have_most_points_in_the_inner_slab_and_like_neighbours() -> None:
-    n_find = np.full((9, 9), 25)
+    n_near = np.full((9, 9), 25)
     # 0.6 of 25 points and half their root: 17.5.
     for n_inner, crowded in ((17, False), (18, True)):
-        found = crowded_cells(sums_of(n_find, np.full((9, 9), n_inner)))
+        found = crowded_cells(sums_of(n_near, np.full((9, 9), n_inner)))
         assert found.all() if crowded else not found.any()
     inner = np.zeros((9, 9), dtype=np.int64)
     # A cell with three neighbours, one with two.
     inner[1:3, 1:3] = inner[6, 6] = inner[6, 7] = inner[7, 6] = 25
-    found = crowded_cells(sums_of(n_find, inner))
+    found = crowded_cells(sums_of(n_near, inner))
     np.testing.assert_array_equal(np.argwhere(found), [[1, 1], [1, 2], [2, 1], [2, 2]])
 
 
 def test_cells_with_two_points_or_far_fewer_than_the_others_are_not_crowded() -> None:
-    n_find = np.full((6, 6), 400)
-    n_find[0, :3] = [2, 7, 9]
-    found = crowded_cells(sums_of(n_find))
+    n_near = np.full((6, 6), 400)
+    n_near[0, :3] = [2, 7, 9]
+    found = crowded_cells(sums_of(n_near))
     # A fiftieth of 400 is 8.
     np.testing.assert_array_equal(found[0], [False, False, True, True, True, True])
     assert found[1:].all()
@@ -102,10 +101,10 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
     belongs[2:6, 12:15] = True  # four cells further on
     belongs[3:9, 20:30] = True  # five cells
     belongs[11, 39] = True  # one of 93 cells
-    n_find = np.where(belongs, 1, 7)
-    n_find[2:6, 3:15] *= 9
+    n_near = np.where(belongs, 1, 7)
+    n_near[2:6, 3:15] *= 9
     raster = raster_of((12, 40))
-    support = support_of(raster, belongs, sums_of(n_find))
+    support = support_of(raster, belongs, sums_of(n_near))
     assert support is not None
     assert not support.cells[11, 39]
     np.testing.assert_array_equal(support.cells[:, :38], belongs[:, :38])
@@ -119,7 +118,7 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
     )
     np.testing.assert_allclose(support.bounds_m, [-0.7, 2.0, 3.2, 3.9], atol=1e-12)
     assert support.n_points == 9 * 32 + 60
-    alone = support_of(raster, belongs, sums_of(n_find), joins_parts=False)
+    alone = support_of(raster, belongs, sums_of(n_near), join_parts=False)
     assert alone is not None
     assert alone.n_points == 9 * 32
     np.testing.assert_allclose(alone.parts_m, support.parts_m[:1])

@@ -119,20 +119,20 @@ def test_materials_need_intensities(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("charts")
 def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane import detecting
+    from orthoflow_plugins.plane import search
 
     rows = []
     cloud = cloud_of(wall(0.002), stations=STATION)
     row = np.repeat(np.arange(300), N_POINTS // 300).astype(np.uint32)
     cloud = dataclasses.replace(cloud, row=row, column=np.zeros(N_POINTS, dtype=np.uint32))
-    original = detecting.row_points
+    original = search.row_points
 
     def kept(*arguments: Any) -> Any:
         rows.append(original(*arguments))
         return rows[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detecting, "row_points", kept)
+        patch.setattr(search, "row_points", kept)
         detect(cloud, tmp_path)
     (found,) = rows
     assert len(found.along_m) == 300

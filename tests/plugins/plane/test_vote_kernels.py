@@ -157,8 +157,10 @@ def test_tilts_are_voted_for_at_the_height_above_the_tilted_plane() -> None:
         np.testing.assert_array_equal(found - 1, expected)
 
 
-@pytest.mark.parametrize("half", [0, 1, 3])
-def test_the_best_bin_stands_out_most_from_the_emptier_window_beside_it(half: int) -> None:
+@pytest.mark.parametrize(("half", "is_plain"), [(0, False), (1, False), (3, False), (0, True)])
+def test_the_best_bin_stands_out_most_from_the_emptier_window_beside_it(
+    half: int, is_plain: bool
+) -> None:
     rng = np.random.default_rng(half)
     n_rows, n_bins = 9, 25
     votes = rng.integers(0, 6, (n_rows, n_bins)).astype(np.int32)
@@ -170,14 +172,15 @@ def test_the_best_bin_stands_out_most_from_the_emptier_window_beside_it(half: in
     barred[6] = barred[7] = 0
     asked = np.array([0, 1, 2, 4, 5, 6, 7, 8])
     scores, places = np.full(n_rows, -7), np.full(n_rows, -7)
-    best_bins(votes, asked, half, barred, scores, places)
+    best_bins(votes, asked, half, is_plain, barred, scores, places)
     assert (scores[3], places[3]) == (-7, -7)
     apart = 2 * half + 2
     for row in asked:
         wide = np.pad(votes[row].astype(np.int64), half + apart)
         windows = np.convolve(wide, np.ones(2 * half + 1, dtype=np.int64), "valid")
         beside = np.minimum(windows[:n_bins], windows[2 * apart :])
-        line = np.where(barred[row] != 0, -1, windows[apart : apart + n_bins] - beside)
+        worth = windows[apart : apart + n_bins] - (0 if is_plain else beside)
+        line = np.where(barred[row] != 0, -1, worth)
         best = max(int(line.max()), -1)
         assert scores[row] == best
         assert places[row] == (int(line.argmax()) if best >= 0 else 0)

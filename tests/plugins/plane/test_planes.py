@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane import assembling
-from orthoflow_plugins.plane.assembling import (
+from orthoflow_plugins.plane.candidates import FoundPlane, label, verify
+from orthoflow_plugins.plane.cloud import PreparedCloud
+from orthoflow_plugins.plane.detector import Candidate
+from orthoflow_plugins.plane.planes import (
     Assembly,
+    Deviations,
     assemble,
-    enclosing,
+    face,
     known_viewpoint,
+    measure_planes,
     middle_viewpoint_m,
     plane_names,
     rectangle_m,
     side_of_remaining,
     side_of_stations,
 )
-from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, verify
-from orthoflow_plugins.plane.final_fit import label
-from orthoflow_plugins.plane.measuring import Deviations, measure_planes
-from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
+from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import PointCloud
-from tests.plane_scenes import RULES, cloud_of
+from tests.plane_scenes import FIT_TOLERANCE_M, TOLERANCE_M, cloud_of, prepared, search_in
 
 UP = np.array([0.0, 0.0, 1.0])
 # At y = 2, its normal to the south; 4 x 2 m about (0, 2, 0).
@@ -58,16 +58,15 @@ def test_corners_run_from_the_top_left_counter_clockwise() -> None:
     np.testing.assert_allclose(
         CORNERS, [[-2.0, 2.0, 1.0], [-2.0, 2.0, -1.0], [2.0, 2.0, -1.0], [2.0, 2.0, 1.0]]
     )
-    back = WALL.flipped()
-    again = enclosing(CORNERS, back, wall_axes(back.normal, UP))
-    np.testing.assert_allclose(
-        again, [[2.0, 2.0, 1.0], [2.0, 2.0, -1.0], [-2.0, 2.0, -1.0], [-2.0, 2.0, 1.0]]
-    )
-    turn = np.array([[0.6, 0.0, 0.8], [0.8, 0.0, -0.6]])
-    wide = enclosing(CORNERS, WALL, turn)
-    placed = wide @ turn.T
-    np.testing.assert_allclose(placed.max(axis=0), [2.0, 2.2])
-    np.testing.assert_allclose(placed.min(axis=0), [-2.0, -2.2])
+    raster = SurfaceRaster.over(WALL, CORNERS.repeat(2, axis=0), UP, 0.1)
+    whole, part = np.array([-2.0, 2.0, -1.0, 1.0]), np.array([[-9.0, 1.0, 0.0, 9.0]])
+    for side, corner in ((1, [-2.0, 2.0, 1.0]), (-1, [2.0, 2.0, 1.0])):
+        faced = face(raster, whole, part, side, UP, is_guessed=False)
+        np.testing.assert_allclose(faced.corners_m[0], corner)
+        np.testing.assert_allclose(faced.plane.normal, side * WALL.normal)
+        # No part reaches beyond the whole.
+        low, high = faced.part_corners_m[0].min(axis=0), faced.part_corners_m[0].max(axis=0)
+        np.testing.assert_allclose([low[[0, 2]], high[[0, 2]]], [[-2.0, -1.0], [1.0, 0.0]])
 
 
 # --- from which side ---
@@ -205,33 +204,35 @@ def scene() -> Scene:
     north[:, 1] += rng.exponential(0.003, 24_000)
     west[:, 0] -= rng.exponential(0.002, 8_000)
     seen = cloud_of(np.vstack([west, north, [[0.3, 0.0, 0.0]]]), origin=tuple(ORIGIN))
-    prepared = prepare(seen, np.eye(3), cell_m=0.5, least_share=0.01, parts=2)
-    unassigned = Unassigned.of(prepared)
+    points = np.column_stack([seen.x, seen.y, seen.z])
+    search = search_in(prepared(points, parts=2))
     found = []
     for normal, offset_m, votes in (([1.0, 0.0, 0.0], -2.0, 77.0), ([0.0, 1.0, 0.0], 2.0, 99.0)):
         rough = Candidate(
-            plane=Plane(normal=np.array(normal), offset_m=offset_m), family="wall", votes=votes
+            plane=Plane(normal=np.array(normal), offset_m=offset_m),
+            constraint="vertical",
+            votes=votes,
         )
-        item = verify(rough, unassigned, RULES)
+        item = verify(rough, search)
         assert item is not None
-        unassigned.claim(item.claim(RULES.find_m))
+        search.claim(item.claim(TOLERANCE_M))
         found.append(item)
-    label(found, prepared, RULES.find_m)
+    label(found, search.cloud, TOLERANCE_M)
     deviations = measure_planes(
-        prepared,
+        search.cloud,
         np.array([item.raster.slab() for item in found]),
         np.array([item.support.bounds_m for item in found]),
-        find_m=RULES.find_m,
-        fit_m=RULES.fit_m,
+        tolerance_m=TOLERANCE_M,
+        fit_tolerance_m=FIT_TOLERANCE_M,
     )
-    return Scene(cloud=seen, prepared=prepared, found=found, deviations=deviations)
+    return Scene(cloud=seen, prepared=search.cloud, found=found, deviations=deviations)
 
 
 def assembled(scene: Scene, *stations: tuple[float, float, float]) -> Assembly:
     known = scene.cloud
     if stations:
         known = replace(known, stations=np.array(stations) + ORIGIN, stations_source="file")
-    return assemble(scene.found, scene.prepared, scene.deviations, known)
+    return assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)
 
 
 def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
@@ -250,18 +251,18 @@ def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -
         # The offset counts from the world's origin: it moves with the normal.
         shift = np.eye(4)
         shift[3, :3] = ORIGIN
-        stated = item.adjusted.stated()
+        covariance, n_independent = item.adjusted.stated()
         np.testing.assert_allclose(
-            planes.covariance[k], shift @ stated.covariance @ shift.T, rtol=1e-6, atol=1e-15
+            planes.covariance[k], shift @ covariance @ shift.T, rtol=1e-6, atol=1e-15
         )
-        assert assembly.n_independent[k] == stated.n_independent
+        assert assembly.n_independent[k] == n_independent
         raw = assembly.raw[k]
         np.testing.assert_array_equal(raw.plane.normal, sign * item.candidate.plane.normal)
         assert raw.plane.offset_m == pytest.approx(
             sign * item.candidate.plane.offset_m + float(raw.plane.normal @ ORIGIN)
         )
         assert raw.votes == item.candidate.votes
-    assert planes.tolerance_m == RULES.find_m
+    assert planes.tolerance_m == TOLERANCE_M
 
 
 def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
@@ -271,7 +272,7 @@ def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
     np.testing.assert_array_equal(after.histogram[1], before.histogram[0])
     np.testing.assert_array_equal(after.mean_fit_m, [-before.mean_fit_m[1], before.mean_fit_m[0]])
     np.testing.assert_array_equal(after.n_fit, before.n_fit[::-1])
-    np.testing.assert_array_equal(after.rms_find_m, before.rms_find_m[::-1])
+    np.testing.assert_array_equal(after.rms_m, before.rms_m[::-1])
     # From behind it is the other way round.
     after = assembled(scene, (-3.0, 3.0, 0.0)).deviations
     np.testing.assert_array_equal(after.histogram, [before.histogram[1], before.histogram[0, ::-1]])
@@ -329,7 +330,7 @@ def test_sides_that_were_stated_are_given(scene: Scene) -> None:
     known = replace(
         scene.cloud, stations=np.array([[0.0, 2.0, 0.0]]) + ORIGIN, stations_source="view_from"
     )
-    planes = assemble(scene.found, scene.prepared, scene.deviations, known).planes
+    planes = assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M).planes
     assert (planes.viewpoint, planes.side_from) == ("view_from", ("guess", "given"))
 
 
@@ -338,7 +339,7 @@ def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
     details = assembly.planes.details
     assert details["fit_n_points"] == scene.deviations.n_fit[::-1].tolist()
     assert details["fit_rms_m"] == scene.deviations.rms_fit_m[::-1].tolist()
-    assert details["fit_tolerance_m"] == RULES.fit_m
+    assert details["fit_tolerance_m"] == FIT_TOLERANCE_M
     assert details["n_independent"] == list(assembly.n_independent)
     first = details["raw"][0]  # type: ignore[index]
     assert first == {
@@ -347,40 +348,3 @@ def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
         "support": 99.0,
         "own_tolerance_m": None,
     }
-
-
-def test_planes_within_twenty_degrees_do_not_count_for_the_side_of_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[Any] = []
-
-    def side(_plane: object, _corners: object, points: Any, is_parallel: Any, **_: object) -> int:
-        asked.append((points, is_parallel))
-        return 1
-
-    monkeypatch.setattr(assembling, "side_of_remaining", side)
-
-    def found(turn_deg: float) -> Any:
-        turn = np.radians(turn_deg)
-        plane = Plane(normal=np.array([np.sin(turn), -np.cos(turn), 0.0]), offset_m=-2.0)
-        stated = SimpleNamespace(stated=lambda: None)
-        return SimpleNamespace(
-            raster=SimpleNamespace(plane=plane, axes=wall_axes(plane.normal, UP)),
-            support=SimpleNamespace(parts_m=np.array([[-1.0, 1.0, -1.0, 1.0]])),
-            adjusted=stated,
-        )
-
-    planes = [found(turn_deg) for turn_deg in (0.0, 19.0, 21.0, 199.0, -19.0, 90.0)]
-    claims = np.array([5, 0, 1, 2, -1, 3, 4, 0], dtype=np.int8)
-    offsets = np.arange(24.0).reshape(8, 3)
-    prepared: Any = SimpleNamespace(
-        sample_claims=claims, sample=SimpleNamespace(index=np.arange(8), offsets_m=offsets)
-    )
-    deviations: Any = SimpleNamespace(
-        extents_m=np.tile([-1.0, 1.0, -1.0, 1.0], (6, 1)), find_m=0.05
-    )
-    faced = assembling._faced(planes, 0, prepared, cloud(), deviations)
-    assert faced.is_guessed
-    ((points, is_parallel),) = asked
-    np.testing.assert_array_equal(points, offsets)
-    assert is_parallel.tolist() == [False, True, True, False, False, True, True, True]

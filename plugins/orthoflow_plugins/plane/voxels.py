@@ -18,6 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
@@ -26,7 +27,6 @@ from orthoflow_plugins.plane.kernels import (
     piece_of,
     plan_frame,
 )
-from orthoflow_plugins.plane.sample import PreparedCloud
 from orthoflow_plugins.plane.voxel_kernels import (
     BRICK_SIDE,
     N_SUMS,
@@ -41,8 +41,6 @@ from orthoflow_plugins.plane.voxel_kernels import (
     voxel_places,
     with_room,
 )
-
-Shape = Literal["cube", "radius", "knn"]
 
 # Points a neighbourhood should hold where the cloud is thin, so that its normal means something.
 POINTS_LEAST: Final = 16.0
@@ -68,26 +66,26 @@ class Neighbourhood:
         voxel_m: side of a voxel.
     """
 
-    shape: Shape
+    shape: Literal["cube", "radius", "knn"]
     size_m: float
     n_points: int
     voxel_m: float
 
     def around(self) -> NDArray[np.int32]:
         """(o, 4) steps to the voxels of the neighbourhood, near ones first, and their shell."""
-        if self.shape == "cube":
-            reach = round(0.5 * (self.size_m / self.voxel_m - 1.0))
-        elif self.shape == "radius":
-            reach = math.floor(self.size_m / self.voxel_m)
-        else:
-            reach = _REACH_MOST
-        reach = min(max(reach, 0), _REACH_MOST)
+        across = self.size_m / self.voxel_m
+        reaches = {
+            "cube": round(0.5 * (across - 1.0)),
+            "radius": math.floor(across),
+            "knn": _REACH_MOST,
+        }
+        reach = min(max(reaches[self.shape], 0), _REACH_MOST)
         axis = np.arange(-reach, reach + 1)
         steps = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         squares = (steps**2).sum(axis=1)
         shell = np.abs(steps).max(axis=1)
         if self.shape == "radius":
-            kept = squares <= max(self.size_m / self.voxel_m, 1.0) ** 2
+            kept = squares <= max(across, 1.0) ** 2
             steps, squares, shell = steps[kept], squares[kept], shell[kept]
         order = np.lexsort([squares, shell])[1:]
         return np.column_stack([steps[order], shell[order]]).astype(np.int32)
@@ -98,10 +96,9 @@ class Neighbourhood:
             return 3.0
         return 2.0 * float(np.abs(self.around()[:, :3]).max(initial=0)) + 1.0
 
-    @property
-    def enough(self) -> int:
-        """Points with which a neighbourhood ends; the others take all their voxels."""
-        return self.n_points if self.shape == "knn" else 2**62
+    def with_voxels(self, voxel_m: float) -> Neighbourhood:
+        """Return the same in voxels of another size."""
+        return replace(self, voxel_m=voxel_m, size_m=self.size_m * (voxel_m / self.voxel_m))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +109,6 @@ class SurfaceVoxels:
         neighbourhood: which points make a normal; its voxels are those used, which may be larger
             than the ones asked for.
         grid: axes, corner and side of the voxels.
-        frame: (3, 4) float32 voxel of an offset: `frame @ p - frame[:, 3]`.
         bricks: (a, b, c) int32 row of each brick in `numbers`, -1 without points.
         numbers: (rows, voxels) int32 number of each voxel, -1 without points.
         places: (m, 3) int32 where voxels lie along e1, e2, up.
@@ -124,13 +120,47 @@ class SurfaceVoxels:
 
     neighbourhood: Neighbourhood
     grid: PlanGrid
-    frame: NDArray[np.float32]
     bricks: NDArray[np.int32]
     numbers: NDArray[np.int32]
     places: NDArray[np.int32]
     sums: NDArray[np.int64]
     normals: NDArray[np.float32]
     spreads: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        neighbourhood: Neighbourhood,
+        grid: PlanGrid,
+        bricks: NDArray[np.int32],
+        numbers: NDArray[np.int32],
+        places: NDArray[np.int32],
+        sums: NDArray[np.int64],
+        *,
+        parts: int,
+    ) -> SurfaceVoxels:
+        """Fit a plane to the neighbourhood of each voxel, in so many parts."""
+        normals = np.empty((len(places), 3), dtype=np.float32)
+        spreads = np.empty((len(places), 3), dtype=np.float32)
+        around = neighbourhood.around()
+        # Points with which a neighbourhood ends; the others take all their voxels.
+        enough = neighbourhood.n_points if neighbourhood.shape == "knn" else 2**62
+
+        def fit(_part: int, piece: slice) -> None:
+            own, start = (normals[piece], spreads[piece]), piece.start
+            fit_neighbourhoods(places[piece], start, bricks, numbers, sums, around, enough, *own)
+
+        each_part(len(places), parts, fit)
+        return cls(
+            neighbourhood=neighbourhood,
+            grid=grid,
+            bricks=bricks,
+            numbers=numbers,
+            places=places,
+            sums=sums,
+            normals=normals,
+            spreads=spreads,
+        )
 
     @property
     def counts(self) -> NDArray[np.int64]:
@@ -146,30 +176,18 @@ class SurfaceVoxels:
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
         """(n,) voxel of each point, -1 for none."""
         found = np.empty(len(points.x), dtype=np.int32)
-        find_voxels(points, self.frame, self.bricks, self.numbers, found)
+        find_voxels(points, plan_frame(self.grid), self.bricks, self.numbers, found)
         return found
 
     def claim(self, cloud: PreparedCloud, owners: NDArray[np.int8]) -> None:
         """Give the points of a cloud to the planes that own (m,) their voxels."""
+        frame = plan_frame(self.grid)
 
         def give(_part: int, piece: slice) -> None:
             points = piece_of(cloud.points, piece)
-            claim_voxels(points, self.frame, self.bricks, self.numbers, owners, cloud.claims[piece])
+            claim_voxels(points, frame, self.bricks, self.numbers, owners, cloud.claims[piece])
 
         each_part(len(cloud.claims), cloud.parts, give)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Coarser:
-    """Some voxels, summed into wider ones.
-
-    Attributes:
-        voxels: the wider voxels.
-        of_member: (k,) the wider voxel of each voxel that was summed.
-    """
-
-    voxels: SurfaceVoxels
-    of_member: NDArray[np.int64]
 
 
 def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels:
@@ -179,30 +197,34 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     neighbourhoods are larger than what is wanted.
     """
     grid = _voxel_grid(cloud, wanted)
-    scale = grid.cell_m / wanted.voxel_m
-    used = replace(wanted, voxel_m=grid.cell_m, size_m=wanted.size_m * scale)
-    table = _in_order(_gathered(cloud, grid))
-    bricks = table.bricks.reshape(-(-np.array(grid.shape) // BRICK_SIDE))
-    places = voxel_places(bricks >= 0, table.numbers >= 0)
-    voxels = SurfaceVoxels(
-        neighbourhood=used,
-        grid=grid,
-        frame=plan_frame(grid),
-        bricks=bricks,
-        numbers=table.numbers,
-        places=places,
-        sums=table.sums,
-        normals=np.empty((len(places), 3), dtype=np.float32),
-        spreads=np.empty((len(places), 3), dtype=np.float32),
+    table = _gathered(cloud, grid)
+    # Numbered by place, so that neither threads nor the order of points show.
+    occupied = np.flatnonzero(table.bricks >= 0)
+    numbers = table.numbers[table.bricks[occupied]]
+    bricks = np.full(len(table.bricks), -1, dtype=np.int32)
+    bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
+    filled = numbers >= 0
+    met = numbers[filled]
+    numbers[filled] = np.arange(len(met), dtype=np.int32)
+    bricks = bricks.reshape(-(-np.array(grid.shape) // BRICK_SIDE))
+    return SurfaceVoxels.of(
+        wanted.with_voxels(grid.cell_m),
+        grid,
+        bricks,
+        numbers,
+        voxel_places(bricks >= 0, filled),
+        np.take(table.sums, met, axis=0),
+        parts=cloud.parts,
     )
-    return with_normals(voxels, parts=cloud.parts)
 
 
-def coarser(voxels: SurfaceVoxels, member: NDArray[np.int64]) -> Coarser:
-    """Sum voxels (k,) into voxels with sides twice as long, and fit their neighbourhoods."""
+def coarser(
+    voxels: SurfaceVoxels, member: NDArray[np.int64]
+) -> tuple[SurfaceVoxels, NDArray[np.int64]]:
+    """Sum voxels (k,) into voxels twice as wide; gives those, and which one each is in."""
     places, odd = np.divmod(voxels.places[member].astype(np.int64), 2)
-    shape = tuple(math.ceil(size / 2) for size in voxels.grid.shape)
-    n_bricks = tuple(-(-size // BRICK_SIDE) for size in shape)
+    a, b, c = (math.ceil(size / 2) for size in voxels.grid.shape)
+    n_bricks = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
     brick, within = np.divmod(places, BRICK_SIDE)
     brick_key = np.ravel_multi_index(tuple(brick.T), n_bricks)
     voxel = np.ravel_multi_index(tuple(within.T), (BRICK_SIDE,) * 3)
@@ -214,53 +236,17 @@ def coarser(voxels: SurfaceVoxels, member: NDArray[np.int64]) -> Coarser:
     bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
     numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
     numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
-    grid = PlanGrid(
-        basis=voxels.grid.basis,
-        low_m=voxels.grid.low_m,
-        cell_m=2.0 * voxels.grid.cell_m,
-        shape=(shape[0], shape[1], shape[2]),
+    grid = replace(voxels.grid, cell_m=2.0 * voxels.grid.cell_m, shape=(a, b, c))
+    wider = SurfaceVoxels.of(
+        voxels.neighbourhood.with_voxels(grid.cell_m),
+        grid,
+        bricks.reshape(n_bricks),
+        numbers,
+        places[first].astype(np.int32),
+        _summed(voxels.sums[member], odd, of_member, len(keys)),
+        parts=1,
     )
-    used = replace(
-        voxels.neighbourhood, voxel_m=grid.cell_m, size_m=2.0 * voxels.neighbourhood.size_m
-    )
-    return Coarser(
-        voxels=with_normals(
-            SurfaceVoxels(
-                neighbourhood=used,
-                grid=grid,
-                frame=plan_frame(grid),
-                bricks=bricks.reshape(n_bricks),
-                numbers=numbers,
-                places=places[first].astype(np.int32),
-                sums=_summed(voxels.sums[member], odd, of_member, len(keys)),
-                normals=np.empty((len(keys), 3), dtype=np.float32),
-                spreads=np.empty((len(keys), 3), dtype=np.float32),
-            ),
-            parts=1,
-        ),
-        of_member=of_member,
-    )
-
-
-def with_normals(voxels: SurfaceVoxels, *, parts: int) -> SurfaceVoxels:
-    """Fit a plane to the neighbourhood of each voxel, which sets normals and spreads."""
-    around = voxels.neighbourhood.around()
-
-    def fit(_part: int, piece: slice) -> None:
-        fit_neighbourhoods(
-            voxels.places[piece],
-            piece.start,
-            voxels.bricks,
-            voxels.numbers,
-            voxels.sums,
-            around,
-            voxels.neighbourhood.enough,
-            voxels.normals[piece],
-            voxels.spreads[piece],
-        )
-
-    each_part(len(voxels.places), parts, fit)
-    return voxels
+    return wider, of_member
 
 
 @dataclass(kw_only=True)
@@ -286,8 +272,7 @@ def _voxel_grid(cloud: PreparedCloud, wanted: Neighbourhood) -> PlanGrid:
     inside = ((placed >= 0) & (placed * wanted.voxel_m < extent_m)).all(axis=1)
     shape = np.ceil(extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
-    edges = np.flatnonzero(np.diff(keys, prepend=-1, append=-1))
-    counts = np.diff(edges)
+    counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
     # How many others of the sample share a point's voxel: chance alone shares none, however few.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
@@ -295,13 +280,8 @@ def _voxel_grid(cloud: PreparedCloud, wanted: Neighbourhood) -> PlanGrid:
     cell_m = wanted.voxel_m * scale if scale > 1.0 else wanted.voxel_m
     cell_m = min(cell_m, max(wanted.voxel_m, _VOXEL_SHARE_MOST * float(extent_m.max())))
     cell_m = coarsened(cell_m, extent_m)
-    n_voxels = np.maximum(1, np.ceil(extent_m / cell_m)).astype(int)
-    return PlanGrid(
-        basis=grid.basis,
-        low_m=grid.low_m,
-        cell_m=cell_m,
-        shape=(int(n_voxels[0]), int(n_voxels[1]), int(n_voxels[2])),
-    )
+    a, b, c = np.maximum(1, np.ceil(extent_m / cell_m)).astype(int).tolist()
+    return replace(grid, cell_m=cell_m, shape=(a, b, c))
 
 
 def _gathered(cloud: PreparedCloud, grid: PlanGrid) -> _Table:
@@ -322,33 +302,16 @@ def _gathered(cloud: PreparedCloud, grid: PlanGrid) -> _Table:
         points, table, start = piece_of(cloud.points, piece), tables[part], 0
         while start < len(points.x):
             table.make_room(BLOCK_POINTS, BLOCK_POINTS)
-            start = gather_moments(
-                points, start, frame, (a, b, c), table.bricks, table.numbers, table.sums,
-                table.n_used,
-            )  # fmt: skip
+            own = (table.bricks, table.numbers, table.sums, table.n_used)
+            start = gather_moments(points, start, frame, (a, b, c), *own)
 
     each_part(len(cloud.claims), cloud.parts, gather)
     whole, *others = tables
     for table in others:
         whole.make_room(int(table.n_used[0]), int(table.n_used[1]))
-        merge_moments(
-            table.bricks, table.numbers, table.sums,
-            whole.bricks, whole.numbers, whole.sums, whole.n_used,
-        )  # fmt: skip
+        own = (whole.bricks, whole.numbers, whole.sums, whole.n_used)
+        merge_moments(table.bricks, table.numbers, table.sums, *own)
     return whole
-
-
-def _in_order(table: _Table) -> _Table:
-    """Number rows and voxels by place, so that neither threads nor the order of points show."""
-    occupied = np.flatnonzero(table.bricks >= 0)
-    numbers = table.numbers[table.bricks[occupied]]
-    bricks = np.full(len(table.bricks), -1, dtype=np.int32)
-    bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
-    filled = numbers >= 0
-    met = numbers[filled]
-    numbers[filled] = np.arange(len(met), dtype=np.int32)
-    sums = np.take(table.sums, met, axis=0)
-    return _Table(bricks=bricks, numbers=numbers, sums=sums, n_used=table.n_used)
 
 
 def _summed(
@@ -362,16 +325,16 @@ def _summed(
         owner: (k,) wider voxel of each.
         count: wider voxels.
     """
-    number = sums[:, :1]
+    number = sums[:, 0]
     shift = (2 * odd - 1) * (STEPS_PER_VOXEL // 4)
     linear = 0.5 * sums[:, 1:4]
-    moved = [number[:, 0], *(linear + number * shift).T]
+    moved = [number, *(linear + number[:, None] * shift).T]
     for k, (i, j) in enumerate(_PAIRS):
         moved.append(
             0.25 * sums[:, 4 + k]
             + shift[:, i] * linear[:, j]
             + shift[:, j] * linear[:, i]
-            + number[:, 0] * shift[:, i] * shift[:, j]
+            + number * shift[:, i] * shift[:, j]
         )
     # Sums of halves and quarters of whole numbers are exact in 53 bits: the order does not show.
     totals = [np.bincount(owner, column, minlength=count) for column in moved]

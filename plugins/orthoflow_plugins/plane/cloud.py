@@ -1,4 +1,4 @@
-"""A cloud made ready for detection: blocks, an even sample of it, and what of that is unassigned.
+"""A cloud made ready for detection: blocks, noise, an even sample, and what of that is on no plane.
 
 Detectors look for planes in the sample alone. Fits and labels then take all points.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.products import PointCloud
+from orthoflow_plugins.plane.detector import DetectorParams
 from orthoflow_plugins.plane.kernels import (
     BlockedPoints,
     PlanCounts,
@@ -40,6 +41,41 @@ _PARTS_MOST: Final = 8
 # Clouds thinner than this in two directions are a line or a point.
 _THINNEST_M: Final = 1e-4
 
+# Noise is measured at so many places, in neighbourhoods of these radii and so many points.
+_NOISE_SEEDS: Final = 600
+_RADII_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
+_NEAR_LEAST: Final = 12
+_NEAR_MOST: Final = 400
+# A neighbourhood is flat where it spreads that many times as far along its plane as across it.
+_FLATNESS: Final = 5.0
+# Fewer flat places do not speak for a cloud.
+_FLAT_LEAST: Final = 20
+_QUARTER: Final = 0.25
+
+
+# What may refuse a candidate: too few points, none that crowd about it, a strip as narrow as a
+# line, points that only pass through, a rounded surface, or a tilt that was not asked for.
+Criterion = Literal["few", "scattered", "strip", "smear", "bent", "tilt"]
+
+
+class Claim(NamedTuple):
+    """A plane that takes points.
+
+    Attributes:
+        slab: (12,) the plane, see `slab_kernels`.
+        bounds_m: (5,) tolerance, then smallest and largest u and v of its rectangle.
+    """
+
+    slab: NDArray[np.float64]
+    bounds_m: NDArray[np.float64]
+
+
+class FreePoints(NamedTuple):
+    """Points that no plane has: (m, 3) offsets, and the same for the compiled passes."""
+
+    offsets_m: NDArray[np.float64]
+    points: BlockedPoints
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
@@ -59,19 +95,6 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Claim:
-    """A plane that took points.
-
-    Attributes:
-        slab: (12,) the plane, see `slab_kernels`.
-        bounds_m: (5,) find tolerance, then smallest and largest u and v of its rectangle.
-    """
-
-    slab: NDArray[np.float64]
-    bounds_m: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
 class PreparedCloud:
     """A cloud as the passes take it, and the plane of each of its points.
 
@@ -81,8 +104,7 @@ class PreparedCloud:
         grid: plan cells and storeys.
         up: (3,) unit vector.
         parts: parts of parallel passes.
-        claims: (n,) int8, plane of each point, -1 for none yet; `final_fit.label` and `claim_alone`
-            fill them.
+        claims: (n,) int8, plane of each point, -1 for none yet; `candidates.label` fills them.
         plan: all points per plan cell and per storey, where they were counted.
     """
 
@@ -107,77 +129,73 @@ class PreparedCloud:
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
         return (self.grid.low_m + steps * extent) @ self.grid.basis
 
-    def claim_alone(self, claim: Claim) -> None:
-        """Give one plane all points that it holds, and leave the others unclaimed."""
+    def claim_in_turn(self, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
+        """Give each point to the nearest of some slabs (k, 12) that hold it, the first of equals.
+
+        In float64, unlike `slab_kernels.assign_points`; all slabs have the same (5,) bounds.
+        """
         self.claims.fill(-1)
 
         def take(_part: int, piece: slice) -> None:
-            points = piece_of(self.points, piece)
-            claim_slab(points, self.claims[piece], claim.slab[None], claim.bounds_m)
+            for k in range(len(slabs)):
+                points, claims = piece_of(self.points, piece), self.claims[piece]
+                claim_slab(points, claims, slabs[: k + 1], bounds_m)
 
         each_part(len(self.claims), self.parts, take)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FreePoints:
-    """The points of a sample that no plane has.
-
-    Attributes:
-        offsets_m: (m, 3) offsets.
-        points: the same for the compiled passes.
-    """
-
-    offsets_m: NDArray[np.float64]
-    points: BlockedPoints
-
-
 @dataclass(kw_only=True)
-class Unassigned:
-    """A sample while planes are taken from it, which is where detectors look for them.
+class Search:
+    """A greedy search for planes: the sample while they are taken from it, and what counts as one.
 
     Attributes:
-        sample: its points.
-        box_corners_m: (8, 3) offsets of the corners of the cloud's robust box.
-        up: (3,) unit vector.
-        parts: parts of parallel passes.
-        claims: (m,) int8, plane of each point, -1 for none yet.
+        cloud: the cloud.
+        params: what is looked for, and when the search ends.
+        tolerance_m: `params.tolerance_m`, measured where that is `auto`.
+        fit_tolerance_m: `params.fit_tolerance_m`, likewise.
+        claims: (m,) int8, plane of each point of the sample, -1 for none yet.
         taken: the planes that took points, in their order.
-        n_points: points that no plane holds.
+        n_points: points of the sample that no plane holds.
+        refusals: what refused candidates, and the share of all points that each held.
     """
 
-    sample: Sample
-    box_corners_m: NDArray[np.float64]
-    up: NDArray[np.float64]
-    parts: int
+    cloud: PreparedCloud
+    params: DetectorParams
+    tolerance_m: float
+    fit_tolerance_m: float
     claims: NDArray[np.int8] = field(init=False)
     taken: list[Claim] = field(init=False, default_factory=list)
     n_points: int = field(init=False)
+    refusals: list[tuple[Criterion, float]] = field(init=False, default_factory=list)
     _free: FreePoints | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self.n_points = len(self.sample.index)
+        self.n_points = len(self.cloud.sample.index)
         self.claims = np.full(self.n_points, -1, dtype=np.int8)
+        self.box_corners_m = self.cloud.box_corners()
 
-    @classmethod
-    def of(cls, cloud: PreparedCloud) -> Unassigned:
-        """Begin with a cloud of which no plane has anything."""
-        return cls(
-            sample=cloud.sample, box_corners_m=cloud.box_corners(), up=cloud.up, parts=cloud.parts
-        )
+    @property
+    def least_points(self) -> float:
+        """Points of the sample that a plane must hold."""
+        return self.params.min_share * len(self.claims)
 
     def free(self) -> FreePoints:
         """The points that no plane has; kept until the next claim."""
         if self._free is None:
-            offsets_m = self.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
-            self._free = FreePoints(offsets_m=offsets_m, points=boxed(offsets_m))
+            offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
+            self._free = FreePoints(offsets_m, boxed(offsets_m))
         return self._free
 
     def claim(self, claim: Claim) -> None:
         """Give a plane its points, but for those that an earlier one has and is nearer to."""
         self.taken.append(claim)
         slabs = np.array([item.slab for item in self.taken])
-        self.n_points -= claim_slab(self.sample.points, self.claims, slabs, claim.bounds_m)
+        self.n_points -= claim_slab(self.cloud.sample.points, self.claims, slabs, claim.bounds_m)
         self._free = None
+
+    def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
+        """Note what refused a candidate that holds so many points of the sample."""
+        self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
 def prepare(
@@ -252,14 +270,10 @@ def draw_sample(cloud: PointCloud) -> Sample:
 
 
 def thinned(cloud: PointCloud, every: int) -> PointCloud:
-    """Keep every n-th point, spread as those of a sample; at least three if there are any."""
+    """Keep every n-th point, at least three, spread as those of a sample: coordinates and scan."""
     if every == 1:
         return cloud
-    return picked(cloud, _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every))))
-
-
-def picked(cloud: PointCloud, index: NDArray[np.int64]) -> PointCloud:
-    """Give some of the points, without intensity, colour and place in the scan."""
+    index = _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every)))
     return replace(
         cloud,
         x=cloud.x[index],
@@ -314,9 +328,68 @@ def plan_grid(
     # A long, thin plan, or a tall tower, must not ask for millions of storeys either.
     cell_m = max(cell_m, float(extent.max()) / PLAN_CELLS_MOST)
     cells = np.maximum(1, np.ceil(extent / cell_m)).astype(int)
-    return PlanGrid(
-        basis=basis,
-        low_m=low,
-        cell_m=cell_m,
-        shape=(int(cells[0]), int(cells[1]), int(cells[2])),
-    )
+    shape = (int(cells[0]), int(cells[1]), int(cells[2]))
+    return PlanGrid(basis=basis, low_m=low, cell_m=cell_m, shape=shape)
+
+
+class CloudNoise(NamedTuple):
+    """Noise of a cloud across its surfaces, standard deviations in metres.
+
+    Attributes:
+        single_m: of single points against their neighbours.
+        shared_m: with errors that the points within 0.8 m share.
+    """
+
+    single_m: float
+    shared_m: float
+
+
+def measure_noise(points_m: NDArray[np.float64]) -> CloudNoise | None:
+    """Measure the noise of a cloud on a sample (n, 3) of its points; None where nothing is flat.
+
+    The points around a seed are fitted by a plane (principal components); their scatter across it
+    is noise where they are flat: spread at least five times as far along the plane as across it.
+    Small neighbourhoods show the noise of single points. Large ones show, too, errors that
+    neighbouring points share (a bent trajectory, stereo, scans that do not fit), but also relief:
+    of them the flatter quarter counts.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points_m) < _NEAR_LEAST:
+        return None
+    tree = cKDTree(points_m)
+    seeds = points_m[:: max(1, len(points_m) // _NOISE_SEEDS)]
+    single = np.full(len(seeds), np.nan)
+    shared = np.full(len(seeds), np.nan)
+    for radius_m in _RADII_M:
+        is_last = radius_m == _RADII_M[-1]
+        for k in np.flatnonzero(np.isnan(single) | is_last).tolist():
+            near = tree.query_ball_point(seeds[k], radius_m)
+            if len(near) < _NEAR_LEAST:
+                continue
+            across_m = _flat_scatter_m(points_m[near[:: max(1, len(near) // _NEAR_MOST)]])
+            if np.isnan(single[k]):
+                single[k] = across_m
+            if is_last:
+                shared[k] = across_m
+    known, large = single[np.isfinite(single)], shared[np.isfinite(shared)]
+    if len(known) < _FLAT_LEAST:
+        return None
+    single_m = float(np.median(known))
+    is_known = len(large) >= _FLAT_LEAST
+    shared_m = float(np.quantile(large, _QUARTER)) if is_known else single_m
+    return CloudNoise(single_m=single_m, shared_m=max(single_m, shared_m))
+
+
+def _flat_scatter_m(points_m: NDArray[np.float64]) -> float:
+    """Robust scatter across the plane of some points; NaN where they are not flat.
+
+    The median deviation from the plane of principal components, 1.4826 times: a second surface or
+    an edge among them widens the components, so such places fall out by the flatness.
+    """
+    relative = points_m - points_m.mean(axis=0)
+    values, axes = np.linalg.eigh(relative.T @ relative / (len(points_m) - 3))
+    if values[1] < _FLATNESS**2 * values[0]:
+        return math.nan
+    across_m = relative @ axes[:, 0]
+    return float(1.4826 * np.median(np.abs(across_m - np.median(across_m))))

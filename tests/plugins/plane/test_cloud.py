@@ -8,23 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane import sample as sampling
-from orthoflow_plugins.plane.kernels import PlanGrid, each_part, piece_of
-from orthoflow_plugins.plane.sample import (
+from orthoflow_plugins.plane import cloud as clouds
+from orthoflow_plugins.plane.cloud import (
     Claim,
     PreparedCloud,
-    Unassigned,
     draw_sample,
     plan_grid,
     prepare,
     thinned,
 )
+from orthoflow_plugins.plane.kernels import PlanGrid, each_part, piece_of
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, assign_points, sum_assigned
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import Plane, wall_axes
-from tests.plane_scenes import cloud_of
+from tests.plane_scenes import cloud_of, search_in
 
 UP = np.array([0.0, 0.0, 1.0])
 FIND_M, FIT_M = 0.3, 0.1
@@ -70,14 +69,14 @@ def nearest_holder(points_m: NDArray[np.float64], rasters: list[SurfaceRaster]) 
 @pytest.mark.parametrize("seed", range(4))
 def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
     rasters = crossing_rasters(seed, 5)
-    unassigned = Unassigned.of(prepared_cloud(seed))
-    points_m = unassigned.sample.offsets_m
+    search = search_in(prepared_cloud(seed))
+    points_m = search.cloud.sample.offsets_m
     for k, raster in enumerate(rasters):
-        unassigned.claim(claim_of(raster))
+        search.claim(claim_of(raster))
         expected = nearest_holder(points_m, rasters[: k + 1])
-        np.testing.assert_array_equal(unassigned.claims, expected)
-        assert unassigned.n_points == np.count_nonzero(expected < 0)
-        free = unassigned.free()
+        np.testing.assert_array_equal(search.claims, expected)
+        assert search.n_points == np.count_nonzero(expected < 0)
+        free = search.free()
         np.testing.assert_array_equal(free.offsets_m, points_m[expected < 0])
         np.testing.assert_array_equal(free.points.x, points_m[expected < 0, 0].astype(np.float32))
 
@@ -93,11 +92,25 @@ def test_one_pass_for_all_planes_assigns_as_one_plane_after_the_other(seed: int)
     np.testing.assert_array_equal(cloud.claims, nearest_holder(cloud.sample.offsets_m, rasters))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_planes_without_rectangles_claim_in_turn_what_is_nearest(seed: int) -> None:
+    rasters = crossing_rasters(seed, 4)
+    cloud = prepared_cloud(seed)
+    slabs = np.array([raster.slab() for raster in rasters])
+    cloud.claim_in_turn(slabs, np.array([FIND_M, -9.0, 9.0, -9.0, 9.0]))
+    points_m = cloud.sample.offsets_m
+    away_m = np.abs(np.array([raster.plane.distances_m(points_m) for raster in rasters]))
+    nearest = np.where(away_m.min(axis=0) <= FIND_M, away_m.argmin(axis=0), -1)
+    np.testing.assert_array_equal(cloud.claims, nearest)
+
+
 @pytest.mark.parametrize("parts", [1, 3])
 def test_a_plane_alone_has_the_same_sums_in_both_passes(parts: int) -> None:
     (raster,) = crossing_rasters(7, 1)
     cloud = prepared_cloud(7, parts=parts)
-    alone = measure_cells(cloud.points, raster, find_m=FIND_M, fit_m=FIT_M, parts=parts)
+    alone = measure_cells(
+        cloud.points, raster, tolerance_m=FIND_M, fit_tolerance_m=FIT_M, parts=parts
+    )
     (left, top), (rows, columns) = raster.low_m, raster.shape
     table = np.array(
         [[left, top, 1.0 / raster.cell_m, rows, columns, 0, FIT_M, INNER_SHARE * FIND_M]]
@@ -112,9 +125,9 @@ def test_a_plane_alone_has_the_same_sums_in_both_passes(parts: int) -> None:
         sum_assigned(points, slabs, bounds, table, counts[part], sums[part], (1, 0))
 
     each_part(len(cloud.claims), parts, add)
-    n_find, n_inner, n_fit = counts.sum(axis=0).reshape(rows, columns, 3).transpose(2, 0, 1)
+    n_near, n_inner, n_fit = counts.sum(axis=0).reshape(rows, columns, 3).transpose(2, 0, 1)
     steps, squares = sums.sum(axis=0).reshape(rows, columns, 2).transpose(2, 0, 1)
-    np.testing.assert_array_equal(n_find, alone.n_find)
+    np.testing.assert_array_equal(n_near, alone.n_near)
     np.testing.assert_array_equal(n_inner, alone.n_inner)
     np.testing.assert_array_equal(n_fit, alone.n_fit)
     # Of each point the distance is rounded to a step, and is known to a tenth of one in float32.
@@ -283,7 +296,7 @@ def test_passes_have_eight_parts_at_most(asked: int, parts: int) -> None:
 def test_a_point_that_is_no_place_is_refused_though_the_sample_misses_it(
     counts_plan: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sampling, "SAMPLE_POINTS", 10)
+    monkeypatch.setattr(clouds, "SAMPLE_POINTS", 10)
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
     cloud = cloud_of(points)
     missed = np.setdiff1d(np.arange(100), draw_sample(cloud).index)[0]

@@ -1,18 +1,23 @@
-"""What every detector takes and gives: ports, tolerances, constraint, stop rules, thinning."""
+"""What every detector takes, proposes and gives: ports, parameters, metrics, candidates."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import MethodParams, MetricSpec, Ports
 
-if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Family
-    from orthoflow_plugins.plane.noise import CloudNoise
+# Which planes are looked for.
+Constraint = Literal["any", "vertical", "horizontal"]
+# Lowest and highest intensity of each material.
+Materials = Mapping[str, tuple[float, float]]
 
 # What every detector reports.
 DETECTOR_METRICS: Final = (
@@ -71,8 +76,16 @@ DETECTOR_METRICS: Final = (
     MetricSpec("thickness_scan_steps", label="thickness over the point spacing on the first plane"),
     MetricSpec("scan_step_mm", label="point spacing on the first plane, without relief"),
 )
+PAPER: Final = (
+    "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "
+    "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
+)
 
-_FAMILIES: Final[Mapping[str, Family]] = {"any": "any", "vertical": "wall", "horizontal": "level"}
+# Tolerances of a clean scan: that of markiewicz2015, and what mouldings of rooms stay outside of.
+_TOLERANCE_M: Final = 0.05
+_FIT_TOLERANCE_M: Final = 0.015
+# Tolerances per standard deviation of the noise.
+_NOISE_TIMES: Final = 4.0
 
 
 class DetectorIn(Ports):
@@ -88,13 +101,6 @@ class DetectorOut(Ports):
     labels: PointLabels
 
 
-# Tolerances of a clean scan: that of markiewicz2015, and what mouldings of rooms stay outside of.
-_FIND_M: Final = 0.05
-_FIT_M: Final = 0.015
-# Tolerances per standard deviation of the noise.
-_NOISE_TIMES: Final = 4.0
-
-
 class DetectorParams(MethodParams):
     """What every detector takes; the defaults suit rooms and facades scanned at millimetres."""
 
@@ -108,7 +114,7 @@ class DetectorParams(MethodParams):
         description="Points this near to a plane take part in its final fit, metres; at most "
         "`tolerance_m`. auto: 0.015, or four times the noise of single points where that is more.",
     )
-    constraint: Literal["any", "vertical", "horizontal"] = Field(
+    constraint: Constraint = Field(
         "any", description="Which planes are looked for, within `max_tilt_deg`."
     )
     max_tilt_deg: float = Field(
@@ -150,7 +156,6 @@ class DetectorParams(MethodParams):
         default=True,
         description="Parts of one plane that do not touch are one plane; else each is its own.",
     )
-
     materials: dict[str, tuple[float, float]] = Field(
         default_factory=dict,
         description="Lowest and highest intensity (0..1) of each material, by its name, e.g. "
@@ -161,11 +166,6 @@ class DetectorParams(MethodParams):
         description="Fit planes to all their points, the same for every detector; else they stay "
         "as the detector itself gave them.",
     )
-
-    @property
-    def family(self) -> Family:
-        """The planes that `constraint` asks for."""
-        return _FAMILIES[self.constraint]
 
     @field_validator("materials")
     @classmethod
@@ -187,32 +187,66 @@ class DetectorParams(MethodParams):
         return materials
 
     @model_validator(mode="after")
-    def _fit_lies_within_find(self) -> Self:
-        if (
-            self.tolerance_m != "auto"
-            and self.fit_tolerance_m != "auto"
-            and self.fit_tolerance_m > self.tolerance_m
-        ):
+    def _fit_lies_within_tolerance(self) -> Self:
+        given = (self.tolerance_m, self.fit_tolerance_m)
+        if "auto" not in given and self.fit_tolerance_m > self.tolerance_m:  # type: ignore[operator]  # no text is left
             raise ValueError(
                 f"fit_tolerance_m must be at most tolerance_m = {self.tolerance_m:g}, "
                 f"got {self.fit_tolerance_m:g}"
             )
         return self
 
-    def tolerances_m(self, noise: CloudNoise | None) -> tuple[float, float]:
-        """Return the tolerances of finding and of fitting, for a cloud with a noise.
+    def tolerances_m(self, single_m: float, shared_m: float) -> tuple[float, float]:
+        """Return `tolerance_m` and `fit_tolerance_m` of a cloud with a noise.
 
         A plane is told from a filled slab by how its points crowd in the inner half of the
         tolerance: within four standard deviations 95 % do (a normal distribution), within 2.5 no
         more than 80 %, which is refused. Shared errors bend a surface by as much, so they count
-        for finding; for the fit half of that, since a bend is averaged over the whole plane.
+        for `tolerance_m`; for the fit half of that, since a bend is averaged over the whole plane.
+
+        Args:
+            single_m: noise of single points, standard deviation; 0 where it is not known.
+            shared_m: the same with errors that neighbouring points share.
         """
-        single_m = 0.0 if noise is None else noise.single_m
-        shared_m = 0.0 if noise is None else noise.shared_m
         if self.fit_tolerance_m == "auto":
-            fit_m = max(_FIT_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
+            fit_m = max(_FIT_TOLERANCE_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
         else:
             fit_m = self.fit_tolerance_m
         if self.tolerance_m == "auto":
-            return max(_FIND_M, _NOISE_TIMES * shared_m, fit_m), fit_m
+            return max(_TOLERANCE_M, _NOISE_TIMES * shared_m, fit_m), fit_m
         return self.tolerance_m, min(fit_m, self.tolerance_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A plane that a detector proposes.
+
+    Attributes:
+        plane: in the cloud's offsets, a few centimetres or a degree off.
+        constraint: what it may be.
+        votes: the points that speak for it, by the detector's own count.
+        own_tolerance_m: the tolerance that the detector found by itself, or None.
+        start: where the common fit starts, if not from the plane itself.
+    """
+
+    plane: Plane
+    constraint: Constraint
+    votes: float
+    own_tolerance_m: float | None = None
+    start: Plane | None = None
+
+
+def leans_as_asked(
+    normals: NDArray[np.float64],
+    up: NDArray[np.float64],
+    constraint: Constraint,
+    max_tilt_deg: float,
+) -> NDArray[np.bool_]:
+    """Tell which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
+    tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
+    if constraint == "any":
+        return np.ones(len(normals), dtype=bool)
+    within = (
+        tilts_deg <= max_tilt_deg if constraint == "vertical" else tilts_deg >= 90.0 - max_tilt_deg
+    )
+    return np.asarray(within, dtype=np.bool_)

@@ -1,0 +1,472 @@
+"""Fits of a plane: to points of the sample, with a shrinking tolerance, and to the cells on it.
+
+All planes here are in the cloud's own offsets (metres from its origin), so that survey coordinates
+cost no digits; `planes` adds the origin once, at the end.
+
+The fit to cells is robust total least squares, cell by cell. Neighbouring points of a scan share
+errors: relief, bow and plaster waves are larger than the scanner's noise. Here a cell is one
+observation with a variance of its own (surface) plus the noise of its points.
+
+Mouldings, edges and mixed distances put points beside the surface, nearly always on one side of it.
+Three things keep them out: the fit starts at the densest layer of cells instead of their median,
+cells far off lose their weight, and so do cells whose points scatter more than those of others.
+
+A covariance from single points would promise micrometres. Three things are done about it.
+
+- Tiles of cells are the units that err independently: the covariance is that of leaving out one
+  tile after the other (the jackknife of clusters, CR3 in Cameron & Miller 2015, section VI.B),
+  which is still right with few tiles. Of several sizes of tile the one with the largest variance
+  holds: as long as tiles are smaller than the reach of the correlation, it grows with their size.
+- Cells that lose their weight as they move away tell less than their weights say: the covariance
+  grows by the derivative of the influence function (Huber & Ronchetti 2009, section 7.6).
+- Mouldings and mixed distances lie on one side and bias the fit, which no scatter shows. How far
+  the plane moves when cells twice as far away may take part shows it; that is added as a component
+  of its own (GUM, JCGM 100:2008, 4.3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane
+from orthoflow_plugins.plane.kernels import FREE, LEVEL, VERTICAL, refine_robustly
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
+from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
+
+# What a fit may change: everything, or a normal kept exactly horizontal, or kept along up; and
+# which of height, slope along u and slope along v are its unknowns then.
+Freedom = Literal["free", "vertical", "horizontal"]
+_KERNEL_FREEDOMS: Final[dict[Freedom, int]] = {
+    "free": FREE,
+    "vertical": VERTICAL,
+    "horizontal": LEVEL,
+}
+_UNKNOWNS: Final[dict[Freedom, tuple[int, ...]]] = {
+    "free": (0, 1, 2),
+    "vertical": (0, 1),
+    "horizontal": (0,),
+}
+
+# In standard deviations of a cell: beyond, a cell has no weight (Beaton & Tukey 1974).
+_TUKEY: Final = 3.5
+# Cells nearer than this share of the limit have all their weight. Would it fade from the plane on,
+# as Tukey's does, each way to cut a wall into cells would weigh the same points differently: a
+# seventh of what they say would be lost, and a turned wall found elsewhere by half its sigma.
+_FULL_SHARE: Final = 0.571
+# The densest layer holds this share of the cells; a normal distribution holds it within +-0.385.
+_LAYER_SHARE: Final = 0.3
+_LAYER_SIGMAS: Final = 0.7706
+# What is usual near a cell counts beside its own variance as if it had so many points.
+_USUAL_POINTS: Final = 40
+# What is usual is the median of blocks so wide, if they hold so many cells.
+_BLOCK_CELLS: Final = 8
+_BLOCK_LEAST: Final = 12
+_CHANCE_SIGMAS: Final = 3.0
+_STEPS_MOST: Final = 30
+# A fit has settled when none of its cells moves by more than this.
+SETTLED_M: Final = 1e-7
+# What a surface is never flatter than, so that a perfectly flat simulation has weights too.
+_FLATTEST_M: Final = 2e-5
+
+# Tiles that the covariance is estimated from, cells wide; fewer tiles do not show a spread.
+_TILE_CELLS: Final = (2, 4, 8, 16)
+_TILES_LEAST: Final = 8
+# The derivative of the influence function is trusted down to this share of the weights.
+_FLATTENING_LEAST: Final = 0.3
+_STEADY: Final = 1e-6
+_WIDER: Final = 2.0
+_WIDER_STEPS: Final = 3
+
+
+def shrinking_tolerances(tolerance_m: float, fit_tolerance_m: float) -> tuple[float, ...]:
+    """Tolerances to fit with, one after the other: 5 cm, 2.7 cm and 1.5 cm for the defaults.
+
+    A fit at 5 cm finds the wall but is pulled by mouldings and the floor's edge; a fit at 1.5 cm is
+    exact but would not get there from a rough start.
+    """
+    if fit_tolerance_m >= tolerance_m:
+        return (tolerance_m,)
+    return (tolerance_m, math.sqrt(tolerance_m * fit_tolerance_m), fit_tolerance_m)
+
+
+def refine_plane(
+    points: NDArray[np.float64],
+    start: Plane,
+    *tolerances_m: float,
+    freedom: Freedom,
+    up: NDArray[np.float64],
+) -> Plane | None:
+    """Move a plane to the densest layer of points near it: total least squares, reweighted.
+
+    Args:
+        points: (m, 3) offsets, metres.
+        start: plane to start from.
+        tolerances_m: points further away have no weight (Tukey's weights); one after the other.
+        freedom: what may change.
+        up: (3,) unit vector.
+
+    Returns:
+        The plane, or None where fewer than three points or only a line of points support it.
+    """
+    # Every other point of an array, or all: one kernel for both.
+    packed = np.ascontiguousarray(points)
+    for tolerance_m in tolerances_m:
+        row = np.append(start.normal, start.offset_m)
+        if not refine_robustly(packed, row, tolerance_m, _KERNEL_FREEDOMS[freedom], up):
+            return None
+        # Twice, because Plane accepts no length that is off by more than rounding.
+        normal = row[:3] / np.linalg.norm(row[:3])
+        start = Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
+    return start
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellHeights:
+    """Cells as observations of the height over a plane that is nearly right.
+
+    Attributes:
+        design: (n, p) derivatives of a height by the unknowns.
+        heights_m: (n,) mean height of the points of each cell.
+        noise_m2: (n,) variance of that mean by the noise of the points.
+        mixture_m2: (n,) its variance by points that do not belong to the surface.
+        rows: (n,) place of the cell on the plane.
+        columns: see rows.
+    """
+
+    design: NDArray[np.float64]
+    heights_m: NDArray[np.float64]
+    noise_m2: NDArray[np.float64]
+    mixture_m2: NDArray[np.float64]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellFit:
+    """A robust fit to cells.
+
+    Attributes:
+        observed: the cells.
+        solution: (p,) the unknowns.
+        limit_m: (n,) residual at which a cell has no weight any more.
+        variance_m2: (n,) variance of each cell.
+    """
+
+    observed: CellHeights
+    solution: NDArray[np.float64]
+    limit_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+
+    def residuals_m(self) -> NDArray[np.float64]:
+        """(n,) heights above the plane."""
+        return np.asarray(self.observed.heights_m - self.observed.design @ self.solution)
+
+    def faded(self) -> NDArray[np.float64]:
+        """(n,) how far residuals are from where weights begin to fade, 0, to the limit, 1."""
+        beyond = (np.abs(self.residuals_m() / self.limit_m) - _FULL_SHARE) / (1.0 - _FULL_SHARE)
+        return np.clip(beyond, 0.0, 1.0)
+
+    def weights(self) -> NDArray[np.float64]:
+        """(n,) robust weights over the variances: all, then Tukey's as residuals near the limit."""
+        return (1.0 - self.faded() ** 2) ** 2 / self.variance_m2
+
+    def stepped(self) -> CellFit | None:
+        """Solve with the weights of this one; None where the cells do not fix a plane."""
+        weighted = self.weights() * self.observed.design.T
+        normal_matrix = weighted @ self.observed.design
+        extremes = np.abs(np.linalg.eigvalsh(normal_matrix))
+        if extremes.max() > 1e12 * extremes.min():
+            return None
+        solution = np.linalg.solve(normal_matrix, weighted @ self.observed.heights_m)
+        return replace(self, solution=np.asarray(solution, dtype=np.float64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustedPlane:
+    """A plane fitted to cells.
+
+    Attributes:
+        plane: in the cloud's offsets.
+        moved_m: how far the fit moved a corner of the cells at most.
+        bend_per_m: strongest curvature of the surface that the cells show, 1 over its radius.
+        bend_share: share of the cells' variance that this curvature explains.
+        fit: the fit to the cells.
+        jacobian: (4, p) of (normal, offset) by the unknowns of the fit.
+    """
+
+    plane: Plane
+    moved_m: float
+    bend_per_m: float
+    bend_share: float
+    fit: CellFit
+    jacobian: NDArray[np.float64]
+
+    def stated(self) -> tuple[NDArray[np.float64], float]:
+        """State the covariance (4, 4) of (normal, offset), in offsets.
+
+        Returns:
+            The covariance, and how many cells without common errors would fix the plane as well.
+        """
+        covariance, n_independent = stated_covariance(self.fit)
+        return self.jacobian @ covariance @ self.jacobian.T, n_independent
+
+
+def adjust_plane(
+    raster: SurfaceRaster,
+    sums: CellSums,
+    cells: NDArray[np.bool_],
+    *,
+    fit_tolerance_m: float,
+    freedom: Freedom,
+    settled_m: float = SETTLED_M,
+) -> AdjustedPlane | None:
+    """Fit the plane to the mean distances of cells; to second order this is total least squares.
+
+    Args:
+        raster: cells on a plane that is nearly right.
+        sums: their sums.
+        cells: (rows, columns) bool, which of them belong.
+        fit_tolerance_m: tolerance the sums were made with.
+        freedom: what may change.
+        settled_m: the fit ends when no cell moves by more.
+
+    Returns:
+        The plane, or None where the cells do not fix it.
+    """
+    rows, columns = np.nonzero(cells & (sums.n_fit > 0))
+    if len(rows) < 4:
+        return None
+    step_m = fit_tolerance_m / STEPS_PER_TOLERANCE
+    number = sums.n_fit[rows, columns]
+    heights_m = sums.steps[rows, columns] / number * step_m
+    squares_m2 = sums.squared_steps[rows, columns] / number * step_m**2
+    noise_m2, mixture_m2 = _cell_variances(
+        squares_m2 - heights_m**2, number, rows, columns, fit_tolerance_m
+    )
+    u, v = (centres[rows, columns] for centres in raster.centres_m())
+    centre = np.array([u.mean(), v.mean()])
+    full = np.column_stack([np.ones(len(rows)), u - centre[0], v - centre[1]])
+    unknowns = list(_UNKNOWNS[freedom])
+    fit = _solved(
+        CellHeights(
+            design=full[:, unknowns],
+            heights_m=heights_m,
+            noise_m2=noise_m2,
+            mixture_m2=mixture_m2,
+            rows=rows,
+            columns=columns,
+        ),
+        settled_m,
+    )
+    if fit is None:
+        return None
+    change = np.zeros(3)
+    change[unknowns] = fit.solution
+    plane, jacobian = _tilted(raster, change, centre)
+    bend_per_m, bend_share = _bend(full, heights_m)
+    return AdjustedPlane(
+        plane=plane,
+        moved_m=float(np.abs(full @ change).max()),
+        bend_per_m=bend_per_m,
+        bend_share=bend_share,
+        fit=fit,
+        jacobian=jacobian[:, unknowns],
+    )
+
+
+def _cell_variances(
+    spread_m2: NDArray[np.float64],
+    number: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    fit_tolerance_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variance of each cell's mean by the noise of its points, and by points that do not belong.
+
+    A share of points spread evenly from the surface to the tolerance D, as mixed distances are,
+    adds share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2: the mean is
+    off by 1.5 / D times the variance in excess of what is usual thereabouts: the median of the
+    cells in its block, since noise differs with incidence and cloth.
+    """
+    free = np.maximum(number - 1, 0)
+    own = np.maximum(spread_m2, 0.0) * number / np.maximum(free, 1)
+    several = number >= 3
+    overall = float(np.median(own[several])) if several.any() else float(own.mean())
+    across = int(columns.max()) // _BLOCK_CELLS + 1
+    block = rows // _BLOCK_CELLS * across + columns // _BLOCK_CELLS
+    n_blocks = across * (int(rows.max()) // _BLOCK_CELLS + 1)
+    order = np.argsort(own)
+    # Sixteen bits, so that the sort takes no comparisons.
+    narrow = block[order].astype(np.uint16 if n_blocks <= 65536 else np.int64)
+    order = order[np.argsort(narrow, kind="stable")]
+    count = np.bincount(block, minlength=n_blocks)
+    first = np.cumsum(count) - count
+    held = count >= _BLOCK_LEAST
+    middle = np.full(n_blocks, overall)
+    middle[held] = own[order[(first + count // 2)[held]]]
+    usual = np.maximum(middle[block], 0.1 * overall)
+    blended = (own * free + _USUAL_POINTS * usual) / (free + _USUAL_POINTS)
+    by_chance = usual * (1.0 + _CHANCE_SIGMAS * np.sqrt(2.0 / np.maximum(free, 1)))
+    excess = np.where(own > by_chance, own - usual, 0.0)
+    return blended / number, (1.5 * excess / fit_tolerance_m) ** 2
+
+
+def _solved(observed: CellHeights, settled_m: float) -> CellFit | None:
+    """Weighted least squares with the cells' own variance estimated along; outliers lose weight."""
+    solution = np.zeros(observed.design.shape[1])
+    solution[0] = _densest_layer(observed.heights_m)[0]
+    noise_m2 = float(np.median(observed.noise_m2 + observed.mixture_m2))
+    for _ in range(_STEPS_MOST):
+        residuals = observed.heights_m - observed.design @ solution
+        scale_m = max(_densest_layer(residuals)[1], _FLATTEST_M)
+        surface_m2 = max(scale_m**2 - noise_m2, _FLATTEST_M**2)
+        fit = CellFit(
+            observed=observed,
+            solution=solution,
+            limit_m=_TUKEY * np.sqrt(surface_m2 + observed.noise_m2),
+            variance_m2=surface_m2 + observed.noise_m2 + observed.mixture_m2,
+        ).stepped()
+        if fit is None:
+            return None
+        moved_m = float(np.abs(observed.design @ (fit.solution - solution)).max())
+        solution = fit.solution
+        if moved_m < settled_m:
+            break
+    return fit
+
+
+def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
+    """Middle of the shortest interval that holds a share of the heights, and the spread it shows.
+
+    The "shorth" of Rousseeuw & Leroy 1987 with a smaller share: a panel that covers half of a wall
+    does not move it.
+    """
+    ordered = np.sort(heights_m)
+    held = max(2, int(_LAYER_SHARE * len(ordered)))
+    lengths = ordered[held - 1 :] - ordered[: len(ordered) - held + 1]
+    first = int(np.argmin(lengths))
+    middle = 0.5 * float(ordered[first + (held - 1) // 2] + ordered[first + held // 2])
+    return middle, float(lengths[first]) / _LAYER_SIGMAS
+
+
+def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
+    """Curvature of the cells' heights, and the share of their variance that it explains."""
+    reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
+    # In units of the reach, so that the normal equations are well conditioned.
+    u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
+    curved = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
+    normal_matrix, right = curved.T @ curved, curved.T @ heights_m
+    squares = float(heights_m @ heights_m)
+    flat = np.linalg.lstsq(normal_matrix[:3, :3], right[:3])[0]
+    terms = np.linalg.lstsq(normal_matrix, right)[0]
+    variance = squares - float(flat @ right[:3])
+    if variance < len(heights_m) * _FLATTEST_M**2:
+        return 0.0, 0.0
+    hessian = np.array([[2.0 * terms[3], terms[4]], [terms[4], 2.0 * terms[5]]]) / reach_m**2
+    strongest = float(np.abs(np.linalg.eigvalsh(hessian)).max())
+    return strongest, 1.0 - max(0.0, squares - float(terms @ right)) / variance
+
+
+def _tilted(
+    raster: SurfaceRaster, change: NDArray[np.float64], centre: NDArray[np.float64]
+) -> tuple[Plane, NDArray[np.float64]]:
+    """Apply height and slopes at a point of the plane; gives the Jacobian (4, 3) too."""
+    height_m, slope_u, slope_v = change
+    u, v = raster.axes
+    normal = raster.plane.normal - slope_u * u - slope_v * v
+    offset_m = raster.plane.offset_m + height_m - slope_u * centre[0] - slope_v * centre[1]
+    length = float(np.linalg.norm(normal))
+    jacobian = np.zeros((4, 3))
+    jacobian[:3, 1], jacobian[:3, 2] = -u, -v
+    jacobian[3] = (1.0, -centre[0], -centre[1])
+    normal = normal / length
+    # Twice, because Plane accepts no length that is off by more than rounding.
+    plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length)
+    return plane, jacobian
+
+
+def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
+    """State the covariance of a robust fit to cells, correlated and one-sided errors included.
+
+    Returns:
+        (p, p) of the unknowns, and how many cells without common errors would fix them as well.
+    """
+    observed, design, weights = fit.observed, fit.observed.design, fit.weights()
+    used = weights > 0.0
+    design_used, weights_used = design[used], weights[used]
+    scores = (weights_used * fit.residuals_m()[used])[:, None] * design_used
+    products = (weights_used[:, None] * design_used)[:, :, None] * design_used[:, None, :]
+    rows, columns = observed.rows[used], observed.columns[used]
+    factor = _flattening(fit, weights) ** -2
+    largest = np.zeros((design.shape[1],) * 2)
+    inverse = np.linalg.inv(products.sum(axis=0))
+    # Every cell a tile of its own; what one of them has in the solution is too little to matter.
+    alone = before = _mean_variance(design, factor * inverse @ (scores.T @ scores) @ inverse)
+    reach = -math.inf
+    for size in _TILE_CELLS:
+        tile = rows // size * (int(columns.max()) // size + 1) + columns // size
+        if np.count_nonzero(np.bincount(tile)) < _TILES_LEAST and math.isfinite(reach):
+            break
+        covariance = factor * _left_out(scores, products, tile)
+        variance = _mean_variance(design, covariance)
+        if variance > reach:
+            # Tiles twice as wide add as much again: what crosses their rims halves with each step.
+            beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
+            largest, reach = beyond * covariance, variance
+        before = variance
+    moved = _moved_by_more(fit)
+    covariance = largest + np.outer(moved, moved)
+    variance = _mean_variance(design, covariance)
+    effective = float(weights.sum() ** 2 / np.sum(weights**2))
+    return covariance, effective * alone / variance if variance else effective
+
+
+def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    """Mean variance of the plane's height over its cells: one number to compare covariances by."""
+    return float(np.sum((design @ covariance) * design)) / len(design)
+
+
+def _left_out(
+    scores: NDArray[np.float64], products: NDArray[np.float64], tile: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Covariance by how far the unknowns move when each tile in turn is left out."""
+    held = np.bincount(tile) > 0
+    n_tiles, size = int(np.count_nonzero(held)), scores.shape[1]
+    sums = np.column_stack([np.bincount(tile, column)[held] for column in scores.T])
+    parts = np.empty((n_tiles, size, size))
+    for i in range(size):
+        for j in range(i, size):
+            parts[:, i, j] = parts[:, j, i] = np.bincount(tile, products[:, i, j])[held]
+    whole = parts.sum(axis=0)
+    # A tile without which the rest fixes no plane: its part is damped.
+    without = whole - parts + _STEADY * np.diag(np.diag(whole))
+    moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
+    return (n_tiles - 1) / n_tiles * (moves.T @ moves)
+
+
+def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
+    """Share of the weights that the derivative of the influence function leaves."""
+    design, faded = fit.observed.design, fit.faded()
+    inside = 1.0 - faded**2
+    ratios = fit.residuals_m() / fit.limit_m
+    falls = 4.0 * faded * np.abs(ratios) / (1.0 - _FULL_SHARE)
+    slopes = inside * (inside - falls) / fit.variance_m2
+    by_weights = float(np.trace(design.T @ (weights[:, None] * design)))
+    by_slopes = float(np.trace(design.T @ (slopes[:, None] * design)))
+    return max(_FLATTENING_LEAST, by_slopes / by_weights)
+
+
+def _moved_by_more(fit: CellFit) -> NDArray[np.float64]:
+    """How far the unknowns move when cells twice as far away may take part."""
+    wider = replace(fit, limit_m=_WIDER * fit.limit_m)
+    for _ in range(_WIDER_STEPS):
+        stepped = wider.stepped()
+        if stepped is None:
+            break
+        wider = stepped
+    return wider.solution - fit.solution

@@ -1,0 +1,615 @@
+"""Found planes turned into products: deviations, sides, order, names, rectangles in the world.
+
+Deviations are of all points, in one pass. markiewicz2015 takes a plane as correct when they look
+normal (Figures 6c to 14c). With a million points every formal test rejects, so the departure itself
+is stated: skewness, excess kurtosis, shares within one, two and three standard deviations, and
+quantile against quantile.
+
+Which side of a plane the viewer is on is asked of the scanner stations, else guessed from points.
+The wrong side mirrors every image of the wall, so a guess is always reported as one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane, omega_phi_deg, wall_axes
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
+from orthoflow.geometry.rows import Rows
+from orthoflow.products import JsonValue, Planes, PointCloud, SideSource, plane_name
+from orthoflow.products.planes import PlaneKind
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.candidates import FoundPlane
+from orthoflow_plugins.plane.cloud import PreparedCloud
+from orthoflow_plugins.plane.kernels import each_part, piece_of
+from orthoflow_plugins.plane.slab_kernels import (
+    HISTOGRAM_BINS,
+    STEPS_PER_TOLERANCE,
+    measure_deviations,
+)
+from orthoflow_plugins.plane.support import SurfaceRaster
+
+Viewpoint = Literal["stations", "view_from", "guess"]
+
+# Points that are too few to speak of a distribution.
+_DISTRIBUTION_LEAST: Final = 100
+_PROBABILITIES: Final = (
+    0.001, 0.0025, 0.005, 0.01, 0.025, *(0.05 * step for step in range(1, 20)),
+    0.975, 0.99, 0.995, 0.9975, 0.999,
+)  # fmt: skip
+# Points of a plane, and of all, that are asked for its side.
+_MEMBERS_MOST: Final = 5000
+_WITNESSES_MOST: Final = 40_000
+# Cosine of 20 degrees.
+_PARALLEL: Final = 0.94
+# A station nearer to the plane than this stands in it, and says nothing about its side.
+_CLEAR_M: Final = 0.05
+# Beyond this distance a point counts no more for the side of the room than a nearer one.
+_FULL_VOTE_M: Final = 1.0
+# Points may project this far outside the rectangle: floor and ceiling lie at its edges.
+_BESIDE_M: Final = 0.3
+# A verdict below this share of all points, each just clear of the plane, is none.
+_DOUBT: Final = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviations(Rows):
+    """How far the points of each plane lie from it.
+
+    Attributes:
+        n_points: (k,) int64 points that belong to the plane.
+        rms_m: (k,) root mean square of their distances.
+        n_fit: (k,) int64 those of them within the tolerance of the fit.
+        rms_fit_m: (k,) root mean square of the distances of those.
+        mean_fit_m: (k,) mean of the distances of those.
+        histogram: (k, bins) points per bin of -tolerance_m..tolerance_m.
+        extents_m: (k, 4) smallest and largest u, smallest and largest v of the points within the
+            tolerance of the fit in the plane's rectangle.
+        tolerance_m: of belonging.
+        fit_tolerance_m: of the fit.
+    """
+
+    n_points: NDArray[np.int64]
+    rms_m: NDArray[np.float64]
+    n_fit: NDArray[np.int64]
+    rms_fit_m: NDArray[np.float64]
+    mean_fit_m: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+    extents_m: NDArray[np.float64]
+    tolerance_m: float
+    fit_tolerance_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normality:
+    """Shape of a distribution of distances.
+
+    Attributes:
+        mean_m: their mean.
+        sigma_m: their standard deviation.
+        skewness: third standardised moment, 0 for a normal distribution.
+        excess_kurtosis: fourth standardised moment less 3, 0 for a normal distribution.
+        within: shares within 1, 2 and 3 sigma of the mean; 0.683, 0.954, 0.997 if normal.
+        expected_sigmas: (q,) quantiles of the normal distribution.
+        found_sigmas: (q,) the same quantiles of the distances from their mean, over sigma.
+    """
+
+    mean_m: float
+    sigma_m: float
+    skewness: float
+    excess_kurtosis: float
+    within: tuple[float, ...]
+    expected_sigmas: NDArray[np.float64]
+    found_sigmas: NDArray[np.float64]
+
+    def to_json(self) -> JsonValue:
+        """Numbers for the planes' details."""
+        return {
+            "mean_m": self.mean_m,
+            "sigma_m": self.sigma_m,
+            "skewness": self.skewness,
+            "excess_kurtosis": self.excess_kurtosis,
+            "within_sigmas": list(self.within),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawPlane:
+    """What a detector itself gave for a plane, before the common fit; world.
+
+    Attributes:
+        plane: its normal to the same side as that of the fit.
+        votes: the points that speak for it, by the detector's own count.
+        own_tolerance_m: the tolerance that the detector found itself, or None.
+    """
+
+    plane: Plane
+    votes: float
+    own_tolerance_m: float | None
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Numbers for the planes' details."""
+        return {
+            "normal": [float(value) for value in self.plane.normal],
+            "offset_m": self.plane.offset_m,
+            "support": self.votes,
+            "own_tolerance_m": self.own_tolerance_m,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FacedPlane:
+    """A plane with its normal towards the viewer and its rectangles, in the cloud's offsets.
+
+    Attributes:
+        plane: the plane.
+        corners_m: (4, 3) top-left first, counter-clockwise for the viewer.
+        part_corners_m: (p, 4, 3) the same of each connected part.
+        is_guessed: no station decided about the side.
+    """
+
+    plane: Plane
+    corners_m: NDArray[np.float64]
+    part_corners_m: NDArray[np.float64]
+    is_guessed: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly:
+    """The products of a detector, and what else is known about them.
+
+    Attributes:
+        planes: ordered by support.
+        labels_from_claims: (k + 1,) int16 label of each claim; the last entry is for -1.
+        deviations: of the planes in their final order.
+        n_guessed: planes whose side was guessed.
+        raw: of each plane what its detector itself gave.
+        normalities: of each plane how normal its deviations are, None where it has too few points.
+        n_independent: of each plane, how many cells without common errors would fix it as well.
+    """
+
+    planes: Planes
+    labels_from_claims: NDArray[np.int16]
+    deviations: Deviations
+    n_guessed: int
+    raw: tuple[RawPlane, ...]
+    normalities: tuple[Normality | None, ...]
+    n_independent: tuple[float, ...]
+
+
+def assemble(
+    found: list[FoundPlane],
+    prepared: PreparedCloud,
+    cloud: PointCloud,
+    tolerance_m: float,
+    fit_tolerance_m: float,
+) -> Assembly:
+    """Measure planes on their claimed points, and give them their side, order and names."""
+    deviations = measure_planes(
+        prepared,
+        np.array([item.raster.slab() for item in found]),
+        np.array([item.support.bounds_m for item in found]),
+        tolerance_m=tolerance_m,
+        fit_tolerance_m=fit_tolerance_m,
+    )
+    order = np.argsort(-deviations.n_points, kind="stable")
+    ordered = deviations.take(order)
+    items = [found[k] for k in order]
+    faced = [_faced(found, int(k), deviations, prepared, cloud) for k in order]
+    flips = np.array(
+        [
+            float(side.plane.normal @ item.raster.plane.normal) < 0.0
+            for side, item in zip(faced, items, strict=True)
+        ]
+    )
+    # Histograms and means follow the normal when it was turned.
+    ordered.histogram[flips] = ordered.histogram[flips][:, ::-1]
+    ordered.mean_fit_m[flips] *= -1.0
+    normalities = tuple(
+        normality(row, tolerance_m=tolerance_m, fit_tolerance_m=ordered.fit_tolerance_m)
+        for row in ordered.histogram
+    )
+    raw = tuple(_raw(item, side.plane, cloud) for item, side in zip(items, faced, strict=True))
+    stated = [item.adjusted.stated() for item in items]
+    n_independent = tuple(n for _, n in stated)
+    is_guessed = [item.is_guessed for item in faced]
+    viewpoint: Viewpoint = "guess" if all(is_guessed) else known_viewpoint(cloud)
+    known: SideSource = "given" if viewpoint == "view_from" else "stations"
+    sides = tuple[SideSource, ...]("guess" if guessed else known for guessed in is_guessed)
+    planes = planes_of(
+        faced,
+        ordered,
+        cloud,
+        # Normal and offset change sign together, so that their covariance stays as it is.
+        covariances=[covariance for covariance, _ in stated],
+        viewpoint=viewpoint,
+        side_from=sides if len(set(is_guessed)) > 1 else (),
+        details={
+            "fit_n_points": [int(n) for n in ordered.n_fit],
+            "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
+            "n_independent": list(n_independent),
+            "normality": [None if item is None else item.to_json() for item in normalities],
+            "fit_tolerance_m": ordered.fit_tolerance_m,
+            "raw": [item.to_json() for item in raw],
+            "guessed_sides": [int(k) for k in np.flatnonzero(is_guessed)],
+        },
+    )
+    labels = np.full(len(found) + 1, -1, dtype=np.int16)
+    labels[order] = np.arange(len(found), dtype=np.int16)
+    return Assembly(
+        planes=planes,
+        labels_from_claims=labels,
+        deviations=ordered,
+        n_guessed=sum(is_guessed),
+        raw=raw,
+        normalities=normalities,
+        n_independent=n_independent,
+    )
+
+
+def planes_of(
+    faced: Sequence[FacedPlane],
+    deviations: Deviations,
+    cloud: PointCloud,
+    *,
+    covariances: Sequence[NDArray[np.float64]],
+    viewpoint: str,
+    side_from: tuple[SideSource, ...] = (),
+    details: dict[str, JsonValue] | None = None,
+) -> Planes:
+    """Make the product of planes in their order; covariances (4, 4) are of (normal, offset)."""
+    normals = np.array([item.plane.normal for item in faced])
+    heights_m = np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced])
+    n_parts = [len(item.part_corners_m) for item in faced]
+    return Planes(
+        normal=normals,
+        offset=np.array([_world(item.plane, cloud).offset_m for item in faced]),
+        corners=np.array([cloud.origin + item.corners_m for item in faced]),
+        covariance=np.array([_world_covariance(matrix, cloud) for matrix in covariances]),
+        n_points=deviations.n_points,
+        rms_m=deviations.rms_m,
+        up=cloud.up.copy(),
+        names=plane_names(normals, heights_m, cloud.up),
+        part_corners=np.concatenate([cloud.origin + item.part_corners_m for item in faced]),
+        part_plane=np.repeat(np.arange(len(faced), dtype=np.int32), n_parts),
+        viewpoint=viewpoint,
+        side_from=side_from,
+        tolerance_m=deviations.tolerance_m,
+        details=details or {},
+    )
+
+
+def report_planes(
+    ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int, n_guessed: int
+) -> None:
+    """Report number and shares of planes, and where the first lies; warn of guessed sides."""
+    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
+    ctx.metric("n_planes", len(planes), "1")
+    ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
+    ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    if n_guessed:
+        ctx.warn(
+            f"no scanner station says from which side {n_guessed} of {len(planes)} planes were "
+            "seen; the side with more of the other points was taken, unless photos decide later "
+            "(face.photos): if an image comes out mirrored, set view_from of read.scan"
+        )
+
+
+def plane_names(
+    normals: NDArray[np.float64], heights_m: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """Name planes by what they are: `wall 0`, `floor 1`, `ceiling 2`, `level 4`, `slope 5`.
+
+    The number is the plane's position in the product, as in the files wall_<k>_*.tif. The floor is
+    the lowest level plane that is seen from above, the ceiling the highest that is seen from below.
+
+    Args:
+        normals: (k, 3) towards the viewer.
+        heights_m: (k,) along up.
+        up: (3,) unit vector.
+    """
+    rises = normals @ up
+    level = np.abs(rises) > math.cos(math.radians(LEVEL_LIMIT_DEG))
+    kinds: list[PlaneKind] = [
+        "level" if level[i] else "wall" if abs(rises[i]) < 0.5 else "slope"
+        for i in range(len(normals))
+    ]
+    seen_from_above = np.flatnonzero(level & (rises > 0.0))
+    seen_from_below = np.flatnonzero(level & (rises < 0.0))
+    if len(seen_from_above):
+        kinds[int(seen_from_above[np.argmin(heights_m[seen_from_above])])] = "floor"
+    if len(seen_from_below):
+        kinds[int(seen_from_below[np.argmax(heights_m[seen_from_below])])] = "ceiling"
+    return tuple(plane_name(kind, place) for place, kind in enumerate(kinds))
+
+
+def measure_planes(
+    cloud: PreparedCloud,
+    slabs: NDArray[np.float64],
+    bounds_m: NDArray[np.float64],
+    *,
+    tolerance_m: float,
+    fit_tolerance_m: float,
+) -> Deviations:
+    """Measure the deviations of all claimed points in one pass.
+
+    Args:
+        cloud: the cloud with its claims.
+        slabs: (k, 12) the planes.
+        bounds_m: (k, 4) their rectangles, smallest and largest u, smallest and largest v.
+        tolerance_m: of belonging.
+        fit_tolerance_m: of the fit.
+    """
+    parts, count = cloud.parts, len(slabs)
+    sums = np.zeros((parts, count, 6), dtype=np.int64)
+    histogram = np.zeros((parts, count, HISTOGRAM_BINS), dtype=np.int64)
+    extents = np.tile([np.inf, -np.inf, np.inf, -np.inf], (parts, count, 1))
+    fit_tolerance_m = min(fit_tolerance_m, tolerance_m)
+    reaches_m = np.tile([tolerance_m, fit_tolerance_m], (count, 1))
+    limits = np.column_stack([reaches_m, bounds_m])
+
+    def measure(part: int, piece: slice) -> None:
+        points, claims = piece_of(cloud.points, piece), cloud.claims[piece]
+        tables = (sums[part], histogram[part], extents[part])
+        measure_deviations(points, claims, slabs, limits, *tables)
+
+    each_part(len(cloud.claims), parts, measure)
+    n_points, _, squares, n_fit, steps_fit, squares_fit = sums.sum(axis=0).T
+    step_m = fit_tolerance_m / STEPS_PER_TOLERANCE
+    low, high = extents.min(axis=0), extents.max(axis=0)
+    reached = np.column_stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]])
+    return Deviations(
+        n_points=n_points,
+        rms_m=np.sqrt(squares / np.maximum(n_points, 1)) * step_m,
+        n_fit=n_fit,
+        rms_fit_m=np.sqrt(squares_fit / np.maximum(n_fit, 1)) * step_m,
+        mean_fit_m=steps_fit / np.maximum(n_fit, 1) * step_m,
+        histogram=histogram.sum(axis=0),
+        # A later, nearer plane may have taken every point within the tolerance of the fit.
+        extents_m=np.where(np.isfinite(reached), reached, bounds_m),
+        tolerance_m=tolerance_m,
+        fit_tolerance_m=fit_tolerance_m,
+    )
+
+
+def normality(
+    histogram: NDArray[np.int64], *, tolerance_m: float, fit_tolerance_m: float
+) -> Normality | None:
+    """Judge the distances that a histogram over +-tolerance_m holds within the fit's tolerance.
+
+    Returns:
+        Their shape, or None where there are too few, or all in one bin.
+    """
+    edges_m = np.linspace(-tolerance_m, tolerance_m, len(histogram) + 1)
+    middles_m = 0.5 * (edges_m[1:] + edges_m[:-1])
+    held = np.abs(middles_m) <= fit_tolerance_m
+    counts, middles_m = histogram[held].astype(np.float64), middles_m[held]
+    total = float(counts.sum())
+    if total < _DISTRIBUTION_LEAST:
+        return None
+    width_m = 2.0 * tolerance_m / len(histogram)
+    mean_m = float(counts @ middles_m) / total
+    away_m = middles_m - mean_m
+    second, third, fourth = (float(counts @ away_m**power) / total for power in (2, 3, 4))
+    # Sheppard's corrections: within a bin, points spread over its width.
+    fourth += -0.5 * second * width_m**2 + 7.0 / 240.0 * width_m**4
+    second -= width_m**2 / 12.0
+    if second <= 0.0:
+        return None
+    sigma_m = math.sqrt(second)
+    below = np.concatenate([[0.0], np.cumsum(counts)]) / total
+    rims_m = np.append(middles_m - 0.5 * width_m, middles_m[-1] + 0.5 * width_m)
+    quantiles_m = np.interp(_PROBABILITIES, below, rims_m)
+
+    def share(reach: float) -> float:
+        low, high = np.interp([mean_m - reach * sigma_m, mean_m + reach * sigma_m], rims_m, below)
+        return float(high - low)
+
+    return Normality(
+        mean_m=mean_m,
+        sigma_m=sigma_m,
+        skewness=third / sigma_m**3,
+        excess_kurtosis=fourth / second**2 - 3.0,
+        within=(share(1.0), share(2.0), share(3.0)),
+        expected_sigmas=np.array([NormalDist().inv_cdf(p) for p in _PROBABILITIES]),
+        found_sigmas=(quantiles_m - mean_m) / sigma_m,
+    )
+
+
+def known_viewpoint(cloud: PointCloud) -> Viewpoint:
+    """Return what is known about where the cloud was seen from."""
+    if cloud.stations is None or len(cloud.stations) == 0:
+        return "guess"
+    return "view_from" if cloud.stations_source == "view_from" else "stations"
+
+
+def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) middle of the stations, of some points of the cloud where none is known; offsets."""
+    if cloud.stations is None or len(cloud.stations) == 0:
+        return np.asarray(np.median(points_m, axis=0))
+    return np.asarray(cloud.stations.mean(axis=0) - cloud.origin)
+
+
+def rectangle_m(
+    plane: Plane, axes: NDArray[np.float64], bounds_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
+
+    Args:
+        plane: the plane, normal towards the viewer.
+        axes: (2, 3) u to the viewer's right and v down (`wall_axes`).
+        bounds_m: (4,) smallest and largest u, smallest and largest v.
+    """
+    left, right, top, bottom = bounds_m
+    around = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
+    return around @ axes + plane.offset_m * plane.normal
+
+
+def face(
+    raster: SurfaceRaster,
+    extent_m: NDArray[np.float64],
+    parts_m: NDArray[np.float64],
+    side: int,
+    up: NDArray[np.float64],
+    *,
+    is_guessed: bool,
+) -> FacedPlane:
+    """Turn a plane with the (4,) extent of its points and of its parts (p, 4) to a side.
+
+    Parts are known to a cell; none reaches beyond the points that are there.
+    """
+    parts_m = np.clip(parts_m, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]])
+    corners = [rectangle_m(raster.plane, raster.axes, bounds) for bounds in (extent_m, *parts_m)]
+    plane = raster.plane.flipped() if side < 0 else raster.plane
+    axes = wall_axes(plane.normal, up)
+    around = []
+    for corners_m in corners:
+        # The rectangle along the other axes that encloses it: for a flip the same one.
+        placed = corners_m @ axes.T
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        around.append(rectangle_m(plane, axes, np.array([low[0], high[0], low[1], high[1]])))
+    return FacedPlane(
+        plane=plane,
+        corners_m=around[0],
+        part_corners_m=np.array(around[1:]),
+        is_guessed=is_guessed,
+    )
+
+
+def side_of_stations(
+    plane: Plane, centre_m: NDArray[np.float64], cloud: PointCloud, index: NDArray[np.int64]
+) -> int:
+    """Side of a plane on which its points were seen from.
+
+    The scans of the plane's own points decide, each point with one vote; without that knowledge
+    the station nearest to the middle of the plane does.
+
+    Args:
+        plane: in the cloud's offsets.
+        centre_m: (3,) middle of the plane, offset.
+        cloud: the cloud.
+        index: (m,) some of the plane's points.
+
+    Returns:
+        1 for the side of the normal, -1 for the other, 0 when no station decides.
+    """
+    if cloud.stations is None or len(cloud.stations) == 0:
+        return 0
+    stations_m = cloud.stations - cloud.origin
+    distances_m = plane.distances_m(stations_m)
+    sides = np.where(np.abs(distances_m) > _CLEAR_M, np.sign(distances_m), 0.0)
+    if cloud.scan is not None and len(index) and int(cloud.scan[index].max()) < len(stations_m):
+        votes = np.bincount(cloud.scan[index], minlength=len(stations_m))
+        verdict = float(votes @ sides)
+        if verdict != 0.0:
+            return 1 if verdict > 0.0 else -1
+    order = np.argsort(np.linalg.norm(stations_m - centre_m, axis=1), kind="stable")
+    nearest = [int(sides[station]) for station in order if sides[station] != 0.0]
+    return nearest[0] if nearest else 0
+
+
+def side_of_remaining(
+    plane: Plane,
+    corners_m: NDArray[np.float64],
+    points_m: NDArray[np.float64],
+    is_parallel: NDArray[np.bool_],
+    *,
+    clear_m: float,
+) -> int:
+    """Side of a plane on which more of the other points lie: a room, or furniture and floor.
+
+    Points on planes parallel to this one do not count at first: behind the front of a pilaster
+    lies the whole wall, yet the room is on the other side, as floor, side walls and furniture know.
+    Of the rest only points before or behind the plane's rectangle have a vote, and a point next to
+    the plane has less than one a metre away: relief and recesses are near, the room is far.
+
+    Args:
+        plane: in the cloud's offsets.
+        corners_m: (4, 3) rectangle, offsets.
+        points_m: (m, 3) sample of the cloud, offsets.
+        is_parallel: (m,) whether a point belongs to a plane parallel to this one.
+        clear_m: points nearer than this belong to the plane itself.
+
+    Returns:
+        1 for the side of the normal, -1 for the other, 0 when the points do not decide.
+    """
+    relative = points_m - corners_m[0]
+    within = np.ones(len(points_m), dtype=bool)
+    for axis in (corners_m[3] - corners_m[0], corners_m[1] - corners_m[0]):
+        length_m = max(float(np.linalg.norm(axis)), 1e-9)
+        position_m = relative @ axis / length_m
+        within &= (position_m > -_BESIDE_M) & (position_m < length_m + _BESIDE_M)
+    distances_m = plane.distances_m(points_m)
+    clear = np.abs(distances_m) > clear_m
+    for chosen in (within & ~is_parallel, within, ~is_parallel, np.ones_like(within)):
+        verdict = float(np.clip(distances_m[chosen & clear], -_FULL_VOTE_M, _FULL_VOTE_M).sum())
+        # Gross outliers on both sides of a bare wall leave a small difference that means nothing.
+        if abs(verdict) > _DOUBT * len(points_m) * clear_m:
+            return 1 if verdict > 0.0 else -1
+    return 0
+
+
+def _faced(
+    found: list[FoundPlane],
+    claim: int,
+    deviations: Deviations,
+    prepared: PreparedCloud,
+    cloud: PointCloud,
+) -> FacedPlane:
+    raster, plane = found[claim].raster, found[claim].raster.plane
+    extent_m = deviations.extents_m[claim]
+    corners_m = rectangle_m(plane, raster.axes, extent_m)
+    claims = prepared.sample_claims
+    members = prepared.sample.index[claims == claim]
+    # Evenly thinned, since a plane's first points may all be from one scan.
+    members = members[:: max(1, len(members) // _MEMBERS_MOST)]
+    side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
+    is_guessed = side == 0
+    if is_guessed:
+        # The last entry stands for points on no plane: a claim of -1 picks it.
+        turns = [abs(float(item.raster.plane.normal @ plane.normal)) for item in found]
+        every = max(1, len(claims) // _WITNESSES_MOST)
+        side = side_of_remaining(
+            plane,
+            corners_m,
+            prepared.sample.offsets_m[::every],
+            np.array([*turns, 0.0])[claims[::every]] > _PARALLEL,
+            clear_m=deviations.tolerance_m,
+        )
+    parts_m = found[claim].support.parts_m
+    return face(raster, extent_m, parts_m, side, cloud.up, is_guessed=is_guessed)
+
+
+def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> RawPlane:
+    candidate = item.candidate
+    own = candidate.plane
+    if float(own.normal @ plane.normal) < 0.0:
+        own = own.flipped()
+    return RawPlane(
+        plane=_world(own, cloud),
+        votes=float(candidate.votes),
+        own_tolerance_m=candidate.own_tolerance_m,
+    )
+
+
+def _world(plane: Plane, cloud: PointCloud) -> Plane:
+    offset_m = plane.offset_m + float(plane.normal @ cloud.origin)
+    return Plane(normal=plane.normal, offset_m=offset_m)
+
+
+def _world_covariance(covariance: NDArray[np.float64], cloud: PointCloud) -> NDArray[np.float64]:
+    """Covariance of (normal, offset) with the offset counted from the world's origin."""
+    shift = np.eye(4)
+    shift[3, :3] = cloud.origin
+    moved: NDArray[np.float64] = shift @ covariance @ shift.T
+    return 0.5 * (moved + moved.T)

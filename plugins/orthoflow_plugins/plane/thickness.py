@@ -1,0 +1,279 @@
+"""Thickness of the cloud on each plane, and along one row of a scan.
+
+Thickness is the scanner's noise as the wall shows it; markiewicz2015 urges to look at this before
+anything else (3.1, Figure 3). Relief and bow are not thickness, so distances are taken from the
+mean of a small tile of the wall. It is measured on the sample. Along one row of a scan, which is
+read from the whole cloud, there is no footprint and no second station to blur the picture: what is
+left is the noise of single distances, on one material after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import wall_axes
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.products import Planes, PointCloud, ScanRow, Spread, Thickness
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.cloud import PreparedCloud
+from orthoflow_plugins.plane.detector import Materials
+
+# Side of a tile of a wall, and length of a piece of a row, from whose mean distances are taken.
+_TILE_M: Final = 0.1
+_TILE_LEAST: Final = 4
+# Fewer points do not show a spread.
+_SPREAD_LEAST: Final = 50
+_INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
+_CLASSES: Final = 6
+# Half the share of a normal distribution that lies outside the width reported.
+_TAIL: Final = 0.025
+# Points a scan row needs on a plane to be worth drawing.
+_ROW_LEAST: Final = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowPoints:
+    """The points of one row of one scan on the first plane.
+
+    Attributes:
+        row: its number.
+        scan: the scan it is from.
+        along_m: (n,) place along the plane, to the viewer's right; ascending.
+        distance_m: (n,) distance from the plane, positive towards the viewer.
+        intensity: (n,) 0..1, or None where the cloud has none.
+    """
+
+    row: int
+    scan: int
+    along_m: NDArray[np.float64]
+    distance_m: NDArray[np.float64]
+    intensity: NDArray[np.float64] | None
+
+    def measured(self, materials: Materials) -> ScanRow:
+        """Thickness of the row, and of each material on it."""
+        piece = np.floor((self.along_m - self.along_m[0]) / _TILE_M).astype(np.int64)
+        crowded, deviation_m, _ = _from_tiles(self.distance_m, piece, np.bincount(piece))
+        material: tuple[Spread, ...] = ()
+        if self.intensity is not None:
+            material = _by_material(self.intensity[crowded], materials, deviation_m)
+        return ScanRow(
+            row=self.row,
+            scan=self.scan,
+            n_points=len(self.along_m),
+            sigma_m=median_deviation(deviation_m, 0.0) if len(deviation_m) else None,
+            material=material,
+        )
+
+
+def measure_thickness(
+    planes: Planes,
+    plane_of_sample: NDArray[np.int64],
+    prepared: PreparedCloud,
+    cloud: PointCloud,
+    *,
+    reach_m: float,
+    materials: Materials,
+) -> tuple[Thickness | None, ...]:
+    """Measure the thickness of each plane; None where too few points are on it.
+
+    Args:
+        planes: the planes, world.
+        plane_of_sample: (s,) plane of each point of the sample, -1 for none.
+        prepared: the cloud as the passes take it, and its sample.
+        cloud: the cloud.
+        reach_m: points further than this from their plane are relief or belong to something else.
+        materials: lowest and highest intensity of each material.
+    """
+    sample, found = prepared.sample, list[Thickness | None]()
+    for k, normal in enumerate(planes.normal):
+        members = np.flatnonzero(plane_of_sample == k)
+        offset_m = planes.offset[k] - float(normal @ cloud.origin)
+        distance_m = sample.offsets_m[members] @ normal - offset_m
+        near = np.abs(distance_m) <= reach_m
+        members, distance_m = members[near], distance_m[near]
+        axes = wall_axes(normal, planes.up)
+        placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)
+        # One number per tile, since rows of two take many times as long to sort.
+        keys = placed[:, 0] * 2**31 + placed[:, 1]
+        _, tile, count = np.unique(keys, return_inverse=True, return_counts=True)
+        crowded, deviation_m, usual = _from_tiles(distance_m, tile, count)
+        if crowded.sum() < _SPREAD_LEAST:
+            found.append(None)
+            continue
+        low_m, high_m = np.quantile(deviation_m, (_TAIL, 1.0 - _TAIL))
+        whole = Thickness(
+            sigma_m=median_deviation(deviation_m, 0.0),
+            width_95_m=float(high_m - low_m),
+            scan_step_m=_TILE_M / float(np.sqrt(usual * sample.n_represented)),
+        )
+        kept = members[crowded]
+        found.append(
+            _by_class(
+                whole,
+                sample.offsets_m[kept],
+                normal,
+                deviation_m,
+                sample.index[kept],
+                cloud,
+                materials,
+            )
+        )
+    return tuple(found)
+
+
+def row_points(
+    planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
+) -> RowPoints | None:
+    """Give the scan row that most of the first plane's points are on, None without rows."""
+    members = prepared.sample.index[plane_of_sample == 0]
+    if cloud.row is None or not len(members):
+        return None
+    scans = np.zeros(len(members), dtype=np.int64) if cloud.scan is None else cloud.scan[members]
+    keys = scans.astype(np.int64) * 2**32 + cloud.row[members]
+    names, counts = np.unique(keys, return_counts=True)
+    scan, row = divmod(int(names[np.argmax(counts)]), 2**32)
+    chosen = np.flatnonzero(cloud.row == row)
+    if cloud.scan is not None:
+        chosen = chosen[cloud.scan[chosen] == scan]
+    claim = prepared.sample_claims[plane_of_sample == 0][0]
+    chosen = chosen[prepared.claims[chosen] == claim]
+    if len(chosen) < _ROW_LEAST:
+        return None
+    points = np.column_stack([cloud.x[chosen], cloud.y[chosen], cloud.z[chosen]]).astype(np.float64)
+    normal = planes.normal[0]
+    along_m = points @ wall_axes(normal, planes.up)[0]
+    order = np.argsort(along_m, kind="stable")
+    distance_m = points @ normal - (planes.offset[0] - float(normal @ cloud.origin))
+    intensity = None
+    if cloud.intensity is not None:
+        intensity = np.nan_to_num(cloud.intensity[chosen].astype(np.float64))[order]
+    return RowPoints(
+        row=row,
+        scan=scan,
+        along_m=along_m[order],
+        distance_m=distance_m[order],
+        intensity=intensity,
+    )
+
+
+def report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> None:
+    """Report how thick the cloud is on the first plane, beside its scan step, and the worst."""
+    known = [item for item in found if item is not None]
+    if known:
+        ctx.metric("thickest_mm", 1000.0 * max(item.sigma_m for item in known), "mm")
+    first = found[0]
+    if first is not None:
+        ctx.metric("thickness_mm", 1000.0 * first.sigma_m, "mm")
+        ctx.metric("thickness_width_mm", 1000.0 * first.width_95_m, "mm")
+        ctx.metric("scan_step_mm", 1000.0 * first.scan_step_m, "mm")
+        ctx.metric("thickness_scan_steps", first.sigma_m / first.scan_step_m, "1")
+
+
+def _from_tiles(
+    distance_m: NDArray[np.float64], tile: NDArray[np.int64], count: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], float]:
+    """Deviations of distances from the means of their tiles.
+
+    Args:
+        distance_m: (m,) distances.
+        tile: (m,) number of the tile of each.
+        count: (t,) points of each tile.
+
+    Returns:
+        (m,) which distances lie in tiles with points enough, their deviations, and how many points
+        such a tile usually has.
+    """
+    mean_m = np.bincount(tile, distance_m) / np.maximum(count, 1)
+    crowded = count[tile] >= _TILE_LEAST
+    tile = tile[crowded]
+    # A mean of n follows its own points: deviations from it are too small by this.
+    deviation_m = (distance_m[crowded] - mean_m[tile]) / np.sqrt(1.0 - 1.0 / count[tile])
+    usual = float(np.median(count[count >= _TILE_LEAST])) if len(tile) else 0.0
+    return crowded, deviation_m, usual
+
+
+def _by_class(
+    whole: Thickness,
+    points_m: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    deviation_m: NDArray[np.float64],
+    index: NDArray[np.int64],
+    cloud: PointCloud,
+    materials: Materials,
+) -> Thickness:
+    """Add to a thickness what is known of it by class; index is of the points in the cloud."""
+    stations_m = _stations_of(index, cloud)
+    if stations_m is not None:
+        rays_m = points_m - stations_m
+        range_m = np.linalg.norm(rays_m, axis=1)
+        cosine = np.abs(rays_m @ normal) / np.maximum(range_m, 1e-9)
+        incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
+        whole = replace(
+            whole,
+            incidence_deg=_spreads(incidence_deg, np.array(_INCIDENCE_DEG), deviation_m),
+            range_m=_spreads(range_m, _even_edges(range_m), deviation_m),
+        )
+    if cloud.intensity is not None:
+        intensity = cloud.intensity[index].astype(np.float64)
+        known = np.isfinite(intensity)
+        intensity, of_known_m = intensity[known], deviation_m[known]
+        if len(intensity):
+            whole = replace(
+                whole,
+                intensity=_spreads(intensity, _even_edges(intensity), of_known_m),
+                material=_by_material(intensity, materials, of_known_m),
+            )
+    return whole
+
+
+def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
+    """(m, 3) or (3,) offset of the station that saw each point, None where that is not known."""
+    stations = cloud.stations
+    if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
+        return None
+    if len(stations) == 1:
+        return np.asarray(stations[0] - cloud.origin)
+    if cloud.scan is None or not len(index) or int(cloud.scan[index].max()) >= len(stations):
+        return None
+    return stations[cloud.scan[index]] - cloud.origin
+
+
+def _even_edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Edges of classes with equally many points."""
+    return np.unique(np.quantile(values, np.linspace(0.0, 1.0, _CLASSES + 1)))
+
+
+def _spreads(
+    values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
+) -> tuple[Spread, ...]:
+    """Spread of the points of each class; those with too few points are left out."""
+    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2))
+    classes = [
+        _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
+        for k in range(len(edges) - 1)
+    ]
+    return tuple(found for found in classes if found is not None)
+
+
+def _by_material(
+    intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
+) -> tuple[Spread, ...]:
+    """Spread of the points of each material; those with too few points are left out."""
+    classes = [
+        _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
+        for name, (low, high) in materials.items()
+    ]
+    return tuple(found for found in classes if found is not None)
+
+
+def _spread(
+    name: str | None, low: float, high: float, deviation_m: NDArray[np.float64]
+) -> Spread | None:
+    if len(deviation_m) < _SPREAD_LEAST:
+        return None
+    sigma_m = median_deviation(deviation_m, 0.0)
+    return Spread(low=low, high=high, n_points=len(deviation_m), sigma_m=sigma_m, name=name)
