@@ -37,8 +37,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "The file": WorkflowFile,
     "`inputs.<name>`: an input": InputSection,
     "`datasets.<name>`: a dataset": DatasetSection,
-    "`steps.<name>`: a step": StepSection,
-    "`steps.<name>.variants.<name>`: a method call": CallSection,
+    "`steps.<name>`: a step, with the keys of a call": StepSection,
+    "`steps.<name>` or `steps.<name>.variants.<name>`: a method call": CallSection,
     "`params.<name>`: a sweep": SweepSection,
     "`resources`": ResourcesSection,
     "`compare`": CompareSection,
@@ -67,16 +67,15 @@ compare:
 HEAD = f"""\
 # The workflow file
 
-Every key that a workflow file may hold. Made of `orthoflow/workflow/model.py` by
-`{COMMAND}`; the checks and `orthoflow schema` are made of the same models.
+Every key of a workflow file. `{COMMAND}` generates this page from `orthoflow/workflow/model.py`,
+the models behind the checks and `orthoflow schema`.
 
 ```yaml
 {EXAMPLE}```
 
-`orthoflow check FILE` names everything that is wrong in one pass, each as
-`file:line:column: path: message`.
+`orthoflow check FILE` reports all mistakes at once, each as `file:line:column: path: message`.
 Names start with a lower-case letter and have at most 32 lower-case letters, digits, `-` or `_`.
-Values are those of YAML 1.2's core schema: `.5e-1` is a number, `1_000`, `0b11` and `yes` are text.
+Values follow YAML 1.2's core schema: `.5e-1` is a number, `1_000`, `0b11` and `yes` are text.
 """
 
 
@@ -100,6 +99,8 @@ def _table(section: type[BaseModel]) -> Iterator[str]:
     yield "| key | value | example | meaning |"
     yield "|---|---|---|---|"
     for name, info in section.model_fields.items():
+        if section is StepSection and name in CallSection.model_fields:
+            continue  # in the table of the call
         key = info.alias or name
         words = annotation_at(section, [key])[1].words
         example = written((info.examples or [""])[0])

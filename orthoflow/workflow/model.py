@@ -259,43 +259,41 @@ class FileSection(BaseModel):
 
 
 class InputSection(FileSection):
-    """A folder stands for the files in it and in its subfolders, a pattern for the files it matches
-    (`**` for folders at any depth). A file that is named, and is not optional, has to be there.
+    """A folder means all files in it and its subfolders, a pattern the files that it matches (`**`:
+    folders at any depth). A file that is not optional must exist.
     """  # noqa: D205 - the text of the reference
 
     files: _Files = Field(
         (),
-        description="A file, a folder, a pattern, or a list of them; relative paths start at the "
-        "workflow. Without it, `--input NAME=PATH` gives some.",
+        description="A file, a folder, a pattern, or a list of them, relative to the workflow. "
+        "Without it, pass `--input NAME=PATH`.",
         examples=["data/photos/*.jpg"],
     )
     optional: _Flag = Field(
         default=False,
-        description="The workflow can do without it: steps that need it are skipped when it is "
-        "absent.",
+        description="Steps that need the input are skipped when it is absent.",
         examples=[True],
     )
 
 
 class ResourcesSection(FileSection):
-    """What a method may take of the machine."""
+    """What a method may use of the machine."""
 
     cores: _Positive | None = Field(
         None,
-        description="How many cores the method may use; without it all, shared by the steps that "
-        "run at the same time.",
+        description="Number of cores that the method may use; by default all, shared by the steps "
+        "that run at the same time.",
         examples=[2],
     )
 
 
 class SweepSection(FileSection):
-    """In the place of a value a parameter may be given several: `tolerance_m: {sweep: [0.02,
-    0.05]}` makes the variants `tolerance_m-0_02` and `tolerance_m-0_05` of the step, or of its
-    variant, whose name then stands in front, and by which `baseline` and `exclude` still know it.
-    A name states exact values, or an index (`sweep-1`) that `orthoflow plan` explains. Several
-    swept parameters make all combinations. A workflow with a sweep is a comparison, with `compare`
-    or without, and its report draws the metrics over the parameter. `--set STEP.PARAM=VALUE` takes
-    the place of a sweep, and `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    """A parameter may have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
+    `tolerance_m-0_02` and `tolerance_m-0_05` of the step. In a variant its name comes first, and
+    `baseline` and `exclude` accept that name. Values that do not fit into a name get an index
+    (`sweep-1`) that `orthoflow plan` explains. Several swept parameters make all combinations. The
+    report draws the metrics over the parameter. `--set STEP.PARAM=VALUE` replaces a sweep,
+    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
     sweep: Annotated[
@@ -303,7 +301,7 @@ class SweepSection(FileSection):
         Field(min_length=2, max_length=MOST_SWEPT),
         Expected(f"2 to {MOST_SWEPT} values in a list"),
     ] = Field(
-        description="Values of the parameter, each of which makes a variant.",
+        description="Values of the parameter; each makes a variant.",
         examples=[[0.02, 0.05, 0.1]],
     )
 
@@ -313,40 +311,38 @@ class CallSection(FileSection):
 
     use: _Text | None = Field(
         None,
-        description="The method, as `kind.method`; `orthoflow plugins list` names all. Needed, "
+        description="The method, as `kind.method`; `orthoflow plugins list` shows all. Required "
         "unless the step has variants.",
         examples=["plane.hough2d"],
     )
     params: Annotated[dict[str, Any], Expected("a mapping")] = Field(
         {},
-        description="Parameters of the method, each a value or a sweep; `orthoflow plugins show "
-        "ID` lists them.",
+        description="Parameters, each a value or a sweep; `orthoflow plugins show ID` lists them.",
         examples=[{"gsd_m": 0.003, "tolerance_m": {"sweep": [0.02, 0.05, 0.1]}}],
     )
     repeat: _Repeats = Field(
         1,
-        description="How many runs with seeds of their own; of a method without randomness, to "
-        "time it. Repeats reach every later step that the comparison names in `metrics` (without "
-        "`metrics`: every inspection), and the steps between; all else uses the first.",
+        description="Number of runs with different seeds; of a method without randomness, to time "
+        "it. Steps that the comparison names in `metrics` (by default every inspection) and those "
+        "between run once per repeat; all others use the first repeat.",
         examples=[10],
     )
     resources: Annotated[ResourcesSection, Expected("a mapping")] = Field(
         ResourcesSection(),
-        description="What the method may take of the machine.",
+        description="What the method may use of the machine.",
         examples=[{"cores": 2}],
     )
     timeout: _Seconds | None = Field(
         None,
-        description="The step is ended, and has failed, when it takes longer. Without it there is "
-        "no limit.",
+        description="A step that takes longer is stopped and fails. Without it there is no limit.",
         examples=["30min"],
     )
 
 
 class StepSection(CallSection):
-    """A step calls one method, or has variants that each call one; then what belongs to a call
-    stands in the variants. A step that lacks a required product, because optional data are
-    absent, is skipped with all that needs it. Steps may stand in any order.
+    """A step calls one method, or has variants that each call one; the keys of a call are then in
+    the variants. A step that lacks a required product because optional data is absent is skipped,
+    with all steps that need it. The order of steps is free.
     """  # noqa: D205
 
     in_: Annotated[
@@ -355,14 +351,13 @@ class StepSection(CallSection):
     ] = Field(
         {},
         alias="in",
-        description="Where each port's product comes from; of a list, the first that is present.",
+        description="Source of each port's product; of a list, the first that is present.",
         examples=[{"cloud": "cloud.cloud", "planes": ["given.planes", "plane.planes"]}],
     )
     if_: _InputSource | None = Field(
         None,
         alias="if",
-        description="The step is skipped unless this input is given, also where its ports do "
-        "without.",
+        description="The step is skipped unless this input is given, even if no port needs it.",
         examples=["inputs.other"],
     )
     unless: _InputSource | None = Field(
@@ -375,19 +370,18 @@ class StepSection(CallSection):
         Expected("a mapping from names to method calls"),
     ] = Field(
         None,
-        description="Alternatives of one kind, each with its own parameters, in the place of "
-        "`use`.",
+        description="Alternatives of one kind with their own parameters, instead of `use`.",
         examples=[{"fine": {"use": "plane.hough2d"}, "quick": {"use": "plane.ransac"}}],
     )
 
 
 class DatasetSection(BaseModel):
-    """What depends on the data runs once per dataset, with `data=<name>` first in its address; all
-    else runs once. An input that a dataset does not name is that of the workflow. Instead of the
-    mapping there may be a CSV file with a line per dataset: the column `name`, a column per input,
-    and columns such as `room.noise_m` for parameters; an empty field sets nothing, and relative
-    paths start at the CSV file. `--datasets FILE` takes the place of the section, `--only-data A,B`
-    chooses among the names.
+    """Steps that depend on the data run once per dataset, with `data=<name>` first in their
+    address; all others run once. Inputs that a dataset does not name are those of the workflow.
+    Instead of the mapping, a CSV file may have a line per dataset: a column `name`, one per input,
+    and columns such as `room.noise_m` for parameters; an empty field sets nothing, and paths are
+    relative to the file. `--datasets FILE` replaces the section, `--only-data A,B` selects
+    datasets.
     """  # noqa: D205
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -395,8 +389,8 @@ class DatasetSection(BaseModel):
 
     set: Annotated[dict[str, Any], Expected("a mapping step.parameter: value")] = Field(
         {},
-        description="Parameters for this dataset alone, named as behind `--set`, which goes before "
-        "them; and `seed`, a number or a sweep of them.",
+        description="Parameters of this dataset, named as for `--set`, which overrides them; and "
+        "`seed`, a number or a sweep.",
         examples=[{"room.noise_m": 0.004, "plane.ransac.tolerance_m": 0.03, "seed": 7}],
     )
 
@@ -411,11 +405,10 @@ class DatasetsSection(FileSection):
 
 
 class CompareSection(FileSection):
-    """Variants fan out: every step behind them runs once per combination that really differs.
-    Tables list each of these runs as a step of its own, by its address: the step, the dataset,
-    seed and variants that make it and the repeat, `ortho@plane=ransac,orient=pnp#2`; columns and
-    keys of files call the address `cell`. Without a comparison only the baseline runs, the first
-    variant of each step.
+    """Every step behind variants runs once per combination that differs. Tables list each of these
+    runs by its address: step, dataset, seed, variants and repeat, such as
+    `ortho@plane=ransac,orient=pnp#2`; columns and keys of files call it `cell`. Without `compare`
+    only the baseline runs, the first variant of each step.
     """  # noqa: D205
 
     design: Annotated[
@@ -429,8 +422,8 @@ class CompareSection(FileSection):
     )
     baseline: _Assignment = Field(
         {},
-        description="The variant of each step that others are compared with, and that a report "
-        "shows; without it the first of each step.",
+        description="The variant of each step with which others are compared and which the report "
+        "shows; by default the first.",
         examples=[{"plane": "hough2d", "orient": "bundle"}],
     )
     exclude: Annotated[
@@ -439,19 +432,19 @@ class CompareSection(FileSection):
         Expected("a list of mappings step: variant"),
     ] = Field(
         [],
-        description="Combinations that are left out, wherever they occur.",
+        description="Combinations that are left out.",
         examples=[[{"plane": "ransac", "orient": "pnp"}]],
     )
     metrics: _Metrics = Field(
         (),
-        description="What the report's tables show, as `step.metric`; `*` stands for anything. "
-        "Without it, the metrics that judge quality.",
+        description="Metrics in the report's tables, as `step.metric`, with `*` as wildcard; "
+        "by default those of quality.",
         examples=[["plane.rms_mm", "*.wall_s"]],
     )
 
 
 class SeedSweep(FileSection):
-    """Several seeds: what is random runs once for each, with `seed=<n>` in its address."""
+    """Several seeds: random steps run once per seed, with `seed=<n>` in their address."""
 
     sweep: Annotated[
         list[_Seed],
@@ -472,14 +465,14 @@ class WorkflowFile(FileSection):
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
     name: Annotated[_Name, Expected("a name")] | None = Field(
         None,
-        description="Name of the workflow; the folder of a run begins with it. Without it, the "
+        description="Name of the workflow, with which the folder of a run begins; by default the "
         "file's name.",
         examples=["palace-room"],
     )
     seed: Annotated[_Seed | SeedSweep, Expected("a whole number from 0 on, or a sweep")] = Field(
         0,
-        description="Root of all seeds: one follows from it, the method and the repeat. A sweep "
-        "makes a factor of it.",
+        description="Root of all seeds; a step's seed follows from it, the method and the repeat. "
+        "A sweep runs everything random once per seed.",
         examples=[1729],
     )
     inputs: Annotated[
@@ -487,7 +480,7 @@ class WorkflowFile(FileSection):
         Expected("a mapping"),
     ] = Field(
         {},
-        description="Files from outside; steps name them `inputs.<name>`.",
+        description="Input files; steps refer to them as `inputs.<name>`.",
         examples=[{"scan": {"files": "data/room.e57"}, "photos": {"optional": True}}],
     )
     datasets: Annotated[
@@ -495,8 +488,7 @@ class WorkflowFile(FileSection):
         Expected("a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"),
     ] = Field(
         {},
-        description="What the workflow runs on, one after the other; the runs are one comparison. "
-        "A mapping, or a CSV file.",
+        description="The datasets on which the workflow runs: a mapping, or a CSV file.",
         examples=[{"hall": {"scan": "data/hall.e57"}, "stairs": {"scan": "data/stairs.e57"}}],
     )
     steps: Annotated[
@@ -504,12 +496,12 @@ class WorkflowFile(FileSection):
         Expected("a mapping"),
     ] = Field(
         {},
-        description="What is done, each step by the method of a plugin.",
+        description="The steps, each of which calls a method.",
         examples=[{"cloud": {"use": "read.scan", "in": {"files": "inputs.scan"}}}],
     )
     compare: Annotated[CompareSection, Expected("a mapping")] | None = Field(
         None,
-        description="Which combinations of variants run, and what of them is compared.",
+        description="Which combinations of variants run and what is compared.",
         examples=[{"design": "product", "baseline": {"plane": "hough2d"}}],
     )
 
