@@ -61,7 +61,7 @@ _NO_SEARCH: Final = (
     '<script>location.protocol === "file:" && document.documentElement.classList.add("by-file")'
     "</script><style>.by-file .md-search, .by-file [for=__search] {display: none}</style>"
 )
-_METRICS_HEAD: Final = "| metric | what | unit | good side | of |\n|---|---|---|---|---|"
+_METRICS_HEAD: Final = "| metric | meaning | unit | better | method |\n|---|---|---|---|---|"
 _LINK: Final = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -85,7 +85,7 @@ def written(folder: Path) -> None:
 
 
 def _linked(text: str, source: str, pages: dict[str, str]) -> str:
-    """Lead links to where things stand on the site; what does not is only named."""
+    """Point links to pages of the site; files that are no page are only named."""
 
     def link(found: re.Match[str]) -> str:
         to, anchor = found[1], found[2] or ""
@@ -105,7 +105,7 @@ def _linked(text: str, source: str, pages: dict[str, str]) -> str:
 
 
 def _methods(catalog: Catalog) -> Iterator[str]:
-    yield "# Methods\n\nAs plugins declare them; `orthoflow plugins show ID` says it, too.\n"
+    yield "# Methods\n\nAs plugins declare them; `orthoflow plugins show ID` prints the same.\n"
     infos = [describe_method(catalog, name) for name in sorted(catalog.methods)]
     for kind in sorted({info.id.partition(".")[0] for info in infos}):
         yield f"## {kind}\n\n{catalog.kinds[kind].spec.summary}\n"
@@ -116,7 +116,7 @@ def _methods(catalog: Catalog) -> Iterator[str]:
 
 def _method(method: type[Method]) -> Iterator[str]:
     yield f"### {method.id}\n\n{_paragraphs(method)}\n"
-    for word, table in (("takes", method.In), ("gives", method.Out)):
+    for word, table in (("input", method.In), ("output", method.Out)):
         for port in port_specs(table).values():
             behind = "" if port.required else ", optional"
             product = f"[{port.type_name}](products.md#{port.type_name})"
@@ -144,9 +144,9 @@ def _paragraphs(method: type[Method]) -> str:
 
 def _products(catalog: Catalog) -> Iterator[str]:
     yield (
-        "# Products and their files\n\nWhat steps hand to each other. A run folder has their files "
+        "# Products and their files\n\nThe data that steps exchange. A run folder has their files "
         "in `products/<step>/`. The fields are those of the objects that `run.product(step, name)` "
-        "gives in Python; what a product consists of stands below the first that does.\n"
+        "returns in Python; parts of a product are described below the first product that has them.\n"
     )
     products = {name: _loaded(catalog.products[name].spec.target) for name in catalog.products}
     places = {product: name for name, product in products.items()}
@@ -233,9 +233,9 @@ def _loaded(target: str) -> type:
 
 def _metrics(catalog: Catalog) -> Iterator[str]:
     yield (
-        "# Metrics\n\nWhat methods measure. `all_` in front: over all walls; `wall_<k>_`: of that "
-        "wall; `floor_`: what the intensity alone shows of itself. On a wall `x` and `u` run to "
-        "the right, `y` and `v` down, as seen by who stands before it; `u` and `v` of a photo are "
+        "# Metrics\n\nWhat methods measure. The prefix `all_` means over all walls, `wall_<k>_` of "
+        "that wall, `floor_` the intensity compared with itself. On a wall `x` and `u` run to the "
+        "right, `y` and `v` down, as seen by a viewer in front of it; `u` and `v` of a photo are "
         "its columns and rows.\n"
     )
     declared: dict[MetricSpec, list[str]] = {}
@@ -269,7 +269,7 @@ def _good(better: str) -> str:
 
 def _commands() -> Iterator[str]:
     yield (
-        "# Commands\n\n`orthoflow COMMAND --help` says the same. To complete commands, options "
+        "# Commands\n\n`orthoflow COMMAND --help` prints the same. To complete commands, options "
         "and files, put this into `~/.bashrc` (`zsh_source` and `~/.zshrc`, or `fish_source`, for "
         "other shells):\n\n"
         '```sh\neval "$(_ORTHOFLOW_COMPLETE=bash_source orthoflow)"\n```\n'
