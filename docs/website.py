@@ -146,7 +146,7 @@ def _products(catalog: Catalog) -> Iterator[str]:
     yield (
         "# Products and their files\n\nThe data that steps exchange. A run folder has their files "
         "in `products/<step>/`. The fields are those of the objects that `run.product(step, name)` "
-        "returns in Python; parts of a product are described below the first product that has them.\n"
+        "returns in Python; parts of a product are described below the first that has them.\n"
     )
     products = {name: _loaded(catalog.products[name].spec.target) for name in catalog.products}
     places = {product: name for name, product in products.items()}
