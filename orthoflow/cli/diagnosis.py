@@ -126,7 +126,6 @@ LIBRARIES: Final = (
     ),
     Library(distribution="ezdxf", module="ezdxf", use="CAD drawings: --to dxf"),
     Library(distribution="reportlab", module="reportlab", use="sheets: --to sheet"),
-    Library(distribution="segno", module="segno", use="the code on sheets: --to sheet"),
     Library(
         distribution="cryptography",
         module="cryptography",

@@ -96,23 +96,28 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--paper",
     metavar="PAPER",
-    help="sheet: A0 to A4, or width x height in mm as 700x500; A3 without it. It is turned "
-    "where that saves sheets.",
+    help="sheet: A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as 700x500; "
+    "without it the smallest that takes each wall on one sheet (without --scale at most A3).",
 )
 @click.option(
     "--grid",
-    "grid_m",
     type=click.FloatRange(min=0.0),
-    metavar="METRES",
-    help="sheet: distance of the crosses with coordinates, 0 for none; without it about "
+    metavar="DISTANCE",
+    help="sheet: distance of the crosses with coordinates in --units, 0 for none; without it about "
     "2 cm on the paper.",
+)
+@click.option(
+    "--units",
+    type=click.Choice(["m", "ft"]),
+    help="sheet: of coordinates, heights and the scale bar; m without it. With ft the usual scales "
+    "are 1:48 (1/4 inch to the foot) and so on.",
 )
 @click.option(
     "--title-block",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="sheet: YAML file with any of project, title, site, client, organisation, author, "
-    "checked_by, date, drawing, revision, note.",
+    "checked_by, date, drawing, revision, note, logo, fields, revisions, layout (column or strip).",
 )
 @click.option(
     "--beside",
@@ -140,7 +145,7 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--language",
     type=click.Choice(["en", "de", "fr", "pl", "es"]),
-    help="plan, section, elevation: language of labels; en without it.",
+    help="sheet, plan, section, elevation: language of labels; en without it.",
 )
 @click.option(
     "--light",

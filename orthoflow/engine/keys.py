@@ -43,7 +43,7 @@ _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
 _WITHOUT_EFFECT: Final = frozenset(
     {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
     | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
-    | {"ruamel-yaml", "segno"}
+    | {"ruamel-yaml"}
 )
 _OUR_OWN: Final = frozenset({"orthoflow", "orthoflow_plugins", "orthoflow_provenance"})
 _REQUIREMENT: Final = re.compile(r"[\w.-]+")

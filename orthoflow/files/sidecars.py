@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawings.words import accuracy_phrase
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import GridPlace, RasterParts
 from orthoflow.foreign_text import json_bytes, parse_json, text_of_file
@@ -245,22 +246,6 @@ def raster_tags(
     }
 
 
-def accuracy_words(accuracy: object) -> str:
-    """Say in words what `accuracy` of an orthoimage's sidecar holds."""
-    told = accuracy if isinstance(accuracy, dict) else {}
-    median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
-    count = told.get("n_check_points")
-    if told.get("assessed") is not True or not all(
-        isinstance(value, float) for value in (median, high)
-    ):
-        return "accuracy not checked"
-    return (
-        f"expected error of a point measured in this image {median:.1f} mm, 95 % below {high:.1f} "
-        f"mm (one standard deviation, by orientation, depth and parallax; {count} check points on "
-        "this wall)"
-    )
-
-
 def mask_meanings(
     meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
 ) -> JsonValue:
@@ -395,5 +380,5 @@ def _opened(path: Path, wall: int) -> OrthoFile:
         name=name if isinstance(name, str) else f"wall {wall}",
         frame=frame,
         digest=digest if isinstance(digest, str) else "",
-        accuracy=accuracy_words(content.get("accuracy")),
+        accuracy=accuracy_phrase(content.get("accuracy")).text(),
     )

@@ -13,8 +13,9 @@ import numpy as np
 
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.files.drawings.words import Phrase, accuracy_phrase
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.sidecars import accuracy_words, placed_raster, read_sidecar
+from orthoflow.files.sidecars import placed_raster, read_sidecar
 from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, Inspection, Opening, Openings, Planes, Walls
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
@@ -22,24 +23,19 @@ from orthoflow.records.runs import Run
 from orthoflow.records.verification import require_unchanged
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
-# Of the accuracy that inspections found, what a drawing says: names of two numbers, the sentence,
+# Of the accuracy that inspections found, what a drawing says: names of two numbers, the statement,
 # and which number says of how many of what it is.
 _ACCURACY: Final = (
-    ("rmse_x_mm", "rmse_y_mm", "RMSE sideways {} mm, up and down {} mm", ("n_found", "n_pairs")),
-    ("rmse_u_mm", "rmse_v_mm", "RMSE sideways {} mm, up and down {} mm", ()),
-    (
-        "patch_rmse_u_mm",
-        "patch_rmse_v_mm",
-        "of patches RMSE sideways {} mm, up and down {} mm",
-        ("n_patches",),
-    ),
-    ("rms_3d_mm", "max_3d_mm", "with depth RMS {} mm, largest {} mm", ("n_3d",)),
+    ("rmse_x_mm", "rmse_y_mm", "rmse", ("n_found", "n_pairs")),
+    ("rmse_u_mm", "rmse_v_mm", "rmse", ()),
+    ("patch_rmse_u_mm", "patch_rmse_v_mm", "patch_rmse", ("n_patches",)),
+    ("rms_3d_mm", "max_3d_mm", "rms_3d", ("n_3d",)),
 )
 _COUNTED: Final = {
-    "n_found": ("check point", "check points"),
-    "n_pairs": ("pair", "pairs"),
-    "n_patches": ("patch", "patches"),
-    "n_3d": ("check point", "check points"),
+    "n_found": "n_check_points",
+    "n_pairs": "n_pairs",
+    "n_patches": "n_patches",
+    "n_3d": "n_check_points",
 }
 
 
@@ -53,9 +49,9 @@ class WallResult:
         plane_index: its plane's place in `planes.json`, or None where nothing says it.
         frame: where the largest of its rasters lies.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, those that are there.
-        accuracy: sentences on the expected error of its orthoimage, its plane's noise, and what
+        accuracy: statements on the expected error of its orthoimage, its plane's noise, and what
             inspections of this wall found; all by evidence on this wall alone.
-        colours: what was done to the colours of the photos; empty without an orthoimage.
+        colours: what was done to the colours of the photos; None without an orthoimage.
         intensity_source: `laser`, or `luminance` where the grey of colours stands in for it.
     """
 
@@ -64,8 +60,8 @@ class WallResult:
     plane_index: int | None
     frame: WallFrame
     rasters: dict[str, Path]
-    accuracy: tuple[str, ...]
-    colours: str
+    accuracy: tuple[Phrase, ...]
+    colours: Phrase | None
     intensity_source: str = "laser"
 
 
@@ -298,7 +294,7 @@ def _wall_result(
     number: int,
     rasters: dict[str, Path],
     planes: Planes | None,
-    colours: str,
+    colours: Phrase,
 ) -> WallResult:
     for path in rasters.values():
         require_unchanged(run, path, path.with_suffix(".json"))
@@ -311,13 +307,11 @@ def _wall_result(
     index = about.get("plane_index", number)
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
-    said = [accuracy_words(content.get("accuracy"))] if error.exists() else []
+    said = [accuracy_phrase(content.get("accuracy"))] if error.exists() else []
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
-        said.append(
-            f"plane with {int(planes.n_points[plane_index]):,} points, which lie {rms_mm:.1f} mm "
-            "from it (RMS, relief included)"
-        )
+        count = f"{int(planes.n_points[plane_index]):,}"
+        said.append(Phrase(key="plane_noise", values={"count": count, "rms": f"{rms_mm:.1f}"}))
     return WallResult(
         number=number,
         name=str(content.get("name") or f"wall {number}"),
@@ -325,7 +319,7 @@ def _wall_result(
         frame=frame,
         rasters=rasters,
         accuracy=tuple(said),
-        colours=colours if "ortho" in rasters else "",
+        colours=colours if "ortho" in rasters else None,
         intensity_source=str(about.get("intensity_source", "laser")),
     )
 
@@ -342,30 +336,34 @@ def _check_kind(kind: str, path: Path) -> None:
         )
 
 
-def _unmeasured(run: Run) -> str:
+def _unmeasured(run: Run) -> Phrase:
     uncounted = uncounted_points(run)
-    why = f", {uncounted.sentence}" if uncounted else "; surveyed check points would tell"
-    return f"how far drawings made from it are off was not measured{why}"
+    if uncounted is None:
+        return Phrase(key="unmeasured")
+    return Phrase(key="unmeasured_given", values={"why": uncounted.sentence})
 
 
-def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:
+def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]:
     for address, inspection in inspections.items():
         own = {item.name: item.value for item in inspection.findings if item.wall == wall}
-        said = [
-            text.format(f"{own[first]:.1f}", f"{own[second]:.1f}") + _of_how_many(own, counts)
-            for first, second, text, counts in _ACCURACY
-            if first in own and second in own
-        ]
-        if said:
-            yield f"{address}: {'; '.join(said)}"
+        for first, second, key, counts in _ACCURACY:
+            if first in own and second in own:
+                values = {"step": address, "first": f"{own[first]:.1f}"}
+                yield Phrase(
+                    key=key,
+                    values={**values, "second": f"{own[second]:.1f}"},
+                    details=tuple(_of_how_many(own, counts)),
+                )
 
 
-def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> str:
-    name = next((name for name in counts if name in values), "")
-    return f" of {values[name]:.0f} {_COUNTED[name][values[name] != 1]}" if name else ""
+def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> Iterator[Phrase]:
+    for name in counts:
+        if name in values:
+            yield Phrase(key=_COUNTED[name], values={"count": f"{values[name]:.0f}"})
+            return
 
 
-def _colours(run: Run, address: str) -> str:
+def _colours(run: Run, address: str) -> Phrase:
     """What the record says was done to the colours of photos or of points."""
     cell = run.cells[address]
     whence = tuple(run.upstream(address))
@@ -373,13 +371,14 @@ def _colours(run: Run, address: str) -> str:
     if all(one.type_name != "photos" for one in given):
         greys = (before.params.get("skip_below_grey") for before in whence)
         least = next((grey for grey in greys if grey), None)
-        without = f", without points darker than {least} of 255" if least else ""
-        return f"colours as the scan has them{without}"
+        if least:
+            return Phrase(key="colours_scan_dark", values={"least": least})
+        return Phrase(key="colours_scan")
     gains = cell.params.get("gains")
     if gains is None:
-        return f"colours as {cell.method} gave them"
+        return Phrase(key="colours_method", values={"method": cell.method})
     if gains == "none":
-        return "colours untouched: as photos or scan have them"
+        return Phrase(key="colours_raw")
     if not any(metric.name == "gain_max" for metric in cell.metrics):
-        return "colours untouched: the photos agree, or there is one only"
-    return f"colours balanced between photos (gains: {gains})"
+        return Phrase(key="colours_agree")
+    return Phrase(key="colours_balanced", values={"gains": gains})

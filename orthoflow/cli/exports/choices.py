@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from orthoflow.files.clouds.dressing import Colouring
@@ -22,7 +22,8 @@ class Choices:
         author: of a crate.
         scale: of sheets, n of 1 : n.
         paper: of sheets.
-        grid_m: distance of the crosses on sheets, 0 for none.
+        grid: distance of the crosses on sheets in their unit, 0 for none.
+        units: of what is written on sheets.
         title_block: file with what an office writes on its sheets.
         beside: rasters that sheets show beside the orthoimage.
         embed: with every product and input.
@@ -47,7 +48,8 @@ class Choices:
     author: str | None = None
     scale: int | None = None
     paper: str | None = None
-    grid_m: float | None = None
+    grid: float | None = None
+    units: Literal["m", "ft"] | None = None
     title_block: Path | None = None
     beside: tuple[str, ...] = ()
     embed: bool = False

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import make_empty, wanted_wall
@@ -25,18 +23,6 @@ from orthoflow.files.drawings.geojson import (
     write_seams_geojson,
     write_wall_geojson,
 )
-from orthoflow.files.drawings.key_plans import key_plan
-from orthoflow.files.drawings.papers import (
-    Paper,
-    Part,
-    View,
-    fitting_scale,
-    nice_step,
-    paper_for_one,
-    paper_of,
-    placed_views,
-)
-from orthoflow.files.drawings.printed_pictures import stretch_of
 from orthoflow.files.drawings.qgis import PROJECT, ProjectLayer, write_project
 from orthoflow.files.drawings.relief import (
     Light,
@@ -45,162 +31,24 @@ from orthoflow.files.drawings.relief import (
     write_relief,
 )
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, room_lines
-from orthoflow.files.drawings.sheet_contents import MarkedArea, Sheet, SheetText, WallDrawing
-from orthoflow.files.drawings.sheets import axes_of, write_sheet
-from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Orthoimage, Orthoimages
 from orthoflow.records.runs import Run
 from orthoflow.records.wall_results import RoomResults, WallResult, room_results
 
-_DEFAULT_PAPER: Final = "A3"
-_GRID_MM: Final = 20.0
 
-
-def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
-    paper = paper_of(chosen.paper or _DEFAULT_PAPER)
-    block = read_title_block(chosen.title_block) if chosen.title_block else TitleBlock()
-    results = room_results(run, chosen.cell, chosen.wall)
-    walls = _chosen_walls(results, chosen)
-    scale = chosen.scale or fitting_scale([_size_m(wall) for wall in walls], paper)
-    digest = run.content_sha256
-    drawings = [
-        _drawing(results, wall, chosen, scale, _sheet_text(run, wall, block, digest))
-        for wall in walls
-    ]
-    make_empty(folder)
-    counts = [
-        _write_wall(folder, drawing, wall, paper)
-        for drawing, wall in zip(drawings, walls, strict=True)
-    ]
-    said = f"{counted(sum(counts), 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
-    if sum(counts) > len(walls):
-        sizes = [
-            (tuple(one.rasters), _size_m(wall)) for one, wall in zip(drawings, walls, strict=True)
-        ]
-        larger = paper_for_one(sizes, scale)
-        said += f" (on {larger} each wall takes one)" if larger else ""
-    return said
-
-
-def _chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
+def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
+    """The walls of a run that are drawn: all, or the one that is asked for."""
     if chosen.wall is None:
         return results.walls
     numbered = {wall.number: wall for wall in results.walls}
     return [wanted_wall(chosen.wall, numbered, results.address, "shows")]
 
 
-def _size_m(wall: WallResult) -> tuple[float, float]:
-    return wall.frame.width * wall.frame.gsd_m, wall.frame.height * wall.frame.gsd_m
-
-
-def _drawing(
-    results: RoomResults, wall: WallResult, chosen: Choices, scale: int, text: SheetText
-) -> WallDrawing:
-    kinds = _kinds(wall, chosen)
-    grid_m = nice_step(1e-3 * _GRID_MM * scale) if chosen.grid_m is None else chosen.grid_m
-    if 0.0 < grid_m < 2e-3 * scale:
-        raise ArgumentError(
-            f"--grid {grid_m:g} puts crosses closer than 2 mm at 1:{scale}: take at least "
-            f"{2e-3 * scale:g}, or 0 for none"
-        )
-    planes = results.planes
-    depths = stretch_of(wall.rasters["depth"]) if "depth" in kinds else None
-    return WallDrawing(
-        number=wall.number,
-        rasters={kind: wall.rasters[kind] for kind in kinds},
-        axes=axes_of(wall.frame),
-        plan=None if planes is None else key_plan(planes, wall.frame),
-        text=text,
-        scale=scale,
-        grid_m=grid_m if math.isfinite(grid_m) else 0.0,
-        interval_m=0.0 if depths is None else depths.interval,
-        depth_range_m=None if depths is None else (depths.low, depths.high),
-        areas=_areas(results, wall),
-        intensity_is_grey=wall.intensity_source != "laser",
-    )
-
-
-def _areas(results: RoomResults, wall: WallResult) -> tuple[MarkedArea, ...]:
-    """Openings of a wall, from the top-left corner of its raster."""
-    frame = wall.frame
-    return tuple(
-        MarkedArea(
-            text=opening.said, outline_m=frame.gsd_m * frame.wall_from_raster(opening.outline_m)
-        )
-        for opening in results.openings_of(wall)
-    )
-
-
-def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """What is shown of a wall: its orthoimage, or else what the scan shows, and what is asked."""
-    first = next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
-    for kind in chosen.beside:
-        if kind not in wall.rasters:
-            raise ArgumentError(
-                f"--beside {kind}: the run has no {kind} of wall {wall.number}, only "
-                f"{', '.join(wall.rasters)}"
-            )
-    return list(dict.fromkeys((first, *chosen.beside)))
-
-
-def _sheet_text(run: Run, wall: WallResult, block: TitleBlock, digest: str) -> SheetText:
-    notes = [f"accuracy: {'; '.join(wall.accuracy)}" if wall.accuracy else "accuracy not checked"]
-    if wall.colours:
-        notes.append(wall.colours)
-    notes.append(f"cells of {1e3 * wall.frame.gsd_m:g} mm")
-    return SheetText(
-        name=wall.name,
-        block=block,
-        notes=tuple(notes),
-        digest=digest,
-        run=f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}",
-    )
-
-
-def _write_wall(folder: Path, drawing: WallDrawing, wall: WallResult, paper: Paper) -> int:
-    """Write the sheets of a wall, and give how many there are besides the index."""
-    kinds = tuple(drawing.rasters)
-    way, views = placed_views(
-        kinds, _size_m(wall), paper, scale=drawing.scale, grid_m=drawing.grid_m
-    )
-    for number, shown in enumerate(views, start=1):
-        sheet = Sheet(
-            paper=way,
-            views=shown,
-            number=number,
-            count=len(views),
-            numbered=_numbered(views, shown[0].kind),
-        )
-        write_sheet(folder / f"wall_{drawing.number}_sheet_{number}.pdf", drawing, sheet)
-    numbered = _numbered(views, kinds[0])
-    if numbered:
-        # As large as one sheet takes; its scale is as true as that of the others.
-        scale = fitting_scale([_size_m(wall)], paper)
-        small = replace(drawing, scale=scale, grid_m=0.0)
-        way, whole = placed_views(kinds[:1], _size_m(wall), paper, scale=scale, grid_m=0.0)
-        index = Sheet(paper=way, views=whole[0], number=0, count=len(views), numbered=numbered)
-        # Of what no usual scale gets onto one sheet there is none.
-        if len(whole) == 1:
-            write_sheet(folder / f"wall_{drawing.number}_index.pdf", small, index)
-    return len(views)
-
-
-def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, Part], ...]:
-    """What of a wall is on which of the sheets of one picture; empty where it is not cut."""
-    parts = tuple(
-        (number, sheet[0].part)
-        for number, sheet in enumerate(views, start=1)
-        if sheet[0].kind == kind
-    )
-    return parts if len(parts) > 1 else ()
-
-
 def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>.dxf` and `room.dxf`, and the pictures that they refer to."""
     results = room_results(run, chosen.cell, chosen.wall)
-    walls = _chosen_walls(results, chosen)
+    walls = chosen_walls(results, chosen)
     lines = _lines(results)
     make_empty(folder)
     drawn = []
@@ -219,7 +67,7 @@ def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
 def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>.geojson`, `wall_<k>_seams.geojson` and `room.geojson`."""
     results = room_results(run, chosen.cell, chosen.wall)
-    walls = _chosen_walls(results, chosen)
+    walls = chosen_walls(results, chosen)
     lines = _lines(results)
     make_empty(folder)
     for wall in walls:
@@ -272,7 +120,7 @@ def export_relief(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>_relief.tif`, `wall_<k>_relief.png` and `wall_<k>_contours.geojson`."""
     light = _light(chosen.light)
     results = room_results(run, chosen.cell, chosen.wall)
-    walls = [wall for wall in _chosen_walls(results, chosen) if "depth" in wall.rasters]
+    walls = [wall for wall in chosen_walls(results, chosen) if "depth" in wall.rasters]
     if not walls:
         raise ArgumentError(f"the run {run.record.run_id} has no depths of walls")
     make_empty(folder)

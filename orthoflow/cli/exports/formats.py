@@ -171,10 +171,12 @@ FORMATS: Final[Mapping[str, Format]] = {
         takes_rasters=True,
     ),
     "sheet": Format(
-        writer="drawings:export_sheets",
+        writer="sheets:export_sheets",
         summary="each wall on paper in exact scale, as PDF, with coordinates, title block, "
-        "accuracy and the seal of the record",
-        options=frozenset({"cell", "scale", "paper", "wall", "grid_m", "title_block", "beside"}),
+        "legend, accuracy and the seal of the record",
+        options=frozenset(
+            {"cell", "scale", "paper", "wall", "grid", "units", "title_block", "beside", "language"}
+        ),
         takes_rasters=True,
     ),
 }
@@ -191,7 +193,8 @@ FLAGS: Final = {
     "relief": "--relief",
     "scale": "--scale",
     "paper": "--paper",
-    "grid_m": "--grid",
+    "grid": "--grid",
+    "units": "--units",
     "title_block": "--title-block",
     "beside": "--beside",
     "heights_m": "--height",

@@ -13,9 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.papers import MARGIN_MM, SCALES, SIZES_MM, Paper, Part, paper_of
-from orthoflow.files.drawings.pens import POINTS_PER_MM, line, text_width_mm, write_text
+from orthoflow.files.drawings.pens import (
+    POINTS_PER_MM,
+    line,
+    sheet_canvas,
+    text_width_mm,
+    write_text,
+)
 from orthoflow.files.drawings.printed_pictures import picture_file, write_picture
-from orthoflow.files.drawings.sheets import sheet_canvas
 from orthoflow.files.drawings.words import Language, label
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.directions import basis_from_up

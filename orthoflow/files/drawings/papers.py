@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 from orthoflow.errors import ArgumentError
+
+Layout = Literal["column", "strip"]
 
 SIZES_MM: Final = {
     "A0": (1189.0, 841.0),
@@ -17,46 +19,69 @@ SIZES_MM: Final = {
     "A3": (420.0, 297.0),
     "A4": (297.0, 210.0),
 }
+# Of the elongated papers of ISO 5457 those that rolls of 297, 420 and 594 mm give.
+LONG_MM: Final = {
+    "A3.2": (594.0, 297.0),
+    "A3.1": (841.0, 297.0),
+    "A3.0": (1189.0, 297.0),
+    "A2.1": (841.0, 420.0),
+    "A2.0": (1189.0, 420.0),
+    "A1.0": (1189.0, 594.0),
+}
 MOST_SHEETS: Final = 200
 SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
+# Inches to the foot: 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16", and engineers' 1" = 20 ft ...
+SCALES_FT: Final = (1, 2, 4, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 240, 480, 1200, 2400, 6000)
+FOOT_M: Final = 0.3048
 _EDGE_MM: Final = (150.0, 5000.0)
 MARGIN_MM: Final = 10.0
-# Around a picture: for its frame and the coordinates beside it.
-LABELS_MM: Final = 9.0
+# Around a picture: for its frame and the coordinates and heights beside it.
+LEFT_MM: Final = 11.0
+RIGHT_MM: Final = 24.0
+ABOVE_MM: Final = 11.0
+BELOW_MM: Final = 11.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Paper:
-    """A sheet of paper.
+    """A sheet of paper, and where on it the title block stands.
 
     Attributes:
         width_mm: of the sheet as it is read.
         height_mm: likewise.
+        name: of the paper, empty for any other size.
+        layout: the title block stands in a column on the right, or in a strip along the lower edge.
+        block_mm: width of that column, or height of that strip.
     """
 
     width_mm: float
     height_mm: float
-
-    @property
-    def column_mm(self) -> float:
-        """Width of the column with the title block."""
-        return min(180.0, max(62.0, 0.24 * self.width_mm))
+    name: str = ""
+    layout: Layout = "column"
+    block_mm: float = 0.0
 
     @property
     def area_mm(self) -> tuple[float, float]:
-        """Width and height that pictures can take."""
-        width_mm = self.width_mm - 2 * MARGIN_MM - self.column_mm - 2 * LABELS_MM
-        return width_mm, self.height_mm - 2 * MARGIN_MM - 2 * LABELS_MM
+        """Width and height that pictures can take, with what stands around them."""
+        wide, high = self.width_mm - 2 * MARGIN_MM, self.height_mm - 2 * MARGIN_MM
+        if self.layout == "column":
+            return wide - self.block_mm, high
+        return wide, high - self.block_mm
+
+    @property
+    def corner_mm(self) -> tuple[float, float]:
+        """Bottom-left corner of that area on the paper."""
+        return MARGIN_MM, MARGIN_MM + (self.block_mm if self.layout == "strip" else 0.0)
 
     @property
     def turned(self) -> Paper:
         """The same paper, upright instead of lying, or lying instead of upright."""
-        return Paper(width_mm=self.height_mm, height_mm=self.width_mm)
+        return replace(self, width_mm=self.height_mm, height_mm=self.width_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A part of a wall's raster, metres from its top-left corner, to the right and down."""
+    """A part of a drawn wall, metres from its top-left corner, to the right and down."""
 
     left_m: float
     top_m: float
@@ -85,163 +110,137 @@ class View:
 
 
 def paper_of(text: str) -> Paper:
-    """Read the name of a paper, `A0` to `A4`, or its width and height as `700x500`, in mm.
+    """Read the name of a paper, `A0` to `A4`, `A3.1` ..., or its size as `700x500`, in mm.
 
     Raises:
         ArgumentError: it is neither.
     """
-    if text.upper() in SIZES_MM:
-        width_mm, height_mm = SIZES_MM[text.upper()]
-        return Paper(width_mm=width_mm, height_mm=height_mm)
+    known = SIZES_MM | LONG_MM
+    if (name := text.upper()) in known:
+        return Paper(width_mm=known[name][0], height_mm=known[name][1], name=name)
     found = re.fullmatch(r"(\d{2,4}(?:\.\d+)?)x(\d{2,4}(?:\.\d+)?)", text)
     low, high = _EDGE_MM
     if found and all(low <= float(edge) <= high for edge in found.groups()):
         return Paper(width_mm=float(found[1]), height_mm=float(found[2]))
     raise ArgumentError(
-        f"--paper must be {', '.join(SIZES_MM)}, or width x height of {low:g} to {high:g} mm such "
+        f"--paper must be {', '.join(known)}, or width x height of {low:g} to {high:g} mm such "
         f"as 700x500, got {text[:100]!r}"
     )
 
 
-def fitting_scale(sizes_m: Sequence[tuple[float, float]], paper: Paper) -> int:
-    """The largest usual scale, 1 : n, at which each of some walls fits onto one sheet; gives n."""
-    for scale in SCALES:
-        if all(
-            any(_fits(size, scale, way.area_mm) for way in (paper, paper.turned))
-            for size in sizes_m
-        ):
-            return scale
-    return SCALES[-1]
+def usual_papers() -> list[Paper]:
+    """Usual papers from the smallest, lying before upright."""
+    names = sorted(SIZES_MM | LONG_MM, key=lambda name: math.prod((SIZES_MM | LONG_MM)[name]))
+    return [way for name in names for way in (paper_of(name), paper_of(name).turned)]
 
 
-def placed_views(
+def together(
+    kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int
+) -> tuple[View, ...]:
+    """Place the pictures of a wall beside or below each other on one sheet; none if too large.
+
+    Args:
+        kinds: the pictures.
+        size_m: width and height of the wall as it is drawn.
+        paper: of the sheet.
+        scale: n of 1 : n.
+    """
+    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+    wide, high = _with_labels(size_m, scale)
+    count, (across, up) = len(kinds), paper.area_mm
+    for columns, rows in ((count, 1), (1, count)):
+        # A micrometre of slack: 12.0 m at 1:50 are 240.00000000000003 mm.
+        if columns * wide > across + 1e-3 or rows * high > up + 1e-3:
+            continue
+        left, bottom = paper.corner_mm
+        left += 0.5 * (across - columns * wide) + LEFT_MM
+        top = bottom + up - 0.5 * (up - rows * high) + BELOW_MM
+        return tuple(
+            View(
+                kind=kind,
+                part=whole,
+                corner_mm=(
+                    left + (place * wide if rows == 1 else 0.0),
+                    top - high * (1 + (place if rows > 1 else 0)),
+                ),
+            )
+            for place, kind in enumerate(kinds)
+        )
+    return ()
+
+
+def cut_up(
     kinds: Sequence[str],
     size_m: tuple[float, float],
     paper: Paper,
     *,
     scale: int,
     grid_m: float,
-) -> tuple[Paper, tuple[tuple[View, ...], ...]]:
-    """Lay the pictures of a wall onto sheets: all onto one, else each onto as many as it needs.
+) -> tuple[tuple[View, ...], ...]:
+    """Lay each picture of a wall onto as many sheets as it needs, evenly.
 
     Args:
         kinds: the pictures.
-        size_m: width and height of the wall's raster.
-        paper: of the sheets; it is turned where that saves some.
+        size_m: width and height of the wall as it is drawn.
+        paper: of the sheets.
         scale: n of 1 : n.
-        grid_m: where a wall is cut, it is cut at whole steps of the grid; 0 for anywhere.
-
-    Returns:
-        The paper, perhaps turned, and the views of each sheet.
+        grid_m: the wall is cut at whole steps of the grid where sheets have the room; 0 for
+            anywhere.
 
     Raises:
         ArgumentError: it takes more than `MOST_SHEETS`.
     """
-    ways = [(way, _sheets(kinds, size_m, way, scale, grid_m)) for way in (paper, paper.turned)]
-    return min(ways, key=lambda way: len(way[1]))
-
-
-def _fits(size_m: tuple[float, float], scale: int, area_mm: tuple[float, float]) -> bool:
-    return all(
-        # A micrometre of slack: 12.0 m at 1:50 are 240.00000000000003 mm.
-        1e3 * edge / scale <= limit + 1e-3
-        for edge, limit in zip(size_m, area_mm, strict=True)
-    )
-
-
-def paper_for_one(walls: Sequence[tuple[Sequence[str], tuple[float, float]]], scale: int) -> str:
-    """Name the smallest usual paper that takes each wall on one sheet; empty where none does.
-
-    Args:
-        walls: the pictures of each, and width and height of its raster.
-        scale: n of 1 : n.
-    """
-    for name in reversed(SIZES_MM):
-        paper = paper_of(name)
-        if all(
-            any(_on_one(kinds, size_m, way, scale) for way in (paper, paper.turned))
-            for kinds, size_m in walls
-        ):
-            return name
-    return ""
-
-
-def _sheets(
-    kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int, grid_m: float
-) -> tuple[tuple[View, ...], ...]:
-    together = _on_one(kinds, size_m, paper, scale)
-    if together:
-        return (together,)
-    parts = _parts(size_m, paper.area_mm, scale, grid_m)
+    around = (LEFT_MM + RIGHT_MM, ABOVE_MM + BELOW_MM)
+    limits = [
+        1e-3 * scale * max(1.0, limit - labels)
+        for limit, labels in zip(paper.area_mm, around, strict=True)
+    ]
+    counts = [
+        max(1, math.ceil(size / limit - 1e-6)) for size, limit in zip(size_m, limits, strict=True)
+    ]
+    if math.prod(counts) > MOST_SHEETS:
+        raise ArgumentError(
+            f"a wall of {size_m[0]:.2f} x {size_m[1]:.2f} m takes {math.prod(counts):,} sheets at "
+            f"1:{scale}, at most {MOST_SHEETS} are drawn: take a larger --paper or --scale"
+        )
+    cuts = [
+        _even_cuts(size, limit, count, grid_m)
+        for size, limit, count in zip(size_m, limits, counts, strict=True)
+    ]
+    parts = [
+        Part(left_m=left, top_m=top, right_m=right, bottom_m=bottom)
+        for top, bottom in zip(cuts[1], cuts[1][1:], strict=False)
+        for left, right in zip(cuts[0], cuts[0][1:], strict=False)
+    ]
     return tuple((_alone(kind, part, paper, scale),) for kind in kinds for part in parts)
 
 
-def _on_one(
-    kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int
-) -> tuple[View, ...]:
-    """The pictures of a wall beside or below each other on one sheet; none if they do not fit."""
-    area = paper.area_mm
-    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
-    wide, high = (1e3 * edge / scale for edge in size_m)
-    gap, count = 2 * LABELS_MM, len(kinds)
-    for columns, rows in ((count, 1), (1, count)):
-        needed = (columns * wide + (columns - 1) * gap, rows * high + (rows - 1) * gap)
-        if needed[0] <= area[0] + 1e-3 and needed[1] <= area[1] + 1e-3:
-            left = MARGIN_MM + LABELS_MM + 0.5 * (area[0] - needed[0])
-            top = paper.height_mm - MARGIN_MM - LABELS_MM - 0.5 * (area[1] - needed[1])
-            return tuple(
-                View(
-                    kind=kind,
-                    part=whole,
-                    corner_mm=(
-                        left + (place * (wide + gap) if rows == 1 else 0.0),
-                        top - high - (place * (high + gap) if rows > 1 else 0.0),
-                    ),
-                )
-                for place, kind in enumerate(kinds)
-            )
-    return ()
-
-
-def _parts(
-    size_m: tuple[float, float], area_mm: tuple[float, float], scale: int, grid_m: float
-) -> list[Part]:
-    """Parts of a wall in reading order, each no larger than an area on the paper."""
-    steps = []
-    for limit_mm in area_mm:
-        step = limit_mm * scale / 1e3
-        steps.append(step if not 0.0 < grid_m <= step else math.floor(step / grid_m) * grid_m)
-    across, down = (
-        max(1, math.ceil(size / step - 1e-6)) for size, step in zip(size_m, steps, strict=True)
-    )
-    if across * down > MOST_SHEETS:
-        raise ArgumentError(
-            f"a wall of {size_m[0]:.2f} x {size_m[1]:.2f} m takes {across * down:,} sheets at "
-            f"1:{scale}, at most {MOST_SHEETS} are drawn: take a larger --paper or --scale"
-        )
-    return [
-        Part(
-            left_m=column * steps[0],
-            top_m=row * steps[1],
-            right_m=min(size_m[0], (column + 1) * steps[0]),
-            bottom_m=min(size_m[1], (row + 1) * steps[1]),
-        )
-        for row in range(down)
-        for column in range(across)
-    ]
+def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list[float]:
+    """Where an edge is cut: parts are equal, but for whole steps of the grid where these fit."""
+    step_m = size_m / count
+    if grid_m > 0.0 and math.ceil(step_m / grid_m - 1e-9) * grid_m <= limit_m + 1e-9:
+        step_m = math.ceil(step_m / grid_m - 1e-9) * grid_m
+    return [*(place * step_m for place in range(count) if place * step_m < size_m), size_m]
 
 
 def _alone(kind: str, part: Part, paper: Paper, scale: int) -> View:
-    """One picture at the top left of its sheet, where cut sheets meet when they are laid out."""
-    high_mm = 1e3 * part.size_m[1] / scale
+    """One picture in the middle of its sheet."""
+    wide, high = _with_labels(part.size_m, scale)
+    left, bottom = paper.corner_mm
+    across, up = paper.area_mm
     return View(
         kind=kind,
         part=part,
         corner_mm=(
-            MARGIN_MM + LABELS_MM,
-            paper.height_mm - MARGIN_MM - LABELS_MM - high_mm,
+            left + 0.5 * (across - wide) + LEFT_MM,
+            bottom + 0.5 * (up - high) + BELOW_MM,
         ),
     )
+
+
+def _with_labels(size_m: tuple[float, float], scale: int) -> tuple[float, float]:
+    wide, high = (1e3 * edge / scale for edge in size_m)
+    return wide + LEFT_MM + RIGHT_MM, high + ABOVE_MM + BELOW_MM
 
 
 def nice_step(least: float) -> float:

@@ -1,68 +1,157 @@
-"""Lines and text on a sheet, in millimetres from its bottom-left corner."""
+"""Pages, lines and text on paper, in millimetres from its bottom-left corner.
+
+Lines have the widths of ISO 128-2, text the heights of ISO 3098: nothing is smaller than 2.5 mm.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from html import escape
+from io import BytesIO
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
+    from orthoflow.files.drawings.papers import Paper
+
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
-THIN_MM: Final = 0.1
-LABEL_MM: Final = 2.0
+# ISO 128-2: each about the square root of two wider than the one before.
+FINE_MM: Final = 0.13
+THIN_MM: Final = 0.25
+MEDIUM_MM: Final = 0.35
+WIDE_MM: Final = 0.5
+FRAME_MM: Final = 0.7
+# ISO 3098.
+TEXT_MM: Final = 2.5
+HEADING_MM: Final = 3.5
+TITLE_MM: Final = 5.0
+BLACK: Final = (0.0, 0.0, 0.0)
+WHITE: Final = (1.0, 1.0, 1.0)
+RED: Final = (0.8, 0.0, 0.0)
+GREY: Final = (0.5, 0.5, 0.5)
+# Contours before the plane and behind it, and openings.
+BEFORE: Final = (0.80, 0.25, 0.05)
+BEHIND: Final = (0.05, 0.30, 0.75)
+OPENING: Final = (0.0, 0.40, 0.45)
+# ISO 128-2, line 10: a long dash, a gap, a dot, a gap.
+MATCH_DASHES_MM: Final = (8.0, 1.5, 0.5, 1.5)
+# Height of capital letters of the font over its size.
+_CAPITALS: Final = 0.729
+
+Colour = tuple[float, float, float]
+
+
+@contextmanager
+def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
+    """Open a PDF page whose unit is the millimetre."""
+    from reportlab import rl_config
+    from reportlab.pdfgen.canvas import Canvas
+
+    # Pictures as bytes: as text they would be a quarter larger, and slow to write.
+    rl_config.useA85 = 0
+    register_fonts()
+    size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
+    canvas = Canvas(str(path), pagesize=size, pageCompression=1, invariant=1)
+    canvas.setCreator("orthoflow")
+    yield canvas
 
 
 def line(
     canvas: Canvas,
     points_mm: Sequence[tuple[float, float]] | NDArray[np.float64],
     *,
-    width_mm: float = THIN_MM,
+    width_mm: float = FINE_MM,
+    colour: Colour = BLACK,
+    dashes_mm: Sequence[float] = (),
     is_closed: bool = False,
 ) -> None:
     """Draw a line through points (n, 2) on the paper."""
     canvas.setLineWidth(width_mm * POINTS_PER_MM)
+    canvas.setStrokeColorRGB(*colour)
+    if dashes_mm:
+        canvas.setDash([POINTS_PER_MM * length for length in dashes_mm])
     path = canvas.beginPath()
     for place, (x, y) in enumerate(points_mm):
         (path.lineTo if place else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
     if is_closed:
         path.close()
     canvas.drawPath(path)
+    if dashes_mm:
+        canvas.setDash()
 
 
-def write_text(
+def box(
+    canvas: Canvas, sides_mm: tuple[float, float, float, float], colour: Colour = BLACK
+) -> None:
+    """Fill a rectangle: left, bottom, width and height."""
+    canvas.setFillColorRGB(*colour)
+    canvas.rect(*(POINTS_PER_MM * side for side in sides_mm), stroke=0, fill=1)
+
+
+def arrow(canvas: Canvas, ends_mm: NDArray[np.float64], colour: Colour = BLACK) -> None:
+    """Draw an arrow from the first to the second of two places (2, 2)."""
+    along = (ends_mm[1] - ends_mm[0]) / max(float(np.linalg.norm(ends_mm[1] - ends_mm[0])), 1e-9)
+    aside = np.array([-along[1], along[0]])
+    barbs = [ends_mm[1] - 2.5 * along + side * 0.9 * aside for side in (1.0, -1.0)]
+    for points in (ends_mm, np.array([barbs[0], ends_mm[1], barbs[1]])):
+        line(canvas, points, width_mm=MEDIUM_MM, colour=colour)
+
+
+def cross(canvas: Canvas, x: float, y: float) -> None:
+    """Draw a cross of 3 mm, white below black, so that it is seen on any picture."""
+    for colour, width_mm in ((WHITE, WIDE_MM), (BLACK, FINE_MM)):
+        line(canvas, [(x - 1.5, y), (x + 1.5, y)], width_mm=width_mm, colour=colour)
+        line(canvas, [(x, y - 1.5), (x, y + 1.5)], width_mm=width_mm, colour=colour)
+
+
+def height_mark(canvas: Canvas, at_mm: tuple[float, float], text: str) -> None:
+    """Draw a height mark, its tip at a place, with the height beside it."""
+    x, y = at_mm
+    line(canvas, [(x - 2.0, y), (x + 2.0, y)])
+    tip = [(x, y), (x - 1.2, y + 2.1), (x + 1.2, y + 2.1)]
+    line(canvas, tip, width_mm=THIN_MM, is_closed=True)
+    write_text(canvas, text, (x + 2.2, y + 0.3))
+
+
+def write_text(  # noqa: PLR0913 - what a text has
     canvas: Canvas,
     text: str,
     at_mm: tuple[float, float],
     *,
-    high_mm: float = LABEL_MM,
+    high_mm: float = TEXT_MM,
     is_bold: bool = False,
     turned_deg: float = 0.0,
     is_centred: bool = False,
+    colour: Colour = BLACK,
 ) -> None:
     """Write a line of text, its height that of its capital letters; foreign letters harmless.
 
     It is turned counter-clockwise about where it begins, or about its middle where it is centred.
     """
     canvas.saveState()
-    canvas.setFont(f"{FONT}-Bold" if is_bold else FONT, font_points(high_mm))
     canvas.translate(at_mm[0] * POINTS_PER_MM, at_mm[1] * POINTS_PER_MM)
     if turned_deg:
         canvas.rotate(turned_deg)
-    (canvas.drawCentredString if is_centred else canvas.drawString)(0, 0, shown(text))
+    canvas.setFillColorRGB(*colour)
+    left = -0.5 * text_width_mm(text, high_mm, is_bold=is_bold) if is_centred else 0.0
+    for font, part in _runs(shown(text), is_bold=is_bold):
+        canvas.setFont(font, font_points(high_mm))
+        canvas.drawString(left * POINTS_PER_MM, 0, part)
+        left += float(canvas.stringWidth(part, font, font_points(high_mm))) / POINTS_PER_MM
     canvas.restoreState()
-
-
-def font_points(high_mm: float) -> float:
-    """Size of the font whose capital letters are so high."""
-    return high_mm * POINTS_PER_MM / 0.729
 
 
 def write_on_white(
@@ -70,32 +159,156 @@ def write_on_white(
     text: str,
     middle_mm: tuple[float, float],
     *,
-    high_mm: float = LABEL_MM,
     turned_deg: float = 0.0,
+    colour: Colour = BLACK,
 ) -> None:
     """Write a line of text around a place, on white: what lies below is cut out for it."""
     along = np.array([math.cos(math.radians(turned_deg)), math.sin(math.radians(turned_deg))])
-    middle = np.array(middle_mm)
-    half = 0.5 * text_width_mm(text, high_mm) + 0.4 * high_mm
-    canvas.saveState()
-    canvas.setStrokeColorRGB(1.0, 1.0, 1.0)
-    line(canvas, np.array([middle - half * along, middle + half * along]), width_mm=1.6 * high_mm)
-    canvas.restoreState()
+    aside = np.array([-along[1], along[0]])
+    half = 0.5 * text_width_mm(text, TEXT_MM) + 0.4 * TEXT_MM
+    corners = [
+        np.array(middle_mm) + side * half * along + up * 0.8 * TEXT_MM * aside
+        for side, up in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    path = canvas.beginPath()
+    for place, (x, y) in enumerate(corners):
+        (path.lineTo if place else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
+    canvas.setFillColorRGB(*WHITE)
+    canvas.drawPath(path, stroke=0, fill=1)
     # Its capital letters stand as far above the middle as below it.
-    x, y = middle + 0.5 * high_mm * np.array([along[1], -along[0]])
-    write_text(
-        canvas,
-        text,
-        (float(x), float(y)),
-        high_mm=high_mm,
-        turned_deg=turned_deg,
-        is_centred=True,
-    )
+    x, y = np.array(middle_mm) - 0.5 * TEXT_MM * aside
+    at = (float(x), float(y))
+    write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True, colour=colour)
 
 
-def text_width_mm(text: str, high_mm: float, *, is_bold: bool = True) -> float:
+def font_points(high_mm: float) -> float:
+    """Size of the font whose capital letters are so high."""
+    return high_mm * POINTS_PER_MM / _CAPITALS
+
+
+def text_width_mm(text: str, high_mm: float = TEXT_MM, *, is_bold: bool = False) -> float:
     """How wide a line of text is on the paper."""
     from reportlab.pdfbase.pdfmetrics import stringWidth
 
-    font = f"{FONT}-Bold" if is_bold else FONT
-    return float(stringWidth(shown(text), font, font_points(high_mm))) / POINTS_PER_MM
+    register_fonts()
+    widths = (
+        stringWidth(part, font, font_points(high_mm))
+        for font, part in _runs(shown(text), is_bold=is_bold)
+    )
+    return float(sum(widths)) / POINTS_PER_MM
+
+
+def paragraph(
+    text: str, *, high_mm: float = TEXT_MM, is_bold: bool = False, colour: Colour = BLACK
+) -> Any:
+    """Make a flowable of text that wraps, with the fonts that its letters need."""
+    from reportlab.lib.colors import Color
+    from reportlab.lib.styles import ParagraphStyle
+    from reportlab.platypus import Paragraph
+
+    register_fonts()
+    style = ParagraphStyle(
+        name="sheet",
+        fontName=f"{FONT}-Bold" if is_bold else FONT,
+        fontSize=font_points(high_mm),
+        leading=1.7 * high_mm * POINTS_PER_MM,
+        textColor=Color(*colour),
+        splitLongWords=True,
+    )
+    parts = (
+        escape(part) if font.startswith(FONT) else f'<font name="{font}">{escape(part)}</font>'
+        for font, part in _runs(shown(text), is_bold=is_bold)
+    )
+    return Paragraph("".join(parts), style)
+
+
+# --- fonts ---
+
+
+@lru_cache(maxsize=1)
+def register_fonts() -> frozenset[int]:
+    """Register the letters of Latin, Greek and Cyrillic, and return their code points."""
+    import matplotlib as mpl
+    from reportlab.pdfbase.pdfmetrics import registerFont
+    from reportlab.pdfbase.ttfonts import TTFont
+
+    folder = Path(mpl.get_data_path()) / "fonts" / "ttf"
+    bold, plain = (
+        TTFont(name, str(folder / f"DejaVuSans{suffix}.ttf"))
+        for name, suffix in ((f"{FONT}-Bold", "-Bold"), (FONT, ""))
+    )
+    registerFont(bold)
+    registerFont(plain)
+    return frozenset(set(plain.face.charToGlyph) & set(bold.face.charToGlyph))
+
+
+def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
+    """Split a text by the fonts that have its letters."""
+    usual = f"{FONT}-Bold" if is_bold else FONT
+    known = register_fonts()
+    for font, letters in groupby(
+        text, lambda letter: usual if ord(letter) in known else fallback_font(letter)
+    ):
+        yield font, "".join(letters)
+
+
+@lru_cache(maxsize=4096)
+def fallback_font(letter: str) -> str:
+    """Make a font of one letter out of those that are installed, and return its name.
+
+    reportlab embeds fonts with TrueType outlines only, so others are converted.
+
+    Raises:
+        InputError: no installed font has the letter.
+    """
+    from fontTools.fontBuilder import FontBuilder
+    from fontTools.pens.cu2quPen import Cu2QuPen
+    from fontTools.pens.ttGlyphPen import TTGlyphPen
+    from fontTools.ttLib import TTFont as FontFile
+    from reportlab.pdfbase.pdfmetrics import registerFont
+    from reportlab.pdfbase.ttfonts import TTFont
+
+    code = ord(letter)
+    path = next((path for path, codes in _installed_letters().items() if code in codes), None)
+    if path is None:
+        raise InputError(
+            f"the letter {letter} (U+{code:04X}) of a text on the sheet is in no installed font: "
+            "install one that has it (Noto Sans CJK has those of Chinese, Japanese and Korean), or "
+            "write the text in Latin, Greek or Cyrillic letters"
+        )
+    outline = TTGlyphPen(None)
+    with FontFile(path, fontNumber=0) as source:
+        glyph = source.getGlyphSet()[source.getBestCmap()[code]]
+        units, wide = int(source["head"].unitsPerEm), glyph.width
+        glyph.draw(Cu2QuPen(outline, 0.001 * units, reverse_direction="glyf" not in source))
+    builder = FontBuilder(units, isTTF=True)
+    builder.setupGlyphOrder([".notdef", "letter"])
+    builder.setupCharacterMap({code: "letter"})
+    builder.setupGlyf({".notdef": TTGlyphPen(None).glyph(), "letter": outline.glyph()})
+    builder.setupHorizontalMetrics({".notdef": (units, 0), "letter": (wide, 0)})
+    builder.setupHorizontalHeader(ascent=units, descent=-units // 4)
+    name = f"Letter-{code:04X}"
+    builder.setupNameTable({"familyName": name, "styleName": "Regular", "psName": name})
+    builder.setupOS2()
+    builder.setupPost()
+    content = BytesIO()
+    builder.font.save(content)
+    content.seek(0)
+    registerFont(TTFont(name, content))
+    return name
+
+
+@lru_cache(maxsize=1)
+def _installed_letters() -> dict[str, frozenset[int]]:
+    """Code points of each font of the system, by path; of collections those of their first font."""
+    from fontTools.ttLib import TTFont, TTLibError
+    from matplotlib.font_manager import findSystemFonts
+
+    found = {}
+    for path in sorted(findSystemFonts()):
+        try:
+            with TTFont(path, fontNumber=0, lazy=True) as font:
+                found[path] = frozenset(font.getBestCmap() or {})
+        except (TTLibError, OSError, KeyError, AssertionError):
+            continue
+    return found

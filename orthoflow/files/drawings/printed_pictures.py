@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, cast
 
@@ -26,6 +26,12 @@ _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
+# A contour has so many times the width of its number, else it has none.
+_LEAST_WIDTHS: Final = 5.0
+_APART_MM: Final = 12.0
+_TRIED: Final = (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
+# The chord over the length of the line below a number, at least: it would lie beside it else.
+_STRAIGHT: Final = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +47,9 @@ class Stretch:
         return nice_step(max((self.high - self.low) / 12.0, 1e-3))
 
 
-def write_picture(raster: Path, part: Part, path: Path, *, scale: int) -> tuple[int, int]:
+def write_picture(
+    raster: Path, part: Part, path: Path, *, scale: int, is_flipped: bool = False
+) -> tuple[int, int]:
     """Write a part of a wall's raster as a picture, white where it shows nothing.
 
     Cells are kept as they are where print shows them, else averaged to 400 pixels per inch.
@@ -51,11 +59,13 @@ def write_picture(raster: Path, part: Part, path: Path, *, scale: int) -> tuple[
         part: of the raster.
         path: file to write without its suffix, which says the format: PNG, or JPEG when large.
         scale: n of 1 : n.
+        is_flipped: the rows of the raster go up the paper; `part` is what is seen there.
 
     Returns:
         Rows and columns of the picture.
     """
     with RasterParts(raster) as source:
+        part = _flipped(part, source) if is_flipped else part
         cells = np.array([part.left_m, part.top_m, part.right_m, part.bottom_m]) / source.gsd_m
         cells = np.clip(cells, 0.0, [*source.shape[::-1], *source.shape[::-1]])
         shape = _printed_shape(part, cells, scale)
@@ -64,8 +74,14 @@ def write_picture(raster: Path, part: Part, path: Path, *, scale: int) -> tuple[
         for rows, values, shown in _bands(source, cells, shape):
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
             picture[rows][shown] = colours[shown]
-    _write_encoded(path, picture)
+    _write_encoded(path, np.ascontiguousarray(picture[::-1]) if is_flipped else picture)
     return shape
+
+
+def _flipped(part: Part, source: RasterParts) -> Part:
+    """The same part, counted from the other of the raster's upper and lower edges."""
+    high_m = source.shape[0] * source.gsd_m
+    return replace(part, top_m=high_m - part.bottom_m, bottom_m=high_m - part.top_m)
 
 
 def picture_file(path: Path) -> Path:
@@ -88,11 +104,12 @@ def stretch_of(raster: Path) -> Stretch:
 
 
 def contours(
-    raster: Path, part: Part, *, scale: int, interval_m: float
+    raster: Path, part: Part, *, scale: int, interval_m: float, is_flipped: bool = False
 ) -> list[tuple[float, NDArray[np.float64]]]:
     """Contours of a depth raster, each a level in metres and a line.
 
-    Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster.
+    Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
+    the drawing where the raster's rows go up the paper.
     Levels are half an interval from the plane, and an interval apart: on the plane itself, noise
     would be all that they draw. Depths are averaged over half a millimetre of paper; lines shorter
     than six are left out.
@@ -100,6 +117,8 @@ def contours(
     from contourpy import contour_generator
 
     with RasterParts(raster) as source:
+        part = _flipped(part, source) if is_flipped else part
+        high_m = source.shape[0] * source.gsd_m
         box = np.array([part.left_m, part.top_m, part.right_m, part.bottom_m]) / source.gsd_m
         pitch_m = max(source.gsd_m, 1e-3 * _CONTOUR_PITCH_MM * scale)
         columns, rows = (max(2, round(edge / pitch_m)) for edge in part.size_m)
@@ -126,8 +145,61 @@ def contours(
             points = np.asarray(line, dtype=np.float64)
             length_m = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
             if 1e3 * length_m / scale >= _SHORTEST_CONTOUR_MM:
+                if is_flipped:
+                    points[:, 1] = high_m - points[:, 1]
                 found.append((level, points))
     return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelPlace:
+    """Where a number stands.
+
+    Attributes:
+        middle_mm: of the number, on the paper.
+        turned_deg: counter-clockwise, so that it is never upside down.
+    """
+
+    middle_mm: tuple[float, float]
+    turned_deg: float
+
+
+def label_place(
+    points_mm: NDArray[np.float64], wide_mm: float, placed_mm: Sequence[NDArray[np.float64]]
+) -> LabelPlace | None:
+    """Find a place for a number on a line, None where there is none.
+
+    Args:
+        points_mm: the line, (n, 2) on the paper.
+        wide_mm: how wide the number is.
+        placed_mm: the middles of other numbers, (2,) each.
+    """
+    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if along[-1] < _LEAST_WIDTHS * wide_mm:
+        return None
+    for share in _TRIED:
+        middle = share * along[-1]
+        ends = np.array(
+            [
+                [
+                    np.interp(middle + side * 0.5 * wide_mm, along, points_mm[:, axis])
+                    for axis in (0, 1)
+                ]
+                for side in (-1.0, 1.0)
+            ]
+        )
+        chord = ends[1] - ends[0]
+        place = ends.mean(axis=0)
+        if float(np.linalg.norm(chord)) < _STRAIGHT * wide_mm:
+            continue
+        if any(float(np.linalg.norm(place - other)) < _APART_MM for other in placed_mm):
+            continue
+        turned_deg = math.degrees(math.atan2(chord[1], chord[0]))
+        if not -90.0 < turned_deg <= 90.0:
+            turned_deg -= math.copysign(180.0, turned_deg)
+        return LabelPlace(middle_mm=(float(place[0]), float(place[1])), turned_deg=turned_deg)
+    return None
 
 
 def _printed_shape(part: Part, cells: NDArray[np.float64], scale: int) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +13,27 @@ from numpy.typing import NDArray
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import Paper, Part, View
 from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.files.drawings.words import Language, Phrase
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.directions import basis_from_up
+
+Unit = Literal["m", "ft"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axes:
-    """What the coordinates beside a picture are.
+    """What the coordinates beside a picture are, in metres.
 
     Attributes:
-        across: coordinate at the raster's left edge, and its change per metre to the right.
+        across: coordinate at the left edge of the drawn wall, and its change per metre to the
+            right.
         down: coordinate at its top edge, and its change per metre downwards.
-        said: what they mean, for the sheet.
+        phrase: what they mean, for the sheet.
     """
 
     across: tuple[float, float]
     down: tuple[float, float]
-    said: str
+    phrase: Phrase
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,14 +43,14 @@ class SheetText:
     Attributes:
         name: of the wall.
         block: the office's title block.
-        notes: sentences: accuracy, colours, cells.
+        notes: accuracy, colours, cells.
         digest: what seals the record.
         run: which run of which workflow, by which program.
     """
 
     name: str
     block: TitleBlock
-    notes: tuple[str, ...]
+    notes: tuple[Phrase, ...]
     digest: str
     run: str
 
@@ -54,7 +61,7 @@ class MarkedArea:
 
     Attributes:
         text: written into it where it is wide enough, its parts (", ") below each other.
-        outline_m: (n, 2) metres to the right and down from the raster's top-left corner.
+        outline_m: (n, 2) metres to the right and down from the top-left corner of the drawn wall.
     """
 
     text: str
@@ -72,10 +79,15 @@ class WallDrawing:
         plan: the key plan, None without planes.
         text: what is written.
         scale: n of 1 : n.
-        grid_m: distance of the crosses, 0 for none.
+        grid: distance of the crosses in `unit`, 0 for none.
+        unit: of everything that is written beside pictures.
+        language: of labels.
         interval_m: of the contours of depth.
         depth_range_m: depths that the grey of the depth picture shows as black and as white.
         areas: openings of the wall.
+        heights: metres down from the top edge that have a height mark.
+        north: (2,) right and up on the paper of what is up in the key plan; None where heights are.
+        is_flipped: the rows of the rasters go up the paper, as those of ceilings do.
         intensity_is_grey: the intensity is the grey of the scan's colours, not of its laser.
     """
 
@@ -85,10 +97,15 @@ class WallDrawing:
     plan: KeyPlan | None
     text: SheetText
     scale: int
-    grid_m: float
+    grid: float
+    unit: Unit = "m"
+    language: Language = "en"
     interval_m: float = 0.0
     depth_range_m: tuple[float, float] | None = None
     areas: tuple[MarkedArea, ...] = ()
+    heights: tuple[float, ...] = ()
+    north: tuple[float, float] | None = None
+    is_flipped: bool = False
     intensity_is_grey: bool = False
 
 
@@ -109,3 +126,37 @@ class Sheet:
     number: int = 1
     count: int = 1
     numbered: tuple[tuple[int, Part], ...] = field(default=())
+
+
+def axes_of(frame: WallFrame) -> Axes:
+    """Coordinates of a raster, those of its GeoTIFF; Y goes up the paper, also that of ceilings."""
+    left_m, top_m = frame.raster_corner_m
+    if frame.raster_down > 0.0:
+        top_m += frame.height * frame.gsd_m
+    kind = frame.raster_axes
+    values: dict[str, object] = {"crs": frame.map_crs} if kind == "map" else {}
+    if kind == "wall":
+        values = {"up": _axis_words(np.array(frame.up))}
+    phrase = Phrase(key=f"axes_{kind}", values=values)
+    return Axes(across=(left_m, 1.0), down=(top_m, -1.0), phrase=phrase)
+
+
+def _axis_words(up: NDArray[np.float64]) -> str:
+    """Say which of the scan's axes heights count along, backwards or not."""
+    if up.shape != (3,):
+        return "?"
+    axis = int(np.argmax(np.abs(up)))
+    if abs(float(up[axis])) < 1.0 - 1e-9:
+        return f"({', '.join(f'{value:.3f}' for value in up.tolist())})"
+    return f"{'-' if up[axis] < 0.0 else ''}{'xyz'[axis]}"
+
+
+def north_of(frame: WallFrame) -> tuple[float, float] | None:
+    """Where on the drawing the key plan's up is: right and up; None of walls that stand upright."""
+    if frame.up is None or frame.raster_axes == "wall":
+        return None
+    north_world = basis_from_up(np.array(frame.up))[1]
+    right, down = float(north_world @ frame.u_world), float(north_world @ frame.v_world)
+    upwards = down if frame.raster_down > 0.0 else -down
+    length = float(np.hypot(right, upwards))
+    return (right / length, upwards / length) if length > 0.5 else None

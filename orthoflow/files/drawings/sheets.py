@@ -6,10 +6,10 @@ its bottom-left corner until reportlab takes them, in points.
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,63 +17,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import StoreError
-from orthoflow.files.drawings.contour_labels import label_place
-from orthoflow.files.drawings.papers import MARGIN_MM, Paper, View
+from orthoflow.files.drawings.papers import FOOT_M, View
 from orthoflow.files.drawings.pens import (
-    FONT,
-    LABEL_MM,
+    BEFORE,
+    BEHIND,
+    FINE_MM,
+    MATCH_DASHES_MM,
+    MEDIUM_MM,
+    OPENING,
     POINTS_PER_MM,
-    THIN_MM,
+    RED,
+    TEXT_MM,
+    WHITE,
+    WIDE_MM,
+    arrow,
+    box,
+    cross,
+    height_mark,
     line,
+    sheet_canvas,
     text_width_mm,
     write_on_white,
     write_text,
 )
-from orthoflow.files.drawings.printed_pictures import contours, picture_file, write_picture
-from orthoflow.files.drawings.sheet_columns import draw_column
-from orthoflow.files.drawings.sheet_contents import Axes, Sheet, WallDrawing
+from orthoflow.files.drawings.printed_pictures import (
+    contours,
+    label_place,
+    picture_file,
+    write_picture,
+)
+from orthoflow.files.drawings.sheet_blocks import Furniture
+from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
+from orthoflow.files.drawings.words import label
 from orthoflow.foreign_text import shown
-from orthoflow.geometry import WallFrame
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-_THICK_MM: Final = 0.35
-_CONTOUR_TEXT_MM: Final = 1.5
-_CROSS_MM: Final = 1.5
-_BEFORE: Final = (0.80, 0.25, 0.05)
-_BEHIND: Final = (0.05, 0.30, 0.75)
-_OPENING: Final = (0.0, 0.40, 0.45)
+_TICK_MM: Final = 1.5
+# Between what stands beside each other, at least.
+_APART_MM: Final = 1.5
+_MARK_ROW_MM: Final = 4.2
 
 
-def axes_of(frame: WallFrame) -> Axes:
-    """Coordinates of a raster, those of its GeoTIFF."""
-    left_m, top_m = frame.raster_corner_m
-    said = {
-        "map": f"X east, Y north ({frame.map_crs}), m",
-        "wall": "X along the wall from its left edge, H height: "
-        f"{_axis_words(np.array(frame.up))}, m",
-        "level": "X and Y: the horizontal axes of the scan, m",
-        "plane": "X to the right and Y upwards from the top-left corner of the orthoimage, m",
-    }[frame.raster_axes]
-    return Axes(across=(left_m, 1.0), down=(top_m, frame.raster_down), said=said)
-
-
-def _axis_words(up: NDArray[np.float64]) -> str:
-    """Say which of the scan's axes heights count along, backwards or not."""
-    if up.shape != (3,):
-        return "unknown"
-    axis = int(np.argmax(np.abs(up)))
-    if abs(float(up[axis])) < 1.0 - 1e-9:
-        return f"along ({', '.join(f'{value:.3f}' for value in up.tolist())}) of the scan"
-    return f"{'minus ' if up[axis] < 0.0 else ''}{'xyz'[axis]} of the scan"
-
-
-def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet) -> None:
+def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet, furniture: Furniture) -> None:
     """Write one sheet.
 
     Raises:
         StoreError: it cannot be written.
+        InputError: no font has a letter of its texts.
     """
     try:
         with (
@@ -84,163 +76,251 @@ def write_sheet(path: Path, drawing: WallDrawing, sheet: Sheet) -> None:
             canvas.setAuthor(shown(drawing.text.block.author))
             canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
             for place, view in enumerate(sheet.views):
-                _draw_view(canvas, drawing, view, Path(folder) / f"picture_{place}")
+                _draw_view(canvas, drawing, sheet, view, Path(folder) / f"picture_{place}")
             if sheet.number == 0:
                 _draw_cuts(canvas, drawing, sheet)
-            _draw_border(canvas, sheet.paper)
-            draw_column(canvas, drawing, sheet)
+            furniture.draw(canvas)
             canvas.showPage()
             canvas.save()
     except OSError as error:
         raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
 
 
-@contextmanager
-def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
-    """A page whose unit is the millimetre, with a font that has the letters of Europe."""
-    import matplotlib as mpl
-    from reportlab import rl_config
-    from reportlab.pdfbase.pdfmetrics import registerFont
-    from reportlab.pdfbase.ttfonts import TTFont
-    from reportlab.pdfgen.canvas import Canvas
-
-    # Pictures as bytes: as text they would be a quarter larger, and slow to write.
-    rl_config.useA85 = 0
-    fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
-    registerFont(TTFont(FONT, str(fonts / "DejaVuSans.ttf")))
-    registerFont(TTFont(f"{FONT}-Bold", str(fonts / "DejaVuSans-Bold.ttf")))
-    size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
-    canvas = Canvas(str(path), pagesize=size, pageCompression=1, invariant=1)
-    canvas.setCreator("orthoflow")
-    yield canvas
-
-
-def _draw_view(canvas: Canvas, drawing: WallDrawing, view: View, picture: Path) -> None:
-    """Draw a picture with its frame, contours, crosses and coordinates."""
+def _draw_view(
+    canvas: Canvas, drawing: WallDrawing, sheet: Sheet, view: View, picture: Path
+) -> None:
+    """Draw a picture with its frame, contours, crosses, coordinates, heights and match lines."""
     raster = drawing.rasters[view.kind]
-    left, bottom = view.corner_mm
-    wide, high = (1e3 * edge / drawing.scale for edge in view.part.size_m)
-    write_picture(raster, view.part, picture, scale=drawing.scale)
+    left, bottom, right, top = _edges(drawing, view)
+    write_picture(raster, view.part, picture, scale=drawing.scale, is_flipped=drawing.is_flipped)
     canvas.drawImage(
         str(picture_file(picture)),
-        *(POINTS_PER_MM * number for number in (left, bottom, wide, high)),
+        *(POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)),
     )
     if view.kind == "depth":
         _draw_contours(canvas, drawing, view)
     _draw_areas(canvas, drawing, view)
-    canvas.setStrokeColorRGB(0.0, 0.0, 0.0)
-    if drawing.grid_m > 0.0:
+    if drawing.grid > 0.0:
         _draw_grid(canvas, drawing, view)
-    corners = ((left, bottom), (left + wide, bottom), (left + wide, bottom + high))
-    line(canvas, [*corners, (left, bottom + high)], width_mm=_THICK_MM, is_closed=True)
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    line(canvas, corners, width_mm=MEDIUM_MM, is_closed=True)
+    neighbours = _neighbours(sheet, view) if sheet.number else {}
+    _draw_match_lines(canvas, drawing, view, neighbours)
+    if drawing.heights and "right" not in neighbours:
+        _draw_heights(canvas, drawing, view)
+    if drawing.north is not None:
+        foot = np.array([right + 12.0, top - 14.0])
+        middle = foot + np.array([0.0, 6.0])
+        half = 6.0 * np.array(drawing.north)
+        arrow(canvas, np.array([middle - half, middle + half]))
+        name = drawing.plan.up_label if drawing.plan is not None else "y"
+        write_text(
+            canvas, name, tuple(middle + 1.35 * half - [0.0, 0.5 * TEXT_MM]), is_centred=True
+        )
+
+
+def _edges(drawing: WallDrawing, view: View) -> tuple[float, float, float, float]:
+    """Left, bottom, right and top of a picture on the paper."""
+    left, bottom = view.corner_mm
+    wide, high = (1e3 * edge / drawing.scale for edge in view.part.size_m)
+    return left, bottom, left + wide, bottom + high
 
 
 def _draw_contours(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     found = contours(
-        drawing.rasters[view.kind], view.part, scale=drawing.scale, interval_m=drawing.interval_m
+        drawing.rasters[view.kind],
+        view.part,
+        scale=drawing.scale,
+        interval_m=drawing.interval_m,
+        is_flipped=drawing.is_flipped,
     )
     placed: list[NDArray[np.float64]] = []
     for level, points in found:
-        colour = _BEFORE if level > 0.0 else _BEHIND
-        canvas.setStrokeColorRGB(*colour)
+        colour = BEFORE if level > 0.0 else BEHIND
         on_paper = np.array([_on_paper(drawing, view, x, y) for x, y in points.tolist()])
-        line(canvas, on_paper, width_mm=0.13)
-        label = f"{round(1e3 * level, 6):+g}"
-        place = label_place(on_paper, text_width_mm(label, _CONTOUR_TEXT_MM), placed)
+        line(canvas, on_paper, width_mm=FINE_MM, colour=colour)
+        text = f"{round(1e3 * level, 6):+g}"
+        place = label_place(on_paper, text_width_mm(text), placed)
         if place is not None:
             placed.append(np.array(place.middle_mm))
-            canvas.setFillColorRGB(*colour)
-            write_on_white(
-                canvas,
-                label,
-                place.middle_mm,
-                high_mm=_CONTOUR_TEXT_MM,
-                turned_deg=place.turned_deg,
-            )
-    canvas.setFillColorRGB(0.0, 0.0, 0.0)
+            turned_deg = place.turned_deg
+            write_on_white(canvas, text, place.middle_mm, turned_deg=turned_deg, colour=colour)
 
 
 def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     """Outline openings, cut off where the picture ends."""
-    left, bottom = view.corner_mm
-    wide, high = (1e3 * edge / drawing.scale for edge in view.part.size_m)
+    left, bottom, right, top = _edges(drawing, view)
     canvas.saveState()
     frame = canvas.beginPath()
-    frame.rect(*(POINTS_PER_MM * number for number in (left, bottom, wide, high)))
+    frame.rect(*(POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)))
     canvas.clipPath(frame, stroke=0, fill=0)
     for area in drawing.areas:
         outline = [_on_paper(drawing, view, x, y) for x, y in area.outline_m.tolist()]
         # White below, so that the line is seen on any picture.
-        for colour, width_mm in (((1.0, 1.0, 1.0), 0.6), (_OPENING, 0.25)):
-            canvas.setStrokeColorRGB(*colour)
-            line(canvas, outline, width_mm=width_mm, is_closed=True)
+        line(canvas, outline, width_mm=1.0, colour=WHITE, is_closed=True)
+        line(canvas, outline, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True)
         xs, ys = zip(*outline, strict=True)
-        _write_inside(canvas, area.text, (min(xs), max(xs), max(ys)))
+        seen = (max(min(xs), left), min(max(xs), right), max(min(ys), bottom), min(max(ys), top))
+        _write_inside(canvas, area.text, seen)
     canvas.restoreState()
 
 
-def _write_inside(canvas: Canvas, text: str, limits_mm: tuple[float, float, float]) -> None:
-    """Write the parts of a text on white, from the top, where left and right are far enough."""
-    left, right, top = limits_mm
+def _write_inside(canvas: Canvas, text: str, limits_mm: Sequence[float]) -> None:
+    """Write the parts of a text on white, from the top, where there is the room."""
+    left, right, bottom, top = limits_mm
     rows = shown(text).split(", ")
-    wide = max(text_width_mm(row, LABEL_MM, is_bold=False) for row in rows)
-    if right - left < wide + 2.0 * LABEL_MM:
+    wide = max(text_width_mm(row) for row in rows) + 2.0
+    high = 1.7 * TEXT_MM * len(rows) + 1.0
+    if right - left < wide + 2.0 or top - bottom < high + 2.0:
         return
-    high = 1.7 * LABEL_MM * len(rows)
-    box = (left + 0.5 * LABEL_MM, top - high - LABEL_MM, wide + LABEL_MM, high + 0.5 * LABEL_MM)
-    canvas.setFillColorRGB(1.0, 1.0, 1.0)
-    canvas.rect(*(POINTS_PER_MM * number for number in box), stroke=0, fill=1)
-    canvas.setFillColorRGB(*_OPENING)
+    box(canvas, (left + 1.0, top - 1.0 - high, wide, high), WHITE)
     for place, row in enumerate(rows):
-        at = (left + LABEL_MM, top - 0.5 * LABEL_MM - 1.7 * LABEL_MM * (place + 0.8))
-        write_text(canvas, row, at)
-    canvas.setFillColorRGB(0.0, 0.0, 0.0)
+        at = (left + 2.0, top - 1.2 - 1.7 * TEXT_MM * (place + 0.8))
+        write_text(canvas, row, at, colour=OPENING)
 
 
 def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
-    """Crosses at round coordinates, and the coordinates beside the frame."""
+    """Crosses at round coordinates, and the coordinates beside the frame, as many as have room."""
     part = view.part
-    columns = list(_marks(drawing.axes.across, part.left_m, part.right_m, drawing.grid_m))
-    rows = list(_marks(drawing.axes.down, part.top_m, part.bottom_m, drawing.grid_m))
-    left, bottom = view.corner_mm
-    right, top = _on_paper(drawing, view, part.right_m, part.top_m)
-    # A quarter of a metre needs two.
-    digits = len(f"{drawing.grid_m:.4f}".rstrip("0").partition(".")[2])
-    for place, value in columns:
-        x, _ = _on_paper(drawing, view, place, part.top_m)
-        for y, end in ((bottom, bottom - 1.5), (top, top + 1.5)):
-            line(canvas, [(x, y), (x, end)])
-        write_text(canvas, f"{value:.{digits}f}", (x, bottom - 2.5 - LABEL_MM), is_centred=True)
-    for place, value in rows:
-        _, y = _on_paper(drawing, view, part.left_m, place)
-        for x, end in ((left, left - 1.5), (right, right + 1.5)):
-            line(canvas, [(x, y), (end, y)])
-        label = (left - 2.5, y)
-        write_text(canvas, f"{value:.{digits}f}", label, turned_deg=90.0, is_centred=True)
-    # White below black, so that a cross is seen on any picture.
-    for colour, width_mm in ((1.0, 0.35), (0.0, THIN_MM)):
-        canvas.setStrokeColorRGB(colour, colour, colour)
-        for place, _ in columns:
-            for down, _ in rows:
-                x, y = _on_paper(drawing, view, place, down)
-                line(canvas, [(x - _CROSS_MM, y), (x + _CROSS_MM, y)], width_mm=width_mm)
-                line(canvas, [(x, y - _CROSS_MM), (x, y + _CROSS_MM)], width_mm=width_mm)
+    left, bottom, right, top = _edges(drawing, view)
+    unit_m = FOOT_M if drawing.unit == "ft" else 1.0
+    columns = {
+        value: _on_paper(drawing, view, place, part.top_m)[0]
+        for place, value in _marks(
+            drawing.axes.across, (part.left_m, part.right_m), drawing.grid, unit_m
+        )
+    }
+    rows = {
+        value: _on_paper(drawing, view, part.left_m, place)[1]
+        for place, value in _marks(
+            drawing.axes.down, (part.top_m, part.bottom_m), drawing.grid, unit_m
+        )
+    }
+    # A quarter of a metre needs two digits.
+    digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
+    for x in columns.values():
+        line(canvas, [(x, bottom), (x, bottom - _TICK_MM)])
+        line(canvas, [(x, top), (x, top + _TICK_MM)])
+    for y in rows.values():
+        line(canvas, [(left, y), (left - _TICK_MM, y)])
+        line(canvas, [(right, y), (right + _TICK_MM, y)])
+    for text, x in _with_room(columns, digits, (left - 4.0, right + 4.0)):
+        at = (x, bottom - _TICK_MM - 1.0 - TEXT_MM)
+        write_text(canvas, text, at, is_centred=True)
+    # Beside the picture, clear of those below it.
+    for text, y in _with_room(rows, digits, (bottom, top)):
+        write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
+    for x in columns.values():
+        for y in rows.values():
+            cross(canvas, x, y)
+
+
+def _with_room(
+    places: dict[float, float], digits: int, limits_mm: tuple[float, float]
+) -> Iterator[tuple[str, float]]:
+    """Numbers at whole multiples of the smallest step of 1, 2, 5 ... marks at which all have room.
+
+    Args:
+        places: coordinate -> where it is along the edge.
+        digits: behind the point.
+        limits_mm: a number at an end is moved inside them.
+    """
+    values = sorted(places)
+    step = values[1] - values[0] if len(values) > 1 else 1.0
+    found: list[tuple[str, float]] = []
+    for every in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000):
+        found, ends = [], []
+        for value in values:
+            if round(value / step) % every == 0:
+                text = f"{value:.{digits}f}"
+                half = 0.5 * text_width_mm(text)
+                low, high = limits_mm[0] + half, max(limits_mm[1] - half, limits_mm[0] + half)
+                middle = min(max(places[value], low), high)
+                found.append((text, middle))
+                ends.append((middle - half, middle + half))
+        ends.sort()
+        if all(after[0] - before[1] >= _APART_MM for before, after in itertools.pairwise(ends)):
+            break
+    yield from found
 
 
 def _marks(
-    axis: tuple[float, float], begin_m: float, end_m: float, step: float
+    axis: tuple[float, float], limits_m: tuple[float, float], step: float, unit_m: float
 ) -> Iterator[tuple[float, float]]:
     """Places on the wall where a coordinate is a whole number of steps, and the coordinate."""
     start, slope = axis
-    values = sorted(start + slope * place for place in (begin_m, end_m))
-    for count in range(math.ceil(values[0] / step - 1e-6), math.floor(values[1] / step + 1e-6) + 1):
-        yield (count * step - start) / slope, count * step
+    step_m = step * unit_m
+    low, high = sorted(start + slope * place for place in limits_m)
+    for count in range(math.ceil(low / step_m - 1e-6), math.floor(high / step_m + 1e-6) + 1):
+        yield (count * step_m - start) / slope, count * step
+
+
+def _draw_heights(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
+    """Height marks right of the picture, moved apart where they would lie over each other."""
+    _, bottom, right, top = _edges(drawing, view)
+    unit_m = FOOT_M if drawing.unit == "ft" else 1.0
+    start, slope = drawing.axes.down
+    levels = sorted(
+        (_on_paper(drawing, view, 0.0, down)[1], (start + slope * down) / unit_m)
+        for down in drawing.heights
+        if view.part.top_m - 1e-9 <= down <= view.part.bottom_m + 1e-9
+    )
+    room = max(1, int((top - bottom) / _MARK_ROW_MM))
+    if len(levels) > room + 1:
+        # Of many the lowest and the highest, and of the others every so many.
+        every = math.ceil((len(levels) - 2) / max(1, room - 1))
+        levels = [levels[0], *levels[1:-1][::every], levels[-1]]
+    places: list[float] = []
+    for level, _ in levels:
+        places.append(max(level, places[-1] + _MARK_ROW_MM if places else level))
+    limit = max(levels[-1][0], places[-1] - _MARK_ROW_MM) if levels else 0.0
+    for k in range(len(places) - 1, -1, -1):
+        places[k] = min(places[k], limit)
+        limit = places[k] - _MARK_ROW_MM
+    for place, (level, value) in zip(places, levels, strict=True):
+        line(canvas, [(right + _TICK_MM, level), (right + 4.0, place)])
+        height_mark(canvas, (right + 6.0, place), f"{value:+.2f}")
+
+
+def _neighbours(sheet: Sheet, view: View) -> dict[str, int]:
+    """Sheets on which a part goes on: side of the picture -> number."""
+    found: dict[str, int] = {}
+    part = view.part
+    for number, other in sheet.numbered:
+        is_level = (other.top_m, other.bottom_m) == (part.top_m, part.bottom_m)
+        is_below = (other.left_m, other.right_m) == (part.left_m, part.right_m)
+        if is_level and other.left_m == part.right_m:
+            found["right"] = number
+        elif is_level and other.right_m == part.left_m:
+            found["left"] = number
+        elif is_below and other.top_m == part.bottom_m:
+            found["below"] = number
+        elif is_below and other.bottom_m == part.top_m:
+            found["above"] = number
+    return found
+
+
+def _draw_match_lines(
+    canvas: Canvas, drawing: WallDrawing, view: View, neighbours: dict[str, int]
+) -> None:
+    """Dash-dotted lines where the wall goes on, each with the number of the sheet."""
+    left, bottom, right, top = _edges(drawing, view)
+    middle = (0.5 * (left + right), 0.5 * (bottom + top))
+    # Left and below they stand beyond the coordinates.
+    for side, ends, at, turned_deg in (
+        ("left", [(left, bottom - 5.0), (left, top + 5.0)], (left - 6.8, middle[1]), 90.0),
+        ("right", [(right, bottom - 5.0), (right, top + 5.0)], (right + 6.0, middle[1]), 90.0),
+        ("below", [(left - 5.0, bottom), (right + 5.0, bottom)], (middle[0], bottom - 9.5), 0.0),
+        ("above", [(left - 5.0, top), (right + 5.0, top)], (middle[0], top + 3.0), 0.0),
+    ):
+        if side in neighbours:
+            line(canvas, ends, width_mm=WIDE_MM, dashes_mm=MATCH_DASHES_MM)
+            text = label("match_line", drawing.language, number=neighbours[side])
+            write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True)
 
 
 def _draw_cuts(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
     """Draw onto the index what of the wall is on which sheet."""
-    canvas.setStrokeColorRGB(0.8, 0.0, 0.0)
-    canvas.setFillColorRGB(0.8, 0.0, 0.0)
     for number, part in sheet.numbered:
         corners = [
             _on_paper(drawing, sheet.views[0], x, y)
@@ -249,13 +329,13 @@ def _draw_cuts(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
                 *((part.right_m, part.bottom_m), (part.left_m, part.bottom_m)),
             )
         ]
-        line(canvas, corners, width_mm=_THICK_MM, is_closed=True)
+        line(canvas, corners, width_mm=MEDIUM_MM, colour=RED, is_closed=True)
         (left, top), _, (right, bottom), _ = corners
-        high = min(12.0, 0.4 * (top - bottom), 0.3 * (right - left))
+        high = max(TEXT_MM, min(10.0, 0.4 * (top - bottom), 0.3 * (right - left)))
         middle = (0.5 * (left + right), 0.5 * (top + bottom) - 0.5 * high)
-        write_text(canvas, str(number), middle, high_mm=high, is_bold=True, is_centred=True)
-    canvas.setStrokeColorRGB(0.0, 0.0, 0.0)
-    canvas.setFillColorRGB(0.0, 0.0, 0.0)
+        write_text(
+            canvas, str(number), middle, high_mm=high, is_bold=True, is_centred=True, colour=RED
+        )
 
 
 def _on_paper(
@@ -267,13 +347,3 @@ def _on_paper(
         left + 1e3 * (right_m - view.part.left_m) / drawing.scale,
         bottom + 1e3 * (view.part.bottom_m - down_m) / drawing.scale,
     )
-
-
-def _draw_border(canvas: Canvas, paper: Paper) -> None:
-    canvas.setStrokeColorRGB(0.0, 0.0, 0.0)
-    left, bottom = MARGIN_MM, MARGIN_MM
-    right, top = paper.width_mm - MARGIN_MM, paper.height_mm - MARGIN_MM
-    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
-    line(canvas, corners, width_mm=0.7, is_closed=True)
-    split = right - paper.column_mm
-    line(canvas, [(split, bottom), (split, top)], width_mm=_THICK_MM)

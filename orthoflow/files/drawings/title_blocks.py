@@ -1,43 +1,78 @@
 """The title block of a sheet: what an office writes on its drawings, from a YAML file.
 
 ```yaml
+layout: strip            # along the lower edge; column: on the right; without it what wastes less
+logo: logo.png           # PNG or JPEG, beside this file
 project: Palace, western hall
 drawing: 21-017
 date: 2026-03-14
+fields: {Order: 4711, Phase: survey}
+revisions:
+  - {mark: A, date: 2026-03-20, text: openings added, by: KN}
 ```
 """
 
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from orthoflow.errors import InputError
+from orthoflow.files.images import decode_image
 from orthoflow.files.yaml_positions import (
     Dialect,
+    Listing,
     Position,
     Table,
-    Text,
     Value,
     describe,
+    plain,
     read_yaml,
 )
-from orthoflow.foreign_text import text_of_file
+from orthoflow.foreign_text import open_file, reading, text_of_file
 
 MOST_BYTES: Final = 100_000
 MOST_LETTERS: Final = 300
-_FIRST: Final = Position(line=1, column=1)
+_MOST_LOGO_BYTES: Final = 4_000_000
 _DIALECT: Final = Dialect(is_strict=False, empty="the title block is empty")
 
 
-@dataclass(frozen=True, kw_only=True)
-class TitleBlock:
+def _checked_text(value: object) -> object:
+    """Take numbers for text, and refuse what is longer than a sheet has room for."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        value = str(value)
+    if isinstance(value, str) and len(value) > MOST_LETTERS:
+        raise ValueError(f"has {len(value)} letters, at most {MOST_LETTERS} fit on a sheet")
+    return value
+
+
+_Text = Annotated[str, BeforeValidator(_checked_text)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Revision(_Model):
+    """A row of the table of revisions."""
+
+    mark: _Text
+    date: _Text = ""
+    text: _Text = ""
+    by: _Text = ""
+
+
+class TitleBlock(_Model):
     """What stands in the title block; what is empty is left out.
 
     Attributes:
-        project: what is surveyed; the largest text of the sheet.
+        layout: where it stands; None for where less paper is left blank.
+        logo: PNG or JPEG of the office, beside the YAML file.
+        project: what is surveyed.
         title: of the drawing, in the place of the name of the wall.
         site: where it stands.
         client: for whom.
@@ -45,25 +80,28 @@ class TitleBlock:
         author: who drew it.
         checked_by: who looked at it.
         date: of the drawing.
-        drawing: its number; the number of the sheet follows it.
-        revision: its state.
+        drawing: its number; the numbers of wall and sheet follow it.
+        revision: its state; the mark of the last of the revisions without it.
         note: anything else.
+        fields: what the client asks for besides, by name.
+        revisions: the oldest first.
     """
 
-    project: str = ""
-    title: str = ""
-    site: str = ""
-    client: str = ""
-    organisation: str = ""
-    author: str = ""
-    checked_by: str = ""
-    date: str = ""
-    drawing: str = ""
-    revision: str = ""
-    note: str = ""
-
-
-FIELDS: Final = tuple(item.name for item in fields(TitleBlock))
+    layout: Literal["column", "strip"] | None = None
+    logo: Path | None = None
+    project: _Text = ""
+    title: _Text = ""
+    site: _Text = ""
+    client: _Text = ""
+    organisation: _Text = ""
+    author: _Text = ""
+    checked_by: _Text = ""
+    date: _Text = ""
+    drawing: _Text = ""
+    revision: _Text = ""
+    note: _Text = ""
+    fields: Annotated[dict[_Text, _Text], Field(max_length=12)] = {}
+    revisions: Annotated[tuple[Revision, ...], Field(max_length=12)] = ()
 
 
 @dataclass
@@ -80,39 +118,52 @@ def read_title_block(path: Path) -> TitleBlock:
     """Read a title block.
 
     Raises:
-        InputError: the file cannot be read, or holds something else than a text per known field;
-            one sentence, about the first place.
+        InputError: the file cannot be read, or holds something else; one sentence, about the first
+            place.
     """
     problems = _Problems()
     text = text_of_file(path, MOST_BYTES, "a title block (YAML)")
     content = read_yaml(text, problems, _DIALECT)
-    values = {} if content is None else _values(content, problems)
-    if problems.found:
+    block = None
+    if isinstance(content, Table) and not problems.found:
+        try:
+            block = TitleBlock.model_validate(plain(content))
+        except ValidationError as error:
+            for item in error.errors():
+                problems.add(*_located(content, item))
+    elif content is not None and not problems.found:
+        said = f"expected fields of a title block such as project, got {describe(content)}"
+        problems.add(Position(line=1, column=1), "", said)
+    if problems.found or block is None:
         position, message = min(problems.found)
         raise InputError(f"{path.name}:{position.line}:{position.column}: {message}")
-    return TitleBlock(**values)
+    if block.logo is None:
+        return block
+    logo = path.parent / block.logo
+    with reading(logo, _MOST_LOGO_BYTES, "a logo (PNG or JPEG)"), open_file(logo) as stream:
+        decode_image(stream.read(_MOST_LOGO_BYTES), logo.name)
+    return block.model_copy(update={"logo": logo})
 
 
-def _values(content: Value, problems: _Problems) -> dict[str, str]:
-    if not isinstance(content, Table):
-        problems.add(
-            _FIRST, "", f"expected fields of a title block such as project, got {describe(content)}"
-        )
-        return {}
-    values = {}
-    for entry in content:
-        if entry.key not in FIELDS:
-            near = difflib.get_close_matches(entry.key, FIELDS, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FIELDS)}"
-            problems.add(entry.position, entry.key[:100], f"no field of a title block; {hint}")
-        elif not isinstance(entry.value, Text) or entry.value.value is None:
-            problems.add(entry.position, entry.key, f"expected a text, got {describe(entry.value)}")
-        elif len(text := str(entry.value.value)) > MOST_LETTERS:
-            problems.add(
-                entry.position,
-                entry.key,
-                f"has {len(text)} letters, at most {MOST_LETTERS} fit on a sheet",
-            )
-        else:
-            values[entry.key] = text
-    return values
+def _located(content: Table, item: Any) -> tuple[Position, str, str]:
+    """Find where in the document a mistake is, and say what it is."""
+    place: Value = content
+    position, path = content.position, [str(key) for key in item["loc"] if key != "[key]"]
+    for key in item["loc"]:
+        entry = place.get(str(key)) if isinstance(place, Table) else None
+        if entry is not None:
+            position, place = entry.position, entry.value
+        elif isinstance(place, Listing) and isinstance(key, int):
+            place = place.items[key]
+            position = place.position
+    name = ".".join(path)[:100]
+    if item["type"] == "extra_forbidden":
+        known = list(TitleBlock.model_fields if len(path) == 1 else Revision.model_fields)
+        near = difflib.get_close_matches(path[-1], known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        return position, name, f"no field of a title block; {hint}"
+    if item["type"] == "string_type":
+        return position, name, f"expected a text, got {describe(place)}"
+    if item["type"] == "value_error":
+        return position, name, str(item["ctx"]["error"])
+    return position, name, f"{str(item['msg'])[0].lower()}{item['msg'][1:]}, got {describe(place)}"

@@ -1,47 +1,78 @@
-"""Labels of drawings in the languages that offices ask for."""
+"""Texts of drawings in the languages that offices ask for; `labels.txt` holds them."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Final, Literal
 
 Language = Literal["en", "de", "fr", "pl", "es"]
 LANGUAGES: Final = ("en", "de", "fr", "pl", "es")
-
-_LABELS: Final[dict[str, tuple[str, str, str, str, str]]] = {
-    "plan": ("Plan", "Grundriss", "Plan", "Rzut", "Planta"),
-    "section": ("Section", "Schnitt", "Coupe", "Przekrój", "Sección"),
-    "elevation": ("Elevation", "Abwicklung", "Élévation", "Rozwinięcie ścian", "Alzado"),
-    "scale": ("scale", "Maßstab", "échelle", "skala", "escala"),
-    "height": ("height", "Höhe", "hauteur", "wysokość", "altura"),
-    "points": ("points", "Punkte", "points", "punkty", "puntos"),
-    "slab": ("slab of", "Schicht von", "tranche de", "warstwa", "capa de"),
-    "above": ("above", "über", "au-dessus de", "nad", "sobre"),
-    "through": ("through", "durch", "par", "przez", "por"),
-    "thickness": (
-        "hatched: solid; wall thickness only where both sides were scanned",
-        "schraffiert: Mauerwerk; Wandstärke nur, wo beide Seiten erfasst sind",
-        "hachuré : plein ; épaisseur seulement où les deux faces ont été relevées",
-        "kreskowanie: mur; grubość tylko tam, gdzie zmierzono obie strony",
-        "rayado: macizo; espesor solo donde se midieron ambas caras",
-    ),
-    "gaps": (
-        "dashed: no points (opening, or hidden)",
-        "gestrichelt: keine Punkte (Öffnung oder verdeckt)",
-        "tireté : aucun point (ouverture ou masqué)",
-        "linia kreskowana: brak punktów (otwór lub zasłonięte)",
-        "a trazos: sin puntos (hueco u oculto)",
-    ),
-    "metres": ("metres", "Meter", "mètres", "metry", "metros"),
-    "wall": ("wall", "Wand", "mur", "ściana", "pared"),
-    "floor": ("floor", "Boden", "sol", "podłoga", "suelo"),
-    "ceiling": ("ceiling", "Decke", "plafond", "sufit", "techo"),
-}
+_TEXTS: Final = Path(__file__).with_name("labels.txt")
+_NUMBERED: Final = re.compile(r"(wall|floor|ceiling) (\d+)")
 
 
-def label(key: str, language: Language = "en") -> str:
-    """Return a label in a language.
+@lru_cache(maxsize=1)
+def _labels() -> dict[str, tuple[str, ...]]:
+    rows = (
+        [part.strip() for part in row.split(" | ")]
+        for row in _TEXTS.read_text(encoding="utf-8").splitlines()
+        if row and not row.startswith("#")
+    )
+    return {key: tuple(texts) for key, *texts in rows}
 
-    >>> label("section", "de")
-    'Schnitt'
+
+def label(key: str, language: Language = "en", **values: object) -> str:
+    """Return a text in a language, with values filled in.
+
+    >>> label("section", "de"), label("sheet_of", "pl", number=1, count=3)
+    ('Schnitt', 'arkusz 1 z 3')
     """
-    return _LABELS[key][LANGUAGES.index(language)]
+    text = _labels()[key][LANGUAGES.index(language)]
+    return text.format(**values) if values else text
+
+
+def surface_name(name: str, language: Language = "en") -> str:
+    """Translate the name that a run gives a surface; any other stays.
+
+    >>> surface_name("wall 3", "fr"), surface_name("Nordwand", "fr")
+    ('mur 3', 'Nordwand')
+    """
+    found = _NUMBERED.fullmatch(name)
+    return f"{label(found[1], language)} {found[2]}" if found else name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phrase:
+    """A statement that can be made in each language.
+
+    Attributes:
+        key: of its text.
+        values: what is filled in.
+        details: statements in parentheses behind it.
+    """
+
+    key: str
+    values: Mapping[str, object] = field(default_factory=dict)
+    details: tuple[Phrase, ...] = ()
+
+    def text(self, language: Language = "en") -> str:
+        """Say it in a language."""
+        text = label(self.key, language, **self.values)
+        more = ", ".join(item.text(language) for item in self.details)
+        return f"{text} ({more})" if more else text
+
+
+def accuracy_phrase(accuracy: object) -> Phrase:
+    """Say what `accuracy` of an orthoimage's sidecar holds."""
+    told = accuracy if isinstance(accuracy, dict) else {}
+    median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
+    if told.get("assessed") is not True or not (
+        isinstance(median, float) and isinstance(high, float)
+    ):
+        return Phrase(key="not_checked")
+    values = {"median": f"{median:.1f}", "high": f"{high:.1f}"}
+    return Phrase(key="expected_error", values={**values, "count": told.get("n_check_points")})

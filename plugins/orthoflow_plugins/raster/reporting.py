@@ -88,6 +88,12 @@ PLAIN: Final = DiagnosticSpec(
     remedy="{way}",
     rank_by="share",
 )
+COVERED: Final = DiagnosticSpec(
+    code="wall-includes-others",
+    severity="warning",
+    text="{subject} shows {included} as its relief, so these have no orthoimage of their own",
+    remedy="{step}.skip_covered=false makes one of each",
+)
 _CAUSES: Final = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
@@ -181,7 +187,7 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
-    """Tell which planes are not rastered though smaller ones are: a larger wall shows them.
+    """Report which planes are not rastered though smaller ones are: a larger wall shows them.
 
     Args:
         ctx: of the step.
@@ -190,10 +196,7 @@ def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int
     """
     for wall in sorted(set(covered.values())):
         left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
-        ctx.warn(
-            f"no raster, and so no orthoimage, is made of {', '.join(left_out)}, which "
-            f"{names[wall]} shows as its relief (set skip_covered to false to have both)"
-        )
+        ctx.report(COVERED, subject=names[wall], included=", ".join(left_out))
 
 
 def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:

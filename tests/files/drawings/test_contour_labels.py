@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.contour_labels import label_place
+from orthoflow.files.drawings.printed_pictures import label_place
 
 
 @pytest.mark.parametrize(

@@ -1,377 +1,482 @@
-"""What is drawn about a picture: coordinates, crosses, cuts, openings, the frame of the sheet."""
+"""Sheets as other programs measure them: scale, text, lines, title blocks, paper and cuts."""
 
 from __future__ import annotations
 
-import math
+import itertools
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pdfplumber
 import pytest
+from click.testing import CliRunner, Result
+from fontTools.fontBuilder import FontBuilder
+from fontTools.pens.t2CharStringPen import T2CharStringPen
+from PIL import Image
 
-from orthoflow.files.drawings import sheets as module
-from orthoflow.files.drawings.papers import Paper, Part, View
-from orthoflow.files.drawings.sheet_contents import Axes, MarkedArea, Sheet, SheetText, WallDrawing
-from orthoflow.files.drawings.sheets import axes_of
+from orthoflow.cli.program import program
+from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings import pens
+from orthoflow.files.drawings.papers import FOOT_M, SCALES, Paper, Part, paper_of, usual_papers
+from orthoflow.files.drawings.printed_pictures import picture_file, write_picture
+from orthoflow.files.drawings.sheet_contents import (
+    SheetText,
+    WallDrawing,
+    axes_of,
+    north_of,
+)
+from orthoflow.files.drawings.sheet_layout import fitting_scale, lay_out, paper_for_one
 from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.files.drawings.words import LANGUAGES, _labels, label
+from orthoflow.files.geotiff import GridPlace, write_raster
+from orthoflow.geometry.frames import frame_over
+from orthoflow.records.unfinished import open_run
 from tests import samples
-from tests.drawn_pages import MM, Page, page
+from tests.drawing_runs import GSD_M, WALL, write_drawing_run
 
-# 6 x 4 m at 1:50 are 120 x 80 mm; the picture begins a metre beside and below the raster's corner.
-PART = Part(left_m=1.0, top_m=1.0, right_m=7.0, bottom_m=5.0)
-VIEW = View(kind="ortho", part=PART, corner_mm=(30.0, 40.0))
-# X counts from 100 m, H falls from 12.25 m.
-AXES = Axes(across=(100.0, 1.0), down=(12.25, -1.0), said="")
-BLACK, WHITE, RED = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.8, 0.0, 0.0)
-
-
-def drawing(**more: object) -> WallDrawing:
-    text = SheetText(name="wall 7", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
-    plain: dict[str, object] = {
-        "number": 7,
-        "rasters": {},
-        "axes": AXES,
-        "plan": None,
-        "text": text,
-        "scale": 50,
-        "grid_m": 1.0,
-    }
-    return WallDrawing(**(plain | more))  # type: ignore[arg-type]
-
-
-@pytest.fixture
-def drawn() -> Iterator[Page]:
-    with page() as one:
-        yield one
+MM = 25.4 / 72.0
+# Height of capital letters of DejaVu Sans over its size.
+CAPITALS = 0.729
+ISO_MM = (0.13, 0.25, 0.35, 0.5, 0.7, 1.0)
+OFFICE = """
+logo: logo.png
+project: Pałac Stanów, sala zachodnia
+title: West elevation
+client: Heritage Council
+site: Castle Road 1
+organisation: Survey Office Ltd.
+author: K. Nowak
+checked_by: Ελένη Παπαδοπούλου
+date: 2026-03-14
+drawing: 21-017
+note: Heights over the local datum.
+fields: {Order: 4711, Phase: Обмер}
+revisions:
+  - {mark: A, date: 2026-03-14, text: first issue, by: KN}
+  - {mark: B, date: 2026-03-20, text: openings added, by: AM}
+"""
 
 
-# --- coordinates ---
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drawing_run(tmp_path_factory.mktemp("drawn") / "run")
 
 
-@pytest.mark.parametrize(
-    ("axis", "begin_m", "end_m", "step", "marks"),
-    [
-        # Places on the wall, and what stands there.
-        ((100.0, 1.0), 1.0, 3.0, 1.0, [(1.0, 101.0), (2.0, 102.0), (3.0, 103.0)]),
-        ((100.25, 1.0), 1.0, 3.0, 1.0, [(1.75, 102.0), (2.75, 103.0)]),
-        ((12.25, -1.0), 1.0, 3.0, 1.0, [(2.25, 10.0), (1.25, 11.0)]),
-        ((0.0, 0.5), 0.0, 5.0, 1.0, [(0.0, 0.0), (2.0, 1.0), (4.0, 2.0)]),
-        ((0.3, 1.0), 0.0, 0.5, 1.0, []),
-        ((100.0, 1.0), 1.0, 2.0, 0.5, [(1.0, 101.0), (1.5, 101.5), (2.0, 102.0)]),
-        ((3.0, -2.0), 0.0, 4.0, 4.0, [(3.5, -4.0), (1.5, 0.0)]),
-        # Sums of decimals miss their round number by a little.
-        ((0.1 + 0.2, 1.0), 0.0, 0.6, 0.3, [(0.0, 0.3), (0.3, 0.6), (0.6, 0.9)]),
-    ],
-)
-def test_marks_stand_at_round_coordinates(
-    axis: tuple[float, float],
-    begin_m: float,
-    end_m: float,
-    step: float,
-    marks: list[tuple[float, float]],
-) -> None:
-    found = list(module._marks(axis, begin_m, end_m, step))
-    assert len(found) == len(marks)
-    if marks:
-        np.testing.assert_allclose(found, marks, atol=1e-9)
+def export(run: Path, folder: Path, *more: object) -> Result:
+    words = ["export", str(run), "--to", "sheet", "-o", str(folder), *map(str, more)]
+    return CliRunner().invoke(program, words)
 
 
-def test_a_grid_has_crosses_in_the_picture_and_coordinates_beside_it(drawn: Page) -> None:
-    module._draw_grid(drawn, drawing(), VIEW)  # type: ignore[arg-type]
-    # X = 101 ... 107 m at every 20 mm from the left edge; H = 11 ... 8 m, 1.25 m down and on.
-    across = {f"{x}": 30.0 + 20.0 * (x - 101) for x in range(101, 108)}
-    heights = {f"{h}": 120.0 - 20.0 * (12.25 - h - 1.0) for h in range(11, 7, -1)}
-    lying = {text.text: text for text in drawn.texts if not text.is_upright}
-    upright = {text.text: text for text in drawn.texts if text.is_upright}
-    assert set(lying) == set(across)
-    assert set(upright) == set(heights)
-    for name, text in lying.items():
-        assert text.middle == pytest.approx(across[name])
-        # Below the marks, which stand below the picture.
-        assert 40.0 - 9.0 < text.bottom < text.bottom + text.high < 40.0 - 1.5
-    for name, text in upright.items():
-        # Centred about its height, left of the marks.
-        assert text.is_centred
-        assert text.bottom == pytest.approx(heights[name])
-        assert 30.0 - 9.0 < text.left + 0.5 * text.width < 30.0 - 1.5
-    marks = [line.points for line in drawn.lines if not _inside(line.points)]
-    ends = {
-        (axis, side): sorted(
-            float(p[0][1 - axis]) for p in marks if p[0][axis] == pytest.approx(side) != p[1][axis]
-        )
-        for axis, sides in ((1, (40.0, 120.0)), (0, (30.0, 150.0)))
-        for side in sides
-    }
-    for axis, side, places in (
-        *((1, 40.0, across), (1, 120.0, across)),
-        *((0, 30.0, heights), (0, 150.0, heights)),
-    ):
-        assert ends[axis, side] == pytest.approx(sorted(places.values())), (axis, side)
-    for points in marks:
-        assert np.linalg.norm(points[1] - points[0]) == pytest.approx(1.5)
-        # Outwards.
-        middle = np.array([90.0, 80.0])
-        assert np.linalg.norm(points[1] - middle) > np.linalg.norm(points[0] - middle)
-    crosses = [line for line in drawn.lines if _inside(line.points)]
-    assert len(crosses) == 2 * 2 * 7 * 4
-    for colour, width_mm in ((WHITE, 0.35), (BLACK, 0.1)):
-        own = [line for line in crosses if line.colour == colour]
-        assert len(own) == 2 * 7 * 4
-        assert all(line.width_mm == pytest.approx(width_mm) for line in own)
-        middles = {tuple(np.round(line.points.mean(axis=0), 6)) for line in own}
-        assert middles == {
-            (round(x, 6), round(y, 6)) for x in across.values() for y in heights.values()
-        }
-    # Black lies over white.
-    assert [line.colour for line in crosses] == [WHITE] * 56 + [BLACK] * 56
-
-
-def _inside(points: np.ndarray) -> bool:
-    """Whether a line lies about a cross: neither mark nor frame."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return bool(np.linalg.norm(high - low) > 2.0)
-
-
-@pytest.mark.parametrize(
-    ("grid_m", "text"), [(0.5, "1.0"), (0.25, "0.50"), (0.1, "0.2"), (1.0, "1"), (10.0, "10")]
-)
-def test_coordinates_have_the_decimals_of_the_grid(drawn: Page, grid_m: float, text: str) -> None:
-    axes = Axes(across=(0.0, 1.0), down=(0.0, -1.0), said="")
-    part = replace(PART, left_m=0.0, right_m=12.0)
-    view = replace(VIEW, part=part)
-    module._draw_grid(drawn, drawing(grid_m=grid_m, axes=axes), view)  # type: ignore[arg-type]
-    assert text in [one.text for one in drawn.texts]
-
-
-@pytest.mark.parametrize(
-    ("up", "words"),
-    [
-        ((0.0, 0.0, 1.0), "z of the scan"),
-        ((math.sin(0.01), 0.0, math.cos(0.01)), "along (0.010, 0.000, 1.000) of the scan"),
-    ],
-)
-def test_a_sheet_has_the_coordinates_of_the_geotiff(
-    up: tuple[float, float, float], words: str
-) -> None:
-    wall = replace(samples.facing_east(0.01, 100, 50, (1.0, 2.0, 30.0)), up=up, left_m=4.0)
-    found = axes_of(wall)
-    assert (found.across, found.down) == ((4.0, 1.0), (wall.raster_corner_m[1], -1.0))
-    assert found.said.endswith(f"H height: {words}, m")
-    unknown = axes_of(replace(wall, up=None))
-    assert (unknown.across, unknown.down) == ((0.0, 1.0), (0.0, -1.0))
-
-
-def test_a_raster_in_a_map_has_the_coordinates_of_the_map() -> None:
-    frame = replace(samples.facing_east(0.5, 40, 20, (1.0, 2.0, 30.0)), map_crs="EPSG:25832")
-    found = axes_of(frame)
-    # Three metres to the right and two down, as its GeoTIFF has them.
-    (place,) = frame.raster_from_wall(np.array([[6.0, 4.0]]))
-    told = [found.across[0] + 3.0 * found.across[1], found.down[0] + 2.0 * found.down[1]]
-    np.testing.assert_allclose(told, place)
-    assert found.said == "X east, Y north (EPSG:25832), m"
-
-
-# --- openings ---
-
-
-@pytest.mark.parametrize("text", ["through, 0.80 x 1.20 m", "door"])
-def test_what_an_opening_is_stands_in_it_from_its_top(drawn: Page, text: str) -> None:
-    module._write_inside(drawn, text, (50.0, 90.0, 100.0))  # type: ignore[arg-type]
-    (ground,) = drawn.boxes
-    left, bottom, wide, high = ground.sides
-    assert ground.fill == WHITE
-    rows = text.split(", ")
-    assert [one.text for one in drawn.texts] == rows
-    for one in drawn.texts:
-        # On white, all of it, and the white in the opening.
-        assert left < one.left
-        assert one.left + one.width < left + wide
-        assert bottom < one.bottom
-        assert one.bottom + one.high < bottom + high
-        assert one.colour not in (BLACK, WHITE)
-    assert left > 50.0
-    assert bottom + high < 100.0
-    heights = [one.bottom for one in drawn.texts]
-    assert heights == sorted(heights, reverse=True)
-    assert all(
-        upper.bottom > lower.bottom + lower.high
-        for upper, lower in zip(drawn.texts, drawn.texts[1:], strict=False)
-    )
-    assert drawn.state["fill"] == BLACK
-
-
-def test_an_opening_too_narrow_for_its_text_has_none(drawn: Page) -> None:
-    module._write_inside(drawn, "door", (50.0, 90.0, 100.0))  # type: ignore[arg-type]
-    wide = drawn.texts[0].width
-    for room, n_texts in ((wide + 4.1, 2), (wide + 3.9, 2)):
-        module._write_inside(drawn, "door", (50.0, 50.0 + room, 100.0))  # type: ignore[arg-type]
-        assert len(drawn.texts) == n_texts
-
-
-def test_openings_are_lined_with_white_and_cut_off_where_the_picture_ends(drawn: Page) -> None:
-    outline = np.array([[2.0, 2.0], [9.0, 2.0], [9.0, 4.0], [2.0, 4.0]])
-    areas = (MarkedArea(text="niche", outline_m=outline),)
-    module._draw_areas(drawn, drawing(areas=areas), VIEW)  # type: ignore[arg-type]
-    np.testing.assert_allclose(drawn.clips, [[[30.0, 40.0], [150.0, 120.0]]], atol=1e-9)
-    below, above = drawn.lines
-    on_paper = [30.0, 120.0] + 20.0 * (outline - [1.0, 1.0]) * [1.0, -1.0]
-    for line in (below, above):
-        np.testing.assert_allclose(line.points, on_paper, atol=1e-9)
-        assert line.is_closed
-    assert below.colour == WHITE
-    assert above.colour != WHITE
-    assert below.width_mm > 2.0 * above.width_mm
-    assert [text.text for text in drawn.texts] == ["niche"]
-
-
-# --- contours ---
-
-
-def test_contours_before_the_plane_and_behind_it_have_two_colours(
-    drawn: Page, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps = [
-        (-0.03, np.array([[2.0, 2.0], [3.0, 2.0]])),
-        (0.01, np.array([[2.0, 4.0], [2.0, 3.0], [4.0, 3.0]])),
-    ]
-    monkeypatch.setattr(module, "contours", lambda *_args, **_kwargs: steps)
-    depth = replace(VIEW, kind="depth")
-    module._draw_contours(drawn, drawing(rasters={"depth": None}), depth)  # type: ignore[arg-type]
-    behind, below_first, before, below = drawn.lines
-    first, second = drawn.texts
-    assert [(text.text, text.colour) for text in (first, second)] == [
-        ("-30", behind.colour),
-        ("+10", before.colour),
-    ]
-    assert below_first.colour == below.colour == WHITE
-    np.testing.assert_allclose(below_first.points.mean(axis=0), [60.0, 100.0], atol=1e-9)
-    # On white, straight along its line.
-    np.testing.assert_allclose(below.points.mean(axis=0), [second.middle, 80.0], atol=1e-9)
-    assert 50.0 < below.points[:, 0].min() < below.points[:, 0].max() < 90.0
-    np.testing.assert_allclose(behind.points, [[50.0, 100.0], [70.0, 100.0]])
-    np.testing.assert_allclose(before.points, [[50.0, 60.0], [50.0, 80.0], [90.0, 80.0]])
-    assert not behind.is_closed
-    # Red before it, blue behind it.
-    assert before.colour[0] > before.colour[2] + 0.5
-    assert behind.colour[2] > behind.colour[0] + 0.5
-
-
-# --- sheets ---
-
-
-@pytest.fixture
-def _pictures_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures that nobody reads, and contours of nothing."""
-    monkeypatch.setattr(module, "write_picture", lambda *_args, **_kwargs: None)
-    monkeypatch.setattr(module, "picture_file", lambda path: path.with_suffix(".png"))
-    monkeypatch.setattr(
-        module, "contours", lambda *_args, **_kwargs: [(0.01, np.array([[2.0, 2.0], [3.0, 2.0]]))]
-    )
-
-
-@pytest.mark.usefixtures("_pictures_are_named")
-@pytest.mark.parametrize(("kind", "grid_m"), [("ortho", 0.0), ("ortho", 0.5), ("depth", 0.0)])
-def test_a_picture_lies_in_its_frame(drawn: Page, kind: str, grid_m: float) -> None:
-    view = replace(VIEW, kind=kind)
-    told = drawing(rasters={kind: Path("a.tif")}, grid_m=grid_m, interval_m=0.02)
-    module._draw_view(drawn, told, view, Path("picture_0"))  # type: ignore[arg-type]
-    # 6 x 4 m at 1:50.
-    assert list(drawn.images) == ["picture_0.png"]
-    np.testing.assert_allclose(drawn.images["picture_0.png"], (30.0, 40.0, 120.0, 80.0))
-    frame = drawn.lines[-1]
-    np.testing.assert_allclose(frame.points, [(30, 40), (150, 40), (150, 120), (30, 120)])
-    assert frame.is_closed
-    assert frame.colour == BLACK
-    assert (len(drawn.texts) > 0) is (grid_m > 0.0)
-    # Besides the frame: one contour of a depth, none of anything else.
-    assert (len(drawn.lines) == 2) is (kind == "depth")
-
-
-@pytest.mark.usefixtures("_pictures_are_named")
-@pytest.mark.parametrize("number", [0, 1])
-def test_only_an_index_shows_how_the_wall_is_cut(
-    tmp_path: Path, drawn: Page, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    @contextmanager
-    def canvas(_path: Path, _paper: Paper) -> Iterator[Page]:
-        yield drawn
-
-    monkeypatch.setattr(module, "sheet_canvas", canvas)
-    paper = Paper(width_mm=420.0, height_mm=297.0)
-    numbered = ((1, PART), (2, replace(PART, right_m=4.0)))
-    sheet = Sheet(paper=paper, views=(VIEW,), number=number, count=2, numbered=numbered)
-    block = TitleBlock(project="Hall", author="A B")
-    told = drawing(rasters={"ortho": Path("a.tif")}, grid_m=0.0)
-    told = replace(told, text=replace(told.text, block=block))
-    module.write_sheet(tmp_path / "sheet.pdf", told, sheet)
-    cuts = [line for line in drawn.lines if line.colour == RED]
-    assert len(cuts) == (2 if number == 0 else 0)
-    assert drawn.said == {
-        "title": "Hall wall 7",
-        "author": "A B",
-        "subject": f"1:50; record sha256:{'0' * 64}",
-    }
-    assert (drawn.n_pages, drawn.is_saved) == (1, True)
-    # Frame and column are there.
-    assert any(np.allclose(line.points.min(axis=0), 10.0) for line in drawn.lines)
-    assert "provenance" in [text.text for text in drawn.texts]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_page_is_as_large_as_its_paper_and_the_same_on_another_day(tmp_path: Path) -> None:
-    sheet = Sheet(paper=Paper(width_mm=400.0, height_mm=250.0), views=())
-    for name in ("a.pdf", "b.pdf"):
-        with module.sheet_canvas(tmp_path / name, sheet.paper) as canvas:
-            canvas.showPage()
-            canvas.save()
-    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
-    with pdfplumber.open(tmp_path / "a.pdf") as pdf:
+@contextmanager
+def page_of(path: Path) -> Iterator[pdfplumber.page.Page]:
+    with pdfplumber.open(path) as pdf:
         (page,) = pdf.pages
-        assert (page.width * MM, page.height * MM) == pytest.approx((400.0, 250.0), abs=1e-3)
+        yield page
 
 
-def test_an_index_shows_what_is_on_which_sheet(drawn: Page) -> None:
-    parts = [replace(PART, right_m=4.0), replace(PART, left_m=4.0, bottom_m=1.2)]
-    numbered = tuple(enumerate(parts, start=1))
-    index = Sheet(
-        paper=Paper(width_mm=420.0, height_mm=297.0), views=(VIEW,), number=0, numbered=numbered
-    )
-    module._draw_cuts(drawn, drawing(), index)  # type: ignore[arg-type]
-    wanted = [
-        ((30.0, 40.0), (90.0, 120.0)),
-        ((90.0, 116.0), (150.0, 120.0)),
-    ]
-    for line, text, (low, high) in zip(drawn.lines, drawn.texts, wanted, strict=True):
-        np.testing.assert_allclose(
-            line.points,
-            [(low[0], high[1]), high, (high[0], low[1]), low],
-            atol=1e-9,
+def office(folder: Path, **more: str) -> Path:
+    Image.new("RGB", (300, 100), (30, 60, 120)).save(folder / "logo.png")
+    path = folder / "office.yaml"
+    lines = "".join(f"{key}: {value}\n" for key, value in more.items())
+    path.write_text(OFFICE + lines, encoding="utf-8")
+    return path
+
+
+def words_of(page: pdfplumber.page.Page) -> str:
+    return " ".join(page.extract_text().split())
+
+
+def boxes_of(page: pdfplumber.page.Page) -> list[tuple[str, tuple[float, float, float, float]]]:
+    """Words with the boxes of their capital letters, upright ones and turned ones."""
+    found = []
+    for is_upright in (True, False):
+        part = page.filter(
+            lambda item, wanted=is_upright: (
+                item["object_type"] != "char" or bool(item["upright"]) is wanted
+            )
         )
-        assert line.is_closed
-        assert line.colour == text.colour == RED
-        # Its number in the middle, inside.
-        assert text.middle == pytest.approx(0.5 * (low[0] + high[0]))
-        assert text.bottom + 0.5 * text.high == pytest.approx(0.5 * (low[1] + high[1]), abs=0.1)
-        assert text.bottom > low[1]
-        assert text.bottom + text.high < high[1]
-        assert text.is_bold
-    assert [text.text for text in drawn.texts] == ["1", "2"]
-    assert (drawn.state["stroke"], drawn.state["fill"]) == (BLACK, BLACK)
+        for word in part.extract_words(x_tolerance=1.5, y_tolerance=1.0):
+            low, high = word["top"], word["bottom"]
+            left, right = word["x0"], word["x1"]
+            if is_upright:
+                low += 0.3 * (high - low)
+                high -= 0.15 * (high - low)
+            found.append((word["text"], (left, low, right, high)))
+    return found
 
 
-def test_the_frame_is_a_centimetre_from_the_edge_and_parts_the_column(drawn: Page) -> None:
-    paper = Paper(width_mm=420.0, height_mm=297.0)
-    module._draw_border(drawn, paper)  # type: ignore[arg-type]
-    frame, split = drawn.lines
-    assert frame.is_closed
-    np.testing.assert_allclose(
-        frame.points, [(10.0, 10.0), (410.0, 10.0), (410.0, 287.0), (10.0, 287.0)]
+def overlapping(page: pdfplumber.page.Page) -> list[tuple[str, str]]:
+    found = []
+    for (text, one), (other_text, other) in itertools.combinations(boxes_of(page), 2):
+        across = min(one[2], other[2]) - max(one[0], other[0])
+        down = min(one[3], other[3]) - max(one[1], other[1])
+        if across > 0.3 and down > 0.3:
+            found.append((text, other_text))
+    return found
+
+
+WAYS = [
+    ("--scale", 50),
+    ("--scale", 20, "--beside", "depth"),
+    ("--scale", 50, "--grid", 0.1),
+    ("--scale", 20, "--paper", "A4"),
+    ("--units", "ft"),
+    ("--language", "de"),
+    ("--language", "pl", "--beside", "intensity"),
+]
+
+
+@pytest.mark.parametrize("more", WAYS, ids=lambda more: " ".join(map(str, more)))
+@pytest.mark.parametrize("layout", ["column", "strip", None])
+def test_text_and_lines_have_the_sizes_of_the_standards_and_nothing_overlaps(
+    run: Path, tmp_path: Path, more: tuple[object, ...], layout: str | None
+) -> None:
+    given: tuple[object, ...] = ()
+    # The whole title block has no room on A4.
+    if layout is not None and "A4" not in more:
+        given = ("--title-block", office(tmp_path, layout=layout))
+    done = export(run, tmp_path / "out", *more, *given)
+    assert done.exit_code == 0, done.output
+    for path in (tmp_path / "out").iterdir():
+        with page_of(path) as page:
+            assert page.chars
+            # Of letters that stand upright the box lies on its side.
+            heights = [
+                CAPITALS * MM * (one["size"] if one["upright"] else one["x1"] - one["x0"])
+                for one in page.chars
+                if min(map(abs, one["matrix"][:2])) < 1e-9
+            ]
+            assert min(heights) >= 2.5 - 1e-3
+            drawn = [*page.lines, *page.rects, *page.curves]
+            widths = {round(one["linewidth"] * MM, 3) for one in drawn if one["stroke"]}
+            assert widths <= set(ISO_MM)
+            assert overlapping(page) == []
+            # Everything lies inside the frame.
+            for one in (*page.chars, *page.images):
+                assert 10.0 < one["x0"] * MM < one["x1"] * MM < page.width * MM - 10.0
+                assert 10.0 < one["top"] * MM < one["bottom"] * MM < page.height * MM - 10.0
+
+
+@pytest.mark.parametrize("layout", ["column", "strip"])
+def test_a_title_block_has_what_the_office_and_its_client_want(
+    run: Path, tmp_path: Path, layout: str
+) -> None:
+    block = office(tmp_path, layout=layout)
+    more = ("--scale", 50, "--title-block", block, "--paper", "A2")
+    done = export(run, tmp_path / "out", *more)
+    assert done.exit_code == 0, done.output
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        text = words_of(page)
+        for said in (
+            *("Pałac Stanów", "West elevation", "Heritage Council", "Castle Road 1"),
+            *(
+                "Survey Office Ltd.",
+                "K. Nowak",
+                "Ελένη Παπαδοπούλου",
+                "2026-03-14",
+                "21-017, wall 2",
+            ),
+            *("Heights over the local datum.", "Order", "4711", "Phase", "Обмер", "Signature"),
+            *("first issue", "openings added", "1:50", "sheet 1 of 1", "Legend", "orthoimage"),
+        ):
+            assert said in text, said
+        # The newest revision is on top, and the one that counts.
+        assert text.index("openings added") < text.index("first issue")
+        assert re.search(r"Revision.*\bB\b", text)
+        logo, picture = sorted(page.images, key=lambda one: one["width"] * one["height"])
+        assert logo["width"] / logo["height"] == pytest.approx(3.0, rel=1e-3)
+        # A column stands right of the picture, a strip below it.
+        (legend,) = (word for word in page.extract_words() if word["text"] == "Legend")
+        assert (legend["x0"] > picture["x1"]) is (layout == "column")
+        assert (legend["top"] > picture["bottom"]) is (layout == "strip")
+
+
+def test_what_a_title_block_has_too_much_of_is_refused(run: Path, tmp_path: Path) -> None:
+    more = ("--scale", 50, "--paper", "A4", "--title-block", office(tmp_path))
+    done = export(run, tmp_path / "out", *more)
+    assert done.exit_code == 2
+    assert "--paper A4 has no room for the title block" in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_seal_is_read_by_a_phone(run: Path, tmp_path: Path) -> None:
+    assert export(run, tmp_path / "out", "--scale", 50).exit_code == 0
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        image = np.asarray(page.to_image(resolution=200).original.convert("L"))
+    text, _, _ = cv2.QRCodeDetector().detectAndDecode(image)
+    assert text == f"sha256:{open_run(run).content_sha256}"
+
+
+def test_heights_and_coordinates_are_those_of_the_wall(run: Path, tmp_path: Path) -> None:
+    assert export(run, tmp_path / "out", "--scale", 20).exit_code == 0
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        (picture,) = page.images
+        rows = [
+            word
+            for word in page.extract_words()
+            if re.fullmatch(r"[+-]\d+\.\d\d", word["text"]) and word["x0"] > picture["x1"]
+        ]
+        # Lower and upper edge of the raster; sill and head of the opening.
+        heights = sorted(float(row["text"]) for row in rows)
+        assert len(heights) == 4
+        assert (heights[0], heights[-1]) == (100.10, 102.40)
+        # Each stands beside its height, where it has the room.
+        for row in rows:
+            up_mm = (picture["bottom"] - row["bottom"]) * MM
+            assert up_mm == pytest.approx((float(row["text"]) - 100.10) * 50.0, abs=1.5)
+
+
+def test_feet_are_written_and_measured(run: Path, tmp_path: Path) -> None:
+    assert export(run, tmp_path / "out", "--units", "ft", "--scale", 24).exit_code == 0
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        text = words_of(page)
+        assert "1:24" in text
+        assert '(1/2" =' in text
+        assert f"{102.4 / FOOT_M:+.2f}" in text
+        bar = [box for box in page.rects if box["height"] * MM == pytest.approx(2.0, abs=1e-3)]
+        # A foot is half an inch.
+        assert bar[0]["width"] * MM == pytest.approx(12.7, abs=0.01)
+        assert "0 1 2 3 4 5 ft" in text
+
+
+def test_pictures_coarser_than_print_are_reported(run: Path, tmp_path: Path) -> None:
+    # Cells of 10 mm at 1:50 are 127 to the inch.
+    ppi = 25.4 * 50 / (1e3 * GSD_M)
+    done = export(run, tmp_path / "out", "--scale", 50)
+    assert f"{ppi:.0f} pixels per inch instead of 150: wall 2; from 1:60 on" in done.output
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        assert f"{ppi:.0f} pixels per inch on this paper (below 150" in words_of(page)
+    assert "instead of 150" not in export(run, tmp_path / "fine", "--scale", 100).output
+
+
+# --- languages and letters ---
+
+
+def test_each_text_is_there_in_each_language_with_the_same_values() -> None:
+    for key, texts in _labels().items():
+        assert len(texts) == len(LANGUAGES), key
+        fields = {tuple(sorted(set(re.findall(r"\{(\w+)\}", text)))) for text in texts}
+        assert len(fields) == 1, key
+
+
+@pytest.mark.parametrize("language", ["de", "fr", "pl", "es"])
+def test_no_english_is_left_on_a_sheet_of_another_language(
+    run: Path, tmp_path: Path, language: str
+) -> None:
+    more = ("--scale", 20, "--beside", "depth", "--language", language)
+    assert export(run, tmp_path / "out", *more).exit_code == 0
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        text = words_of(page)
+    for key in ("legend", "legend_height", "legend_empty", "sheet_of", "legend_opening"):
+        said = (
+            label(key, language, number=1, count=1) if key == "sheet_of" else label(key, language)
+        )
+        assert said.split(";")[0][:20] in text, said
+    for english in ("sheet 1 of", "Legend ", "height", "contour ", "accuracy", "wall 2", "colours"):
+        assert english not in text, english
+
+
+def test_letters_of_no_font_are_refused_and_nothing_is_written(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("matplotlib.font_manager.findSystemFonts", list)
+    pens._installed_letters.cache_clear()
+    block = tmp_path / "block.yaml"
+    block.write_text("project: 松本城\n", encoding="utf-8")
+    done = export(run, tmp_path / "out", "--title-block", block)
+    pens._installed_letters.cache_clear()
+    assert done.exit_code == 2
+    assert "the letter 松 (U+677E) of a text on the sheet is in no installed font" in done.output
+    assert "Noto Sans CJK" in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_letters_are_taken_from_an_installed_font(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    font = tmp_path / "postscript.otf"
+    write_cff_font(font, "城")
+    monkeypatch.setattr("matplotlib.font_manager.findSystemFonts", lambda: [str(font)])
+    pens._installed_letters.cache_clear()
+    pens.fallback_font.cache_clear()
+    block = tmp_path / "block.yaml"
+    block.write_text("project: A 城\n", encoding="utf-8")
+    done = export(run, tmp_path / "out", "--title-block", block)
+    pens._installed_letters.cache_clear()
+    assert done.exit_code == 0, done.output
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        letters = [one for one in page.chars if one["text"] == "城"]
+        assert letters
+        assert {one["size"] for one in letters} <= {one["size"] for one in page.chars}
+
+
+def write_cff_font(path: Path, letter: str) -> None:
+    """A font with one letter, a square, whose outlines are not those of TrueType."""
+    pen = T2CharStringPen(1000, None)
+    pen.moveTo((100, 0))
+    for corner in ((900, 0), (900, 800), (100, 800)):
+        pen.lineTo(corner)
+    pen.closePath()
+    empty = T2CharStringPen(500, None)
+    builder = FontBuilder(1000, isTTF=False)
+    builder.setupGlyphOrder([".notdef", "square"])
+    builder.setupCharacterMap({ord(letter): "square"})
+    strings = {".notdef": empty.getCharString(), "square": pen.getCharString()}
+    builder.setupCFF("Square", {}, strings, {})
+    builder.setupHorizontalMetrics({".notdef": (500, 0), "square": (1000, 100)})
+    builder.setupHorizontalHeader(ascent=800, descent=-200)
+    builder.setupNameTable({"familyName": "Square", "styleName": "Regular"})
+    builder.setupOS2()
+    builder.setupPost()
+    builder.save(path)
+
+
+# --- paper and cuts ---
+
+
+def drawing(scale: int, **more: object) -> WallDrawing:
+    """A drawing whose picture nobody opens."""
+    frame = replace(samples.facing_east(0.01, 100, 50, (1.0, 2.0, 30.0)), up=(0.0, 0.0, 1.0))
+    text = SheetText(name="wall 7", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
+    plain = WallDrawing(
+        number=7,
+        rasters={"ortho": Path("a.tif")},
+        axes=axes_of(frame),
+        plan=None,
+        text=text,
+        scale=scale,
+        grid=1.0,
     )
-    at = 410.0 - paper.column_mm
-    np.testing.assert_allclose(split.points, [(at, 10.0), (at, 287.0)])
-    assert not split.is_closed
-    assert frame.width_mm > split.width_mm
-    assert (frame.colour, split.colour) == (BLACK, BLACK)
+    return replace(plain, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("size_m", "scale", "name"),
+    [((24.5, 4.7), 50, "A3.2"), ((3.8, 2.3), 50, "A4"), ((7.0, 5.0), 20, "A3.2")],
+)
+def test_the_paper_fits_the_content(size_m: tuple[float, float], scale: int, name: str) -> None:
+    laid = lay_out(drawing(scale), size_m)
+    ((sheet, furniture),) = laid.sheets
+    assert sheet.paper.name == name
+    assert laid.index is None
+    # No smaller paper would do, either way round.
+    for paper in usual_papers():
+        if paper.width_mm * paper.height_mm < sheet.paper.width_mm * sheet.paper.height_mm - 1.0:
+            with pytest.raises(ArgumentError):
+                lay_out_on_one(drawing(scale), size_m, paper)
+    assert furniture.paper == sheet.paper
+
+
+def lay_out_on_one(one: WallDrawing, size_m: tuple[float, float], paper: Paper) -> None:
+    if len(lay_out(one, size_m, [paper]).sheets) > 1:
+        raise ArgumentError("several")
+
+
+def test_the_scale_is_the_largest_at_which_all_walls_fit() -> None:
+    sizes = [(3.8, 2.3), (9.0, 3.0)]
+
+    def drawn(scale: int) -> list[tuple[WallDrawing, tuple[float, float]]]:
+        return [(drawing(scale), size_m) for size_m in sizes]
+
+    # 360 mm of the 400 inside the frame, with 35 for what stands beside them.
+    assert fitting_scale(drawn, SCALES, [paper_of("A3")]) == 25
+    assert fitting_scale(lambda n: drawn(n)[:1], SCALES, [paper_of("A3")]) == 20
+    assert paper_for_one(drawn(25)) == "A3"
+    assert paper_for_one(drawn(1)) == ""
+
+
+@pytest.mark.parametrize(
+    ("size_m", "scale", "grid"),
+    [((30.0, 4.0), 20, 1.0), ((9.7, 13.3), 10, 0.0), ((25.0, 9.0), 20, 0.5), ((5.0, 3.9), 5, 0.3)],
+)
+def test_sheets_cover_a_wall_once_and_evenly(
+    size_m: tuple[float, float], scale: int, grid: float
+) -> None:
+    laid = lay_out(drawing(scale, grid=grid), size_m, [paper_of("A3")])
+    parts = [sheet.views[0].part for sheet, _ in laid.sheets]
+    assert len(parts) > 1
+    area_m2 = sum(part.size_m[0] * part.size_m[1] for part in parts)
+    assert area_m2 == pytest.approx(size_m[0] * size_m[1])
+    for axis in (0, 1):
+        edges = sorted({(part.left_m, part.top_m)[axis] for part in parts})
+        sizes = np.diff([*edges, size_m[axis]])
+        # Equal, but for the whole steps of the grid at which they are cut.
+        assert sizes.max() - sizes.min() <= max(grid * (len(sizes)), 1e-9) + 1e-9
+        if grid:
+            steps = np.array(edges) / grid
+            fits_grid = np.abs(steps - np.round(steps)).max() < 1e-6
+            assert fits_grid or np.ptp(sizes) < 1e-9
+    for sheet, _ in laid.sheets:
+        left, bottom = sheet.views[0].corner_mm
+        wide, high = (1e3 * edge / scale for edge in sheet.views[0].part.size_m)
+        corner, area = sheet.paper.corner_mm, sheet.paper.area_mm
+        assert corner[0] < left < left + wide < corner[0] + area[0]
+        assert corner[1] < bottom < bottom + high < corner[1] + area[1]
+
+
+def test_too_many_sheets_are_refused() -> None:
+    with pytest.raises(ArgumentError, match="at most 200 are drawn: take a larger --paper"):
+        lay_out(drawing(1), (30.0, 4.0), [paper_of("A4")])
+
+
+def test_match_lines_name_the_sheet_on_which_the_wall_goes_on(run: Path, tmp_path: Path) -> None:
+    done = export(run, tmp_path / "out", "--scale", 10, "--paper", "A3")
+    assert done.exit_code == 0, done.output
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names[0] == f"wall_{WALL}_index.pdf"
+    n_sheets = len(names) - 1
+    seen: dict[int, set[int]] = {}
+    for number in range(1, n_sheets + 1):
+        with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_{number}.pdf") as page:
+            letters = "".join(one["text"] for one in page.chars)
+            seen[number] = {int(other) for other in re.findall(r"match line, sheet (\d)", letters)}
+            dashed = [one for one in page.lines if one["dash"] and one["dash"][0]]
+            # One of them is in the legend.
+            assert len(dashed) == len(seen[number]) + 1
+    assert n_sheets > 1
+    for number, others in seen.items():
+        assert others
+        assert all(number in seen[other] for other in others)
+
+
+# --- ceilings ---
+
+
+def test_a_reflected_ceiling_lies_over_its_floor(tmp_path: Path) -> None:
+    up = (0.0, 0.0, 1.0)
+    planes = {"floor": (0.0, 0.0, 1.0), "ceiling": (0.0, 0.0, -1.0)}
+    corners = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 2.0, 0.0], [0.0, 2.0, 0.0]])
+    seen = {}
+    for name, normal in planes.items():
+        # Top left first, counter-clockwise for the viewer; rows of ceilings go north.
+        seen_from = corners[[3, 0, 1, 2]] if name == "floor" else corners[[0, 3, 2, 1]]
+        frame = replace(frame_over(seen_from, np.array(normal), gsd_m=0.01), up=up)
+        # Bright where x is small and y large: a corner that both share.
+        place = frame.world_from_wall(cell_centres(frame.shape))
+        bright = (place[:, 0] < 1.0) & (place[:, 1] > 1.0)
+        values = bright.reshape(frame.shape).astype(np.float32)
+        raster = tmp_path / f"{name}.tif"
+        write_raster(raster, values, place=GridPlace.of(frame), tags={})
+        whole = Part(left_m=0.0, top_m=0.0, right_m=3.0, bottom_m=2.0)
+        is_flipped = frame.raster_down > 0.0
+        write_picture(raster, whole, tmp_path / name, scale=10, is_flipped=is_flipped)
+        seen[name] = np.asarray(Image.open(picture_file(tmp_path / name)).convert("L"))
+        axes = axes_of(frame)
+        # X to the right and Y up the paper, and so the key plan's up.
+        assert (axes.across, axes.down) == (
+            pytest.approx((0.0, 1.0), abs=1e-9),
+            pytest.approx((2.0, -1.0), abs=1e-9),
+        )
+        assert north_of(frame) == pytest.approx((0.0, 1.0), abs=1e-9)
+    np.testing.assert_array_equal(seen["floor"], seen["ceiling"])
+    assert seen["floor"][5, 5] == 255
+    assert seen["floor"][-5, 5] == seen["floor"][5, -5] == 0
+
+
+def cell_centres(shape: tuple[int, int]) -> np.ndarray:
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return np.column_stack([columns.ravel(), rows.ravel()])

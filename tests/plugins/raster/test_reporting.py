@@ -170,15 +170,17 @@ def emptiness(
     )
 
 
-def test_planes_that_another_shows_are_told_in_a_line_per_wall(listener: Listener) -> None:
+def test_walls_that_another_shows_are_reported_with_the_setting_of_their_step(
+    listener: Listener,
+) -> None:
     names = ("wall 0", "wall 1", "wall 2", "wall 3")
     reporting.warn_of_covered(listener.context, names, {1: 0, 2: 0})
     reporting.warn_of_covered(listener.context, names, {})
-    (told,) = listener.warnings
-    assert told == (
-        "no raster, and so no orthoimage, is made of wall 1, wall 2, which wall 0 shows as its "
-        "relief (set skip_covered to false to have both)"
-    )
+    (told,) = listener.context.diagnostics
+    assert told.code == "wall-includes-others"
+    assert told.values["included"] == "wall 1, wall 2"
+
+    assert told.remedy.startswith("{step}.skip_covered=false")
 
 
 def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(listener: Listener) -> None:

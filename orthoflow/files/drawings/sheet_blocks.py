@@ -1,0 +1,629 @@
+"""What stands beside the pictures of a sheet: scale bar, notes, legend, key plan, title block.
+
+reportlab's flowables measure and break text; this module says what there is, and packs it into a
+column on the right of the sheet or a strip along its lower edge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from reportlab.lib.colors import Color
+from reportlab.platypus import Flowable, Image, Table
+
+from orthoflow.files.drawings.key_plans import KeyPlan
+from orthoflow.files.drawings.papers import FOOT_M, MARGIN_MM, Paper
+from orthoflow.files.drawings.pens import (
+    BEFORE,
+    BEHIND,
+    BLACK,
+    FRAME_MM,
+    GREY,
+    HEADING_MM,
+    MATCH_DASHES_MM,
+    MEDIUM_MM,
+    OPENING,
+    POINTS_PER_MM,
+    RED,
+    TEXT_MM,
+    THIN_MM,
+    TITLE_MM,
+    WIDE_MM,
+    arrow,
+    box,
+    cross,
+    height_mark,
+    line,
+    paragraph,
+    text_width_mm,
+    write_on_white,
+    write_text,
+)
+from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
+from orthoflow.files.drawings.words import label
+
+if TYPE_CHECKING:
+    from reportlab.pdfgen.canvas import Canvas
+
+_PADDING_MM: Final = 3.0
+_GAP_MM: Final = 2.0
+_COLUMNS_MM: Final = (90.0, 110.0, 130.0, 150.0, 180.0)
+# ISO 7200: a title block is 180 mm wide at most.
+_TITLE_MM: Final = 180.0
+_STRIP_COLUMN_MM: Final = 85.0
+# Of the paper at most so much is not for pictures.
+_MOST_SHARE: Final = 0.55
+_PLAN_MM: Final = (35.0, 90.0)
+_MOST_SEGMENTS: Final = 5
+_SEGMENT_MM: Final = 25.0
+_SYMBOL_MM: Final = 14.0
+_QR_MM: Final = 28.0
+_SIGNATURE_MM: Final = 14.0
+_LOGO_MM: Final = 16.0
+# Wider title blocks have four columns instead of two.
+_FOUR_COLUMNS_MM: Final = 140.0
+# Scales of imperial rulers: inches on the paper of one foot.
+_INCHES: Final = {
+    12: "1",
+    16: "3/4",
+    24: "1/2",
+    32: "3/8",
+    48: "1/4",
+    64: "3/16",
+    96: "1/8",
+    128: "3/32",
+    192: "1/16",
+}
+
+
+class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
+    """Something drawn in millimetres from its bottom-left corner, as wide as there is room."""
+
+    def __init__(self, high_mm: float, draw: Callable[[Canvas, float], None]) -> None:
+        super().__init__()
+        self.high_mm, self.draw_mm = high_mm, draw
+
+    def wrap(self, wide: float, _high: float) -> tuple[float, float]:
+        """Return its size in points."""
+        self.width = wide
+        return wide, self.high_mm * POINTS_PER_MM
+
+    def draw(self) -> None:
+        """Draw it."""
+        self.draw_mm(self.canv, self.width / POINTS_PER_MM)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Furniture:
+    """What stands beside the pictures of a sheet.
+
+    Attributes:
+        paper: with the room that it takes.
+        placed: flowables, with left and bottom on the paper and width, in mm.
+    """
+
+    paper: Paper
+    placed: tuple[tuple[Any, tuple[float, float, float]], ...]
+
+    def draw(self, canvas: Canvas) -> None:
+        """Draw all of it, and the frame of the sheet."""
+        paper = self.paper
+        for flowable, (left, bottom, wide) in self.placed:
+            flowable.wrapOn(canvas, wide * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
+            flowable.drawOn(canvas, left * POINTS_PER_MM, bottom * POINTS_PER_MM)
+        right, top = paper.width_mm - MARGIN_MM, paper.height_mm - MARGIN_MM
+        corners = [(MARGIN_MM, MARGIN_MM), (right, MARGIN_MM), (right, top), (MARGIN_MM, top)]
+        line(canvas, corners, width_mm=FRAME_MM, is_closed=True)
+        split = [(right - paper.block_mm, MARGIN_MM), (right - paper.block_mm, top)]
+        if paper.layout == "strip":
+            height = MARGIN_MM + paper.block_mm
+            split = [(MARGIN_MM, height), (right, height)]
+        line(canvas, split, width_mm=MEDIUM_MM)
+
+
+def furnished(
+    paper: Paper, drawing: WallDrawing, sheet: Sheet, *, is_brief: bool = False
+) -> Furniture | None:
+    """Pack what stands beside the pictures; None where the paper is too small for it.
+
+    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that takes all is taken.
+    Without key plans, `is_brief`, less paper does.
+    """
+    wide, high = paper.width_mm - 2 * MARGIN_MM, paper.height_mm - 2 * MARGIN_MM
+    if paper.layout == "column":
+        for block_mm in _COLUMNS_MM:
+            if block_mm > _MOST_SHARE * wide:
+                break
+            inner = block_mm - 2 * _PADDING_MM
+            left = paper.width_mm - MARGIN_MM - block_mm + _PADDING_MM
+            title = _Stack(_title_flowables(drawing, sheet, inner), inner)
+            room = high - 2 * _PADDING_MM - title.high_mm - _GAP_MM
+            notes = _notes(drawing, sheet, is_brief=is_brief)
+            packed = _packed(notes, inner, [left], MARGIN_MM + high, room)
+            if packed is not None:
+                placed = (*packed, *title.placed(left, MARGIN_MM + _PADDING_MM + title.high_mm))
+                return Furniture(paper=replace(paper, block_mm=block_mm), placed=placed)
+        return None
+    title_mm = min(_TITLE_MM, 0.5 * wide)
+    n_columns = max(1, int((wide - title_mm) / _STRIP_COLUMN_MM))
+    column_mm = (wide - title_mm) / n_columns - 2 * _PADDING_MM
+    title = _Stack(_title_flowables(drawing, sheet, title_mm), title_mm)
+    lefts = [MARGIN_MM + _PADDING_MM + k * (column_mm + 2 * _PADDING_MM) for k in range(n_columns)]
+    block_mm = title.high_mm
+    while block_mm <= _MOST_SHARE * high:
+        packed = _packed(
+            _notes(drawing, sheet, is_brief=is_brief),
+            column_mm,
+            lefts,
+            MARGIN_MM + block_mm,
+            block_mm - 2 * _PADDING_MM,
+        )
+        if packed is not None:
+            left = paper.width_mm - MARGIN_MM - title_mm
+            placed = (*packed, *title.placed(left, MARGIN_MM + title.high_mm))
+            return Furniture(paper=replace(paper, block_mm=block_mm), placed=placed)
+        block_mm += 5.0
+    return None
+
+
+class _Stack:
+    """Flowables below each other, without gaps."""
+
+    def __init__(self, flowables: Sequence[Any], wide_mm: float) -> None:
+        self.flowables, self.wide_mm = flowables, wide_mm
+        self.heights = [_high_mm(flowable, wide_mm) for flowable in flowables]
+        self.high_mm = sum(self.heights)
+
+    def placed(self, left: float, top: float) -> Iterator[tuple[Any, tuple[float, float, float]]]:
+        for flowable, high in zip(self.flowables, self.heights, strict=True):
+            top -= high
+            yield flowable, (left, top, self.wide_mm)
+
+
+def _high_mm(flowable: Any, wide_mm: float) -> float:
+    return float(flowable.wrap(wide_mm * POINTS_PER_MM, 1e5)[1]) / POINTS_PER_MM
+
+
+def _packed(
+    flowables: Sequence[Any],
+    wide_mm: float,
+    lefts: Sequence[float],
+    top_mm: float,
+    high_mm: float,
+) -> list[tuple[Any, tuple[float, float, float]]] | None:
+    """Fill columns from the left, each from its top; None where there is not the room.
+
+    Key plans, which come last, take what is left of a column up to their largest height.
+    """
+    placed: list[tuple[Any, tuple[float, float, float]]] = []
+    column, used = 0, 0.0
+    for place, flowable in enumerate(flowables):
+        is_plan = isinstance(flowable, _Plan)
+        high = flowable.least_mm if is_plan else _high_mm(flowable, wide_mm)
+        if used and used + high > high_mm:
+            column, used = column + 1, 0.0
+        if column == len(lefts) or used + high > high_mm + 1e-6:
+            return None
+        if is_plan:
+            later = sum(item.least_mm for item in flowables[place + 1 :])
+            high = max(high, min(_PLAN_MM[1], high_mm - used - later))
+            flowable.high_mm = high
+        top = top_mm - _PADDING_MM - used
+        placed.append((flowable, (lefts[column], top - high, wide_mm)))
+        used += high + _GAP_MM
+    return placed
+
+
+# --- notes, legend, key plans ---
+
+
+def _notes(drawing: WallDrawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
+    language = drawing.language
+    found: list[Any] = [_scale_bar(drawing)]
+    if drawing.grid > 0.0:
+        digits = f"{drawing.grid:.6g}"
+        axes = drawing.axes.phrase.text(language)
+        grid = label("grid_note", language, step=digits, unit=drawing.unit, axes=axes)
+        found.append(paragraph(grid))
+    found += [paragraph(note.text(language)) for note in drawing.text.notes]
+    found += _legend(drawing, sheet)
+    if is_brief:
+        return found
+    if sheet.numbered and sheet.number > 0:
+        found.append(_Plan(*_sheet_key(drawing, sheet)))
+    if drawing.plan is not None:
+        found.append(_Plan(*_key_plan(drawing, drawing.plan)))
+    return found
+
+
+def _scale_bar(drawing: WallDrawing) -> _Picture:
+    """Draw segments of a round length, black and white, with its length at each end."""
+    unit_m = FOOT_M if drawing.unit == "ft" else 1.0
+    least = 1e-3 * drawing.scale * _SEGMENT_MM / 2.5 / unit_m
+    # The largest round length that is at most 25 mm long.
+    power = 10.0 ** math.floor(math.log10(least))
+    mm_per_unit = 1e3 * unit_m / drawing.scale
+    lengths = [factor * power for factor in (1.0, 2.0, 5.0, 10.0, 20.0)]
+    length = max(one for one in lengths if one * mm_per_unit <= _SEGMENT_MM + 1e-6)
+    segment = length * mm_per_unit
+
+    def draw(canvas: Canvas, wide_mm: float) -> None:
+        count = max(1, min(_MOST_SEGMENTS, int((wide_mm - 14.0) / segment)))
+        for place in range(count):
+            left = 4.0 + place * segment
+            box(canvas, (left, 0.5, segment, 2.0), BLACK if place % 2 == 0 else (1.0, 1.0, 1.0))
+            sides = [(left, 0.5), (left + segment, 0.5), (left + segment, 2.5), (left, 2.5)]
+            line(canvas, sides, is_closed=True)
+        step, end = 1, -math.inf
+        widest = text_width_mm(f"{count * length:g} {drawing.unit}")
+        while step * segment < widest + 1.0:
+            step += 1
+        for place in range(0, count + 1, step):
+            text = f"{place * length:g}" + (f" {drawing.unit}" if place == count else "")
+            at = (4.0 + place * segment, 4.2)
+            if at[0] > end:
+                write_text(canvas, text, at, is_centred=True)
+                end = at[0]
+
+    return _Picture(8.0, draw)
+
+
+def _legend(drawing: WallDrawing, sheet: Sheet) -> Iterator[Any]:
+    language = drawing.language
+    rows: list[tuple[Callable[[Canvas], None], str]] = []
+    if drawing.grid > 0.0:
+        rows.append((lambda canvas: cross(canvas, 7.0, 2.0), label("legend_cross", language)))
+    if drawing.heights:
+        rows.append(
+            (
+                lambda canvas: height_mark(canvas, (4.0, 0.6), ""),
+                f"{label('legend_height', language)}, {drawing.unit}",
+            )
+        )
+    if drawing.north is not None:
+        up = np.array([[7.0, -0.5], [7.0, 4.5]])
+        text = f"{drawing.plan.up_label if drawing.plan else ''}: {label('legend_north', language)}"
+        rows.append((lambda canvas: arrow(canvas, up), text))
+    if drawing.areas:
+        sides = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
+        rows.append(
+            (
+                lambda canvas: line(
+                    canvas, sides, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True
+                ),
+                label("legend_opening", language),
+            )
+        )
+    if any(view.kind == "depth" for view in sheet.views):
+        interval = f"{1e3 * drawing.interval_m:g}"
+        for key, colour in (("legend_before", BEFORE), ("legend_behind", BEHIND)):
+            rows.append((_sample(colour), label(key, language, interval=interval)))
+        if drawing.depth_range_m is not None:
+            low, high = (f"{1e3 * value:+.0f}" for value in drawing.depth_range_m)
+            rows.append((_grey_ramp, label("legend_grey", language, low=low, high=high)))
+    rows.append((_empty_box, label("legend_empty", language)))
+    if len(sheet.numbered) > 1:
+        rows.append(
+            (
+                lambda canvas: line(
+                    canvas,
+                    [(1.0, 2.0), (13.0, 2.0)],
+                    width_mm=WIDE_MM,
+                    dashes_mm=MATCH_DASHES_MM,
+                ),
+                label("legend_match", language),
+            )
+        )
+    yield paragraph(label("legend", language), is_bold=True)
+    for draw, text in rows:
+        yield _Row(draw, text)
+
+
+class _Row(Flowable):  # type: ignore[misc] # reportlab has no types
+    """A symbol of the legend with its text."""
+
+    def __init__(self, symbol: Callable[[Canvas], None], text: str) -> None:
+        super().__init__()
+        self.symbol, self.text = symbol, paragraph(text)
+
+    def wrap(self, wide: float, high: float) -> tuple[float, float]:
+        """Return its size in points."""
+        _, text_high = self.text.wrap(wide - _SYMBOL_MM * POINTS_PER_MM, high)
+        self.height = max(text_high, 5.0 * POINTS_PER_MM)
+        return wide, self.height
+
+    def draw(self) -> None:
+        """Draw it, the symbol beside the first row of the text."""
+        self.text.drawOn(self.canv, _SYMBOL_MM * POINTS_PER_MM, self.height - self.text.height)
+        self.canv.saveState()
+        self.canv.translate(0.0, self.height - 4.3 * POINTS_PER_MM)
+        self.symbol(self.canv)
+        self.canv.restoreState()
+
+
+def _sample(colour: tuple[float, float, float]) -> Callable[[Canvas], None]:
+    return lambda canvas: line(canvas, [(1.0, 2.0), (13.0, 2.0)], width_mm=THIN_MM, colour=colour)
+
+
+def _grey_ramp(canvas: Canvas) -> None:
+    for step in range(24):
+        box(canvas, (1.0 + 0.5 * step, 0.5, 0.5, 3.0), (step / 23.0,) * 3)
+
+
+def _empty_box(canvas: Canvas) -> None:
+    line(canvas, [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)], colour=GREY, is_closed=True)
+
+
+class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
+    """A heading, and lines (n, 2) in metres below it, as large as there is room."""
+
+    def __init__(
+        self,
+        heading: str,
+        points: NDArray[np.float64],
+        draw: Callable[[Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None],
+    ) -> None:
+        super().__init__()
+        self.heading, self.points, self.draw_lines = paragraph(heading), points, draw
+        self.least_mm = self.high_mm = _PLAN_MM[0]
+
+    def wrap(self, wide: float, _high: float) -> tuple[float, float]:
+        """Return its size in points."""
+        self.width = wide
+        return wide, self.high_mm * POINTS_PER_MM
+
+    def draw(self) -> None:
+        """Draw it."""
+        wide_mm = self.width / POINTS_PER_MM
+        heading_mm = _high_mm(self.heading, wide_mm)
+        self.heading.drawOn(self.canv, 0.0, (self.high_mm - heading_mm) * POINTS_PER_MM)
+        low = self.points.min(axis=0)
+        size = np.maximum(self.points.max(axis=0) - low, 1e-6)
+        # On the right stands the arrow that points up.
+        limits = np.array([wide_mm - 14.0, self.high_mm - heading_mm - 5.0])
+        mm_per_m = float((limits / size).min())
+        corner = np.array([2.0, 0.5 * (limits[1] - mm_per_m * size[1]) + 2.0])
+        self.draw_lines(
+            self.canv, lambda points: np.asarray(corner + mm_per_m * (points - low)), wide_mm
+        )
+
+
+def _key_plan(drawing: WallDrawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
+    """The room from above, with the number of the marked wall."""
+    lines = [*plan.walls, *plan.outlines, plan.marked]
+    if plan.arrow is not None:
+        lines.append(plan.arrow)
+
+    def draw(canvas: Canvas, place: Any, wide_mm: float) -> None:
+        for wall in plan.walls:
+            line(canvas, place(wall), colour=GREY)
+        for outline in plan.outlines:
+            line(canvas, place(outline), width_mm=MEDIUM_MM)
+        is_area = len(plan.marked) > 2
+        line(canvas, place(plan.marked), width_mm=FRAME_MM, colour=RED, is_closed=is_area)
+        if plan.arrow is not None:
+            arrow(canvas, place(plan.arrow), RED)
+        right = wide_mm - 4.0
+        arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
+        write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
+        # The marked one first: where walls lie close, not all of them have room.
+        placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
+        order = sorted(placed, key=lambda n: (n != drawing.number, -_length(placed[n])))
+        _number_walls(canvas, {n: placed[n] for n in order})
+
+    return label("key_plan", drawing.language), np.vstack(lines), draw
+
+
+def _number_walls(canvas: Canvas, on_paper: Mapping[int, NDArray[np.float64]]) -> None:
+    """Write the numbers of walls into their middles, in this order, where there is room."""
+    placed: list[NDArray[np.float64]] = []
+    for number, wall in on_paper.items():
+        middle = wall.mean(axis=0)
+        room = 1.5 * text_width_mm(str(number)) + TEXT_MM
+        is_close = any(float(np.linalg.norm(middle - other)) < room for other in placed)
+        if _length(wall) >= room and not is_close:
+            placed.append(middle)
+            write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
+
+
+def _length(ends: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(ends[1] - ends[0]))
+
+
+def _sheet_key(drawing: WallDrawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
+    """How a wall is cut into sheets, this one filled."""
+    boxes = {
+        number: np.array(
+            [
+                [x, -y]
+                for x, y in (
+                    *((part.left_m, part.top_m), (part.right_m, part.top_m)),
+                    *((part.right_m, part.bottom_m), (part.left_m, part.bottom_m)),
+                )
+            ]
+        )
+        for number, part in sheet.numbered
+    }
+
+    def draw(canvas: Canvas, place: Any, _wide_mm: float) -> None:
+        for number, corners in boxes.items():
+            on_paper = place(corners)
+            (left, bottom), (right, top) = on_paper.min(axis=0), on_paper.max(axis=0)
+            if number == sheet.number:
+                box(canvas, (left, bottom, right - left, top - bottom), (1.0, 0.75, 0.75))
+            line(canvas, on_paper, is_closed=True)
+            if min(right - left - text_width_mm(str(number)), top - bottom - TEXT_MM) > 0.6:
+                middle = (0.5 * (left + right), 0.5 * (bottom + top - TEXT_MM))
+                write_text(canvas, str(number), middle, is_centred=True)
+
+    heading = label("key_sheets", drawing.language, wall=drawing.text.name)
+    return heading, np.vstack(list(boxes.values())), draw
+
+
+# --- the title block ---
+
+
+def _title_flowables(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> list[Any]:
+    block = drawing.text.block
+    found = [_revisions(drawing, wide_mm)] if block.revisions else []
+    return [*found, _title_table(drawing, sheet, wide_mm)]
+
+
+def _revisions(drawing: WallDrawing, wide_mm: float) -> Any:
+    """The table of revisions, the newest on top."""
+    rows = [
+        [paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
+        for one in reversed(drawing.text.block.revisions)
+    ]
+    shares = (0.12, 0.28, 0.42, 0.18)
+    return Table(
+        rows, colWidths=[share * wide_mm * POINTS_PER_MM for share in shares], style=_style()
+    )
+
+
+def _title_table(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> Any:
+    block = drawing.text.block
+    cells: list[tuple[list[Any], bool]] = []
+    if block.logo is not None or block.organisation:
+        head = [_logo(str(block.logo), 0.9 * wide_mm)] if block.logo is not None else []
+        if block.organisation:
+            head.append(_bold(block.organisation))
+        cells.append((head, True))
+    if block.project:
+        cells.append(([_bold(block.project)], True))
+    title = [_bold(block.title or drawing.text.name)]
+    if block.title:
+        title.append(paragraph(drawing.text.name))
+    cells.append(([*title, paragraph(", ".join(_kinds(drawing, sheet)))], True))
+    cells += [([_small(name), paragraph(value)], False) for name, value in _named(drawing, sheet)]
+    cells += list(_scale_and_sheet(drawing, sheet))
+    if block.note:
+        cells.append(([_small(label("note", drawing.language)), paragraph(block.note)], True))
+    if block != type(block)():
+        room = _Picture(_SIGNATURE_MM - 5.0, lambda _canvas, _wide: None)
+        cells.append(([_small(label("signature", drawing.language)), room], True))
+    seal_mm = wide_mm if wide_mm < _FOUR_COLUMNS_MM else 0.5 * wide_mm
+    cells.append(([_seal(drawing, seal_mm)], True))
+    n_columns = 2 if wide_mm < _FOUR_COLUMNS_MM else 4
+    rows, spans = _rows(cells, n_columns)
+    widths = [wide_mm / n_columns * POINTS_PER_MM] * n_columns
+    return Table(rows, colWidths=widths, style=_style(*spans))
+
+
+def _named(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
+    """The fields that have a name, those of the client in the middle."""
+    language, block = drawing.language, drawing.text.block
+    number = label("index", language)
+    if sheet.number:
+        number = f"{label('sheet', language)} {sheet.number}"
+    last = block.revisions[-1].mark if block.revisions else ""
+    drawn = f"{block.drawing}, {drawing.text.name}, {number}" if block.drawing else ""
+    for key in ("client", "site"):
+        if getattr(block, key):
+            yield label(key, language), getattr(block, key)
+    yield from block.fields.items()
+    values = {key: getattr(block, key) for key in ("author", "checked_by", "date")}
+    for key, value in {**values, "drawing": drawn, "revision": block.revision or last}.items():
+        if value:
+            yield label(key, language), value
+
+
+def _scale_and_sheet(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
+    language = drawing.language
+    inches = _INCHES.get(drawing.scale) if drawing.unit == "ft" else None
+    text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")
+    high_mm = TITLE_MM if inches is None else HEADING_MM
+    large = paragraph(text, high_mm=high_mm, is_bold=True)
+    yield [_small(label("scale", language)), large], False
+    of = "sheet_of" if sheet.number else "index_of"
+    said = label(of, language, number=sheet.number, count=sheet.count)
+    size = sheet.paper.name or f"{sheet.paper.width_mm:g} x {sheet.paper.height_mm:g} mm"
+    yield [paragraph(said), paragraph(f"{label('paper', language)} {size}")], False
+
+
+def _rows(
+    cells: Sequence[tuple[list[Any], bool]], n_columns: int
+) -> tuple[list[list[Any]], list[Any]]:
+    """Put cells into rows: wide ones take two columns, and the last of a row what is left of it."""
+    rows: list[list[tuple[list[Any], int]]] = [[]]
+    for content, is_wide in cells:
+        span = 2 if is_wide else 1
+        if sum(taken for _, taken in rows[-1]) + span > n_columns:
+            rows.append([])
+        rows[-1].append((content, span))
+    table, spans = [], []
+    for number, row in enumerate(rows):
+        texts: list[Any] = [""] * n_columns
+        column = 0
+        for place, (content, span) in enumerate(row):
+            end = n_columns if place == len(row) - 1 else column + span
+            texts[column] = content
+            spans.append(("SPAN", (column, number), (end - 1, number)))
+            column = end
+        table.append(texts)
+    return table, spans
+
+
+def _style(*more: Any) -> list[Any]:
+    black = Color(0, 0, 0)
+    whole = ((0, 0), (-1, -1))
+    return [
+        ("GRID", *whole, THIN_MM * POINTS_PER_MM, black),
+        ("BOX", *whole, WIDE_MM * POINTS_PER_MM, black),
+        ("VALIGN", *whole, "TOP"),
+        *((f"{side}PADDING", *whole, 1.2 * POINTS_PER_MM) for side in ("LEFT", "RIGHT")),
+        *((f"{side}PADDING", *whole, 0.6 * POINTS_PER_MM) for side in ("TOP", "BOTTOM")),
+        *more,
+    ]
+
+
+def _bold(text: str) -> Any:
+    return paragraph(text, high_mm=HEADING_MM, is_bold=True)
+
+
+def _small(text: str) -> Any:
+    """The name of a field, grey over its value."""
+    return paragraph(text, colour=GREY)
+
+
+def _logo(path: str, most_mm: float) -> Any:
+    logo = Image(path, hAlign="LEFT")
+    factor = min(
+        _LOGO_MM * POINTS_PER_MM / logo.imageHeight, most_mm * POINTS_PER_MM / logo.imageWidth
+    )
+    logo.drawHeight, logo.drawWidth = factor * logo.imageHeight, factor * logo.imageWidth
+    return logo
+
+
+def _kinds(drawing: WallDrawing, sheet: Sheet) -> Iterator[str]:
+    for kind in dict.fromkeys(view.kind for view in sheet.views):
+        is_grey = kind == "intensity" and drawing.intensity_is_grey
+        yield label("grey" if is_grey else kind, drawing.language)
+    if drawing.is_flipped:
+        yield label("reflected", drawing.language)
+
+
+def _seal(drawing: WallDrawing, wide_mm: float) -> Any:
+    """The digest of the record as a QR code and as text."""
+    from reportlab.graphics.barcode.qr import QrCodeWidget
+    from reportlab.graphics.shapes import Drawing
+
+    digest = drawing.text.digest
+    side = _QR_MM * POINTS_PER_MM
+    code = QrCodeWidget(
+        f"sha256:{digest}", barLevel="M", barWidth=side, barHeight=side, barBorder=4
+    )
+    rows = [
+        paragraph(label("record", drawing.language)),
+        *(paragraph(digest[k : k + 16]) for k in (0, 16, 32, 48)),
+        paragraph(drawing.text.run),
+    ]
+    left = side + 1.0 * POINTS_PER_MM
+    cells = [[Drawing(side, side, code), rows]]
+    plain = [("LEFTPADDING", (0, 0), (-1, -1), 0), ("VALIGN", (0, 0), (-1, -1), "TOP")]
+    return Table(cells, colWidths=[left, (wide_mm - 2.4) * POINTS_PER_MM - left], style=plain)

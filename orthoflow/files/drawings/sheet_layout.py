@@ -1,0 +1,210 @@
+"""Which paper a wall is drawn on, and how it is cut up where none takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.papers import (
+    FOOT_M,
+    SCALES,
+    SCALES_FT,
+    Layout,
+    Paper,
+    Part,
+    View,
+    cut_up,
+    paper_of,
+    together,
+    usual_papers,
+)
+from orthoflow.files.drawings.sheet_blocks import Furniture, furnished
+from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
+from orthoflow.files.drawings.title_blocks import TitleBlock
+
+# A wall that fits no paper is cut up onto sheets of this one.
+_CUT_PAPER: Final = "A1"
+
+# A drawing, and width and height of its wall in metres.
+Sized = tuple[WallDrawing, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheets:
+    """The sheets of a wall.
+
+    Attributes:
+        drawing: of the wall.
+        furniture: what stands beside the pictures of each sheet.
+        sheets: each with its pictures.
+        index: the drawing and sheet that show how the wall is cut, at a smaller scale.
+    """
+
+    drawing: WallDrawing
+    sheets: tuple[tuple[Sheet, Furniture], ...]
+    index: tuple[WallDrawing, Sheet, Furniture] | None = None
+
+
+def _ways(paper: Paper, block: TitleBlock) -> list[Paper]:
+    """A paper with the title block in each place that the office allows."""
+    layouts: tuple[Layout, ...] = (block.layout,) if block.layout else ("column", "strip")
+    return [replace(paper, layout=layout) for layout in layouts]
+
+
+def _on_one(
+    drawing: WallDrawing,
+    size_m: tuple[float, float],
+    papers: Sequence[Paper],
+    *,
+    is_brief: bool = False,
+) -> tuple[Sheet, Furniture] | None:
+    """All pictures of a wall on one sheet of the first of some papers that takes them."""
+    kinds = tuple(drawing.rasters)
+    for paper in papers:
+        for way in _ways(paper, drawing.text.block):
+            views = together(kinds, size_m, way, drawing.scale)
+            if not views:
+                continue
+            furniture = furnished(way, drawing, Sheet(paper=way, views=views), is_brief=is_brief)
+            if furniture is None:
+                continue
+            views = together(kinds, size_m, furniture.paper, drawing.scale)
+            if views:
+                return Sheet(paper=furniture.paper, views=views), furniture
+    return None
+
+
+def fitting_scale(
+    drawn: Callable[[int], Sequence[Sized]], scales: Sequence[int], papers: Sequence[Paper]
+) -> int:
+    """Return n of the largest scale 1 : n at which each wall fits onto one sheet.
+
+    Args:
+        drawn: gives the walls at a scale.
+        scales: from the largest.
+        papers: that are at hand.
+    """
+    ways = [way for paper in papers for way in (paper, paper.turned)]
+    for scale in scales:
+        if all(_on_one(drawing, size_m, ways) for drawing, size_m in drawn(scale)):
+            return scale
+    return scales[-1]
+
+
+def paper_for_one(walls: Sequence[Sized]) -> str:
+    """Name the smallest usual paper that takes each wall on one sheet; empty where none does."""
+    for paper in usual_papers()[::2]:
+        ways = (paper, paper.turned)
+        if all(_on_one(drawing, size_m, ways) for drawing, size_m in walls):
+            return paper.name
+    return ""
+
+
+def lay_out(
+    drawing: WallDrawing, size_m: tuple[float, float], given: Sequence[Paper] = ()
+) -> Sheets:
+    """Lay a wall onto one sheet, or cut it up onto several of the same size.
+
+    Args:
+        drawing: of the wall.
+        size_m: its width and height.
+        given: papers that may be taken; without any the smallest usual one that takes the wall.
+
+    Raises:
+        ArgumentError: the paper has no room for the title block, or the wall takes too many sheets.
+    """
+    papers = [way for paper in given for way in (paper, paper.turned)] or usual_papers()
+    # Key plans are left out only where the office's paper has no room for them.
+    for is_brief in (False, True) if given else (False,):
+        if (alone := _on_one(drawing, size_m, papers, is_brief=is_brief)) is not None:
+            return Sheets(drawing=drawing, sheets=(alone,))
+    paper = given[0] if given else paper_of(_CUT_PAPER)
+    ways: list[tuple[tuple[Sheet, Furniture], ...]] = []
+    for is_brief in (False, True):
+        for way in (paper, paper.turned):
+            for one in _ways(way, drawing.text.block):
+                ways += [] if ways and is_brief else _cut(drawing, size_m, one, is_brief=is_brief)
+    if not ways:
+        raise ArgumentError(
+            f"--paper {paper.name or f'{paper.width_mm:g}x{paper.height_mm:g}'} has no room for "
+            "the title block, the legend and notes beside a picture: take a larger one, or shorten "
+            "the title block"
+        )
+    sheets = min(ways, key=len)
+    kind = next(iter(drawing.rasters))
+    numbered = tuple(
+        (sheet.number, sheet.views[0].part) for sheet, _ in sheets if sheet.views[0].kind == kind
+    )
+    return Sheets(
+        drawing=drawing, sheets=sheets, index=_index(drawing, size_m, paper, numbered, len(sheets))
+    )
+
+
+def _cut(
+    drawing: WallDrawing, size_m: tuple[float, float], paper: Paper, *, is_brief: bool
+) -> list[tuple[tuple[Sheet, Furniture], ...]]:
+    """The sheets of a wall that is cut up; nothing where the paper has no room for them."""
+    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+    # As much text as any of them: with a key of several sheets.
+    views = (View(kind=next(iter(drawing.rasters)), part=whole, corner_mm=(0.0, 0.0)),)
+    several = ((1, whole), (2, whole))
+    longest = Sheet(paper=paper, views=views, count=99, numbered=several)
+    first = furnished(paper, drawing, longest, is_brief=is_brief)
+    if first is None:
+        return []
+    grid_m = drawing.grid * (FOOT_M if drawing.unit == "ft" else 1.0)
+    laid = cut_up(tuple(drawing.rasters), size_m, first.paper, scale=drawing.scale, grid_m=grid_m)
+    sheets = [
+        Sheet(
+            paper=first.paper,
+            views=shown,
+            number=number,
+            count=len(laid),
+            numbered=_numbered(laid, shown[0].kind),
+        )
+        for number, shown in enumerate(laid, start=1)
+    ]
+    furniture = [furnished(first.paper, drawing, sheet, is_brief=is_brief) for sheet in sheets]
+    if any(one is None or one.paper.block_mm > first.paper.block_mm for one in furniture):
+        return []
+    return [
+        tuple(
+            (sheet, replace(one, paper=first.paper))
+            for sheet, one in zip(sheets, furniture, strict=True)
+            if one is not None
+        )
+    ]
+
+
+def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, Part], ...]:
+    """What of a wall is on which of the sheets of one picture; empty where it is not cut."""
+    parts = tuple(
+        (number, sheet[0].part)
+        for number, sheet in enumerate(views, start=1)
+        if sheet[0].kind == kind
+    )
+    return parts if len(parts) > 1 else ()
+
+
+def _index(
+    drawing: WallDrawing,
+    size_m: tuple[float, float],
+    paper: Paper,
+    numbered: tuple[tuple[int, Part], ...],
+    count: int,
+) -> tuple[WallDrawing, Sheet, Furniture] | None:
+    """The wall as large as one sheet takes; None where it is not cut, or no usual scale does."""
+    first = next(iter(drawing.rasters))
+    whole = replace(drawing, grid=0.0, heights=(), rasters={first: drawing.rasters[first]})
+    if len(numbered) < 2:
+        return None
+    for scale in SCALES_FT if drawing.unit == "ft" else SCALES:
+        small = replace(whole, scale=scale)
+        ways = (paper, paper.turned)
+        if scale > drawing.scale and (found := _on_one(small, size_m, ways, is_brief=True)):
+            sheet = replace(found[0], number=0, count=count, numbered=numbered)
+            furniture = furnished(found[0].paper, small, sheet, is_brief=True)
+            return None if furniture is None else (small, sheet, furniture)
+    return None
