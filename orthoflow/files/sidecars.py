@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.words import accuracy_phrase
 from orthoflow.errors import GeometryError, InputError, StoreError
+from orthoflow.files.drawings.words import accuracy_phrase
 from orthoflow.files.geotiff import GridPlace, RasterParts
 from orthoflow.foreign_text import json_bytes, parse_json, text_of_file
 from orthoflow.geometry import WallFrame

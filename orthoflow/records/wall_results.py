@@ -352,7 +352,7 @@ def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]
                 yield Phrase(
                     key=key,
                     values={**values, "second": f"{own[second]:.1f}"},
-                    details=tuple(_of_how_many(own, counts)),
+                    asides=tuple(_of_how_many(own, counts)),
                 )
 
 

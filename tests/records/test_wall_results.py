@@ -59,19 +59,6 @@ class ToyRun:
         return [self.cells[name] for name in names[: names.index(address) + 1]]
 
 
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"n_found": 6.0}, " of 6 check points"),
-        ({"n_found": 1.0, "n_pairs": 9.0}, " of 1 check point"),
-        ({"n_pairs": 9.0}, " of 9 pairs"),
-        ({}, ""),
-    ],
-)
-def test_accuracy_says_of_how_many_it_is(values: dict[str, float], said: str) -> None:
-    assert module._of_how_many(values, ("n_found", "n_pairs")) == said
-
-
 def inspection(*findings: tuple[str, float, int], walls: tuple[int, ...] = ()) -> Inspection:
     count = len(walls)
     return Inspection(
@@ -88,7 +75,8 @@ def inspection(*findings: tuple[str, float, int], walls: tuple[int, ...] = ()) -
 
 def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     own = inspection(
-        ("rmse_x_mm", 1.25, 3), ("rmse_y_mm", 2.0, 3), ("rms_3d_mm", 3.0, 3), ("max_3d_mm", 9.0, 3),
+        ("rmse_x_mm", 1.25, 3), ("rmse_y_mm", 2.0, 3), ("n_found", 6.0, 3),
+        ("rms_3d_mm", 3.0, 3), ("max_3d_mm", 9.0, 3),
         ("rmse_x_mm", 7.0, 4), ("rmse_y_mm", 7.0, 4),
         ("rmse_x_mm", 8.0, -1), ("rmse_y_mm", 8.0, -1),
     )  # fmt: skip
@@ -96,11 +84,13 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     first = inspection(("rmse_u_mm", 4.0, 0), ("rmse_v_mm", 5.0, 0))
     half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
     found = {"check": own, "truth": every, "half": half, "first": first}
-    assert list(module._accuracy(found, 3)) == [
-        "check: RMSE sideways 1.2 mm, up and down 2.0 mm; with depth RMS 3.0 mm, largest 9.0 mm",
+    assert [said.text() for said in module._accuracy(found, 3)] == [
+        "check: RMSE sideways 1.2 mm, up and down 2.0 mm (check points: 6)",
+        "check: with depth RMS 3.0 mm, largest 9.0 mm",
     ]
     # What was found of all walls together says nothing of one.
-    assert list(module._accuracy(found, 0)) == ["first: RMSE sideways 4.0 mm, up and down 5.0 mm"]
+    (first_said,) = module._accuracy(found, 0)
+    assert first_said.text("de") == "first: RMSE seitlich 4.0 mm, in der Höhe 5.0 mm"
 
 
 def test_places_in_walls_become_numbers() -> None:
@@ -131,7 +121,7 @@ def looking(status: str, message: str = "") -> Any:
         (3, looking("failed", "none was found: P0 (57 m left of wall 0)"),
          ", though 3 check points were given: none was found: P0 (57 m left of wall 0)"),
         (1, cell(), ", though 1 check point was given: no step has looked for them"),
-        (3, looking("ok"), "; surveyed check points would tell"),
+        (3, looking("ok"), ": surveyed check points would tell"),
     ],
     ids=["none counted", "not looked for", "counted on another wall"],
 )  # fmt: skip
@@ -140,11 +130,9 @@ def test_given_check_points_are_not_asked_for_again(count: int, check: Any, said
     room = cell(method="simulate.room", outputs={"points": checkpoints(48)})
     survey = cell(method="read.checkpoints", outputs={"points": checkpoints(count)})
     run: Any = ToyRun(room=room, survey=survey, check=check)
-    assert module._unmeasured(run) == (
-        f"how far drawings made from it are off was not measured{said}"
-    )
+    assert module._unmeasured(run).text().startswith(f"accuracy not checked{said}")
     alone: Any = ToyRun(room=room)
-    assert module._unmeasured(alone).endswith("measured; surveyed check points would tell")
+    assert "surveyed check points would tell" in module._unmeasured(alone).text()
 
 
 @pytest.mark.parametrize(
@@ -163,9 +151,9 @@ def test_given_check_points_are_not_asked_for_again(count: int, check: Any, said
 def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) -> None:
     photos = cell(inputs={"photos": output("photos")})
     run: Any = ToyRun(photos=photos, mosaic=cell(params=params, metrics=metrics))
-    assert module._colours(run, "mosaic") == said
+    assert module._colours(run, "mosaic").text() == said
     run = ToyRun(scan=cell(inputs={"cloud": output("cloud")}), mosaic=cell(params=params))
-    assert module._colours(run, "mosaic") == "colours as the scan has them"
+    assert module._colours(run, "mosaic").text() == "colours as the scan has them"
 
 
 @pytest.mark.parametrize(
@@ -174,7 +162,7 @@ def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) 
 def test_points_that_paint_nothing_for_their_colour_are_said(least: int, said: str) -> None:
     ortho = cell(inputs={"cloud": output("cloud")}, params={"skip_below_grey": least})
     run: Any = ToyRun(ortho=ortho, mosaic=cell())
-    assert module._colours(run, "mosaic") == f"colours as the scan has them{said}"
+    assert module._colours(run, "mosaic").text() == f"colours as the scan has them{said}"
 
 
 def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:

@@ -164,7 +164,7 @@ def _scaled(drawing: WallDrawing, wall: WallResult, chosen: Choices, scale: int)
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
-    cells = Phrase(key="cells", values=values, details=coarse if ppi < _LEAST_PPI else ())
+    cells = Phrase(key="cells", values=values, asides=coarse if ppi < _LEAST_PPI else ())
     text = replace(drawing.text, notes=(*drawing.text.notes, cells))
     return replace(drawing, scale=scale, grid=grid, text=text)
 

@@ -52,17 +52,17 @@ class Phrase:
     Attributes:
         key: of its text.
         values: what is filled in.
-        details: statements in parentheses behind it.
+        asides: statements in parentheses behind it.
     """
 
     key: str
     values: Mapping[str, object] = field(default_factory=dict)
-    details: tuple[Phrase, ...] = ()
+    asides: tuple[Phrase, ...] = ()
 
     def text(self, language: Language = "en") -> str:
         """Say it in a language."""
         text = label(self.key, language, **self.values)
-        more = ", ".join(item.text(language) for item in self.details)
+        more = ", ".join(item.text(language) for item in self.asides)
         return f"{text} ({more})" if more else text
 
 

@@ -128,7 +128,8 @@ def test_the_step_of_the_wall_is_a_contour(sheet: pdfplumber.page.Page) -> None:
     drawn = [
         line
         for line in (*sheet.curves, *sheet.lines)
-        if line["stroking_color"] == pytest.approx((0.8, 0.25, 0.05))
+        if line["stroke"]
+        and line["stroking_color"] == pytest.approx((0.8, 0.25, 0.05))
         # The legend has one, too.
         and depth["top"] <= line["top"] <= depth["bottom"]
     ]
