@@ -13,7 +13,7 @@ import numpy as np
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS
+from orthoflow_plugins.plane.detector import DETECTOR_METRICS
 from orthoflow_provenance.document import (
     Metric,
     RecordedCell,
