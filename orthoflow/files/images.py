@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 # What photos end in; another file holds none, or one that must be converted first.
 PHOTO_SUFFIXES: Final = (
-    *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
-    *(".webp", ".heic", ".heif", ".avif"),
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"),
+    *(".webp", ".heic", ".heif", ".hif", ".avif"),
 )
 # What cameras call their raw photos.
 RAW_SUFFIXES: Final = frozenset(

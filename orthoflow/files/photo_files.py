@@ -414,6 +414,60 @@ def _is_padded(encoded: bytes, text: str) -> bool:
     return abs(passed_over - n_padding) <= _FEW_BYTES
 
 
+# Levels that a step between two blocks of a JPEG has beyond the slope on both sides of it, and
+# share by which such steps go one way along a row of blocks. Of 32 photos none exceeds 0.13, of 23
+# with a flipped bit that shows 20 exceed 0.5.
+_STEP_LEVELS: Final = 3
+_SHIFTED_SHARE: Final = 0.4
+_SHORTEST_SEAM: Final = 0.05
+_FEWEST_PARTS: Final = 8
+# Of more rows it is the picture that has such steps.
+_MOST_ROWS: Final = 0.05
+_SEAM_PX: Final = 16
+
+
+def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
+    """Return the row from which on the colours of a JPEG are shifted; None where they are not.
+
+    A flipped bit that decoders do not notice changes all blocks behind it by one amount. So colours
+    step along the upper sides of the blocks from there on to the right, and along the lower sides
+    of those to the left; nothing that is photographed lies like that on the grid of blocks.
+
+    Args:
+        encoded: the file's bytes.
+        rgb: (rows, cols, 3) its pixels.
+    """
+    if photo_format(encoded) != "JPEG":
+        return None
+    import simplejpeg
+
+    try:
+        sampling = simplejpeg.decode_jpeg_header(encoded, strict=False)[3]
+    except (ValueError, KeyError):
+        return None
+    side = 16 if sampling in ("420", "440") else 8
+    rows = np.arange(side, len(rgb) - 1, side)
+    n_parts = rgb.shape[1] // _SEAM_PX
+    ends = max(_FEWEST_PARTS, round(_SHORTEST_SEAM * n_parts))
+    if len(rows) < 2 or n_parts <= 2 * ends:
+        return None
+    above2, above, below, below2 = (
+        rgb[rows + k, : n_parts * _SEAM_PX].astype(np.int16) for k in (-2, -1, 0, 1)
+    )
+    beyond = 2 * (below - above) - (above - above2) - (below2 - below)
+    ways = np.where(np.abs(beyond) >= 2 * _STEP_LEVELS, np.sign(beyond), 0)
+    parts = ways.reshape(len(rows), n_parts, _SEAM_PX, 3).mean(axis=2)
+    summed = np.cumsum(parts, axis=1)
+    count = np.arange(1, n_parts + 1)[:, None]
+    left = (summed / count)[1:, ends - 1 : n_parts - ends]
+    right = ((summed[:, -1:] - summed) / np.maximum(n_parts - count, 1))[:-1]
+    right = right[:, ends - 1 : n_parts - ends]
+    share = np.maximum(np.minimum(left, right), np.minimum(-left, -right)).max(axis=(1, 2))
+    n_shifted = np.count_nonzero(share >= _SHIFTED_SHARE)
+    is_damage = 0 < n_shifted <= max(2.0, _MOST_ROWS * len(rows))
+    return int(rows[share.argmax()]) if is_damage else None
+
+
 # Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by equal angle over the
 # diagonal, and the cameras we could check keep to it: a Redmi Note 9S (4.74 mm, sensor diagonal
 # 8.0 mm) writes 26 where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm)

@@ -25,6 +25,7 @@ from orthoflow.files.photo_files import (
     opaque_pixels,
     photo_format,
     read_exif,
+    shifted_row,
     stated_bits,
     stated_size,
 )
@@ -260,6 +261,32 @@ def test_damage_in_the_scan_of_a_jpeg_is_found(kind: str, harm: Callable[[bytes]
     found, is_lost = damage(harm(JPEGS[kind]))
     assert found
     assert is_lost
+
+
+def flipped(encoded: bytes, seed: int) -> bytes:
+    """A JPEG with one bit of its scan flipped."""
+    rng = np.random.default_rng(seed)
+    at = int(rng.integers(encoded.rindex(b"\xff\xda") + 20, len(encoded) * 9 // 10))
+    return encoded[:at] + bytes([encoded[at] ^ 1 << int(rng.integers(8))]) + encoded[at + 1 :]
+
+
+def test_flipped_bits_that_no_decoder_notices_shift_what_is_behind_them() -> None:
+    visible = found = 0
+    for kind in ("baseline", "optimised", "grey", "cmyk"):
+        whole = decode_image(JPEGS[kind])
+        assert shifted_row(JPEGS[kind], whole) is None
+        for seed in range(25):
+            encoded = flipped(JPEGS[kind], seed)
+            if damage(encoded)[0]:
+                continue
+            image = decode_image(encoded)
+            is_off = (np.abs(image.astype(int) - whole) > 12).any(axis=2)
+            if is_off.mean() > 0.02:
+                visible += 1
+                row = shifted_row(encoded, image)
+                found += row is not None and abs(row - np.argmax(is_off.any(axis=1))) <= 32
+    assert visible >= 10
+    assert found >= 0.8 * visible
 
 
 @pytest.mark.parametrize("padding", [bytes(7), bytes(500), b"\x12\x34\x56"])

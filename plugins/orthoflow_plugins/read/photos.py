@@ -52,6 +52,7 @@ from orthoflow.files.photo_files import (
     opened,
     photo_format,
     read_exif,
+    shifted_row,
     stated_bits,
 )
 from orthoflow.geometry.levels import eight_bits
@@ -470,7 +471,12 @@ def _read_photo(
     )
     sheet.add(name, eight_bits(pixels))
     n_pages = count_pages(encoded)
+    row = shifted_row(encoded, eight_bits(pixels))
     remarks = (
+        ""
+        if row is None
+        else f"seems damaged from row {row} on, where colours step along the blocks of the JPEG: "
+        "look at it, copy it again from the camera, or take it out",
         f"holds bytes that its decoder passes over ({odd}), so it may be damaged" if odd else "",
         f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
     )

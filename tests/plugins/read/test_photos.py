@@ -490,6 +490,19 @@ def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: Rea
     assert "photo a.jpg: holds bytes that its decoder passes over" in read.warnings
 
 
+def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
+    tmp_path: Path, read: Reader
+) -> None:
+    image = made.picture(640, 480)
+    shifted = image // 2
+    shifted[96:112, 256:] += 40
+    shifted[112:] += 40
+    photos = {"a.jpg": encode_jpeg(shifted), "b.jpg": encode_jpeg(image)}
+    assert len(read(*made.write(tmp_path, photos))) == 2
+    assert "photo a.jpg: seems damaged from row 96 on" in read.warnings
+    assert "b.jpg: seems" not in read.warnings
+
+
 @pytest.mark.parametrize(
     ("content", "named"),
     [
