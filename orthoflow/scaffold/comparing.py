@@ -39,7 +39,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
     Args:
         method_id: the new method.
         name: its variant's name.
-        catalog: says which kinds are sources, which take no variants.
+        catalog: knows which kinds are sources, which take no variants.
 
     Returns:
         YAML; empty for a source, and when neither a shipped recipe has a step of the kind nor an
@@ -83,7 +83,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
 def _judged(
     kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog
 ) -> dict[str, list[str]]:
-    """The numbers that say which method is the better one, of a recipe that measures them."""
+    """The numbers that show which method is better, of a recipe that measures them."""
     wanted = _JUDGED.get(kind, ())
     measured = {
         metric.name: f"{name}.{metric.name}"
@@ -101,7 +101,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
     Args:
         method_id: the new method, which has a parameter `factor`.
         takes: product types that it takes.
-        catalog: says what the recipes' methods give.
+        catalog: knows what the recipes' methods give.
 
     Returns:
         YAML; empty when no shipped recipe leads to all of them.
@@ -128,7 +128,7 @@ def _behind_a_recipe(
         step: its name.
         takes: port -> product type; what the recipe does not give installed methods make of it.
         variants: of the step.
-        catalog: says what methods take and give.
+        catalog: knows what methods take and give.
     """
     for recipe in _RECIPES:
         document = _coarse_document(recipe)

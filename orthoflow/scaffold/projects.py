@@ -1,4 +1,4 @@
-"""The files of a new plugin, filled from templates and from what the catalog says of its kind."""
+"""The files of a new plugin, filled from templates and from what the catalog has about its kind."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
 # What stands where the author shall write; `unwritten` finds it again.
 _UNWRITTEN: Final = {
     "summary": "one line for `orthoflow plugins list`",
-    "description": "Say here what the method does, for `orthoflow plugins show`.",
+    "description": "State here what the method does, for `orthoflow plugins show`.",
 }
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Project:
-    """What the author says of a new plugin.
+    """What the author states about a new plugin.
 
     Attributes:
         name: of distribution and method, e.g. `my-detector`.
@@ -88,7 +88,7 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
     """Write a new plugin into a folder of its name.
 
     Args:
-        project: what the author says.
+        project: what the author states.
         parent: gets the folder.
         catalog: what is installed.
 
@@ -115,7 +115,7 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 
 
 def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
-    """Say what the plugin of a method still shows in the words that `write_project` put there.
+    """List what the plugin of a method still shows in the words that `write_project` put there.
 
     Raises:
         PluginError: the method cannot be loaded.

@@ -116,7 +116,7 @@ class StepContext:
         listen: where progress, log lines and diagnostics go as they happen.
         is_cancelled: asks whether the step should stop.
         clock_s: seconds as `time.perf_counter`, which stand still while modules are loaded and
-            kernels compiled: what a method measures of its own speed must not hang on what ran
+            kernels compiled: what a method measures of its own speed must not depend on what ran
             before. The engine states that time as `compile_s`.
         processor_s: processor seconds of all threads, and of processes that have ended, without
             those of loading and compiling: what is left to compare where others use the machine.
@@ -212,7 +212,7 @@ class StepContext:
         )
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Say how far the step is, 0..1; never goes back. Stops a cancelled step.
+        """Report how far the step is, 0..1; never goes back. Stops a cancelled step.
 
         Raises:
             CancelledStepError: the step was asked to stop.

@@ -1,4 +1,4 @@
-"""What methods say, made fit to be shown and kept: one line, printable, of bounded length."""
+"""What methods report, made fit to be shown and kept: one line, printable, of bounded length."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class MetricSpec:
     """A metric that a method may report.
 
     Attributes:
-        name: of the metric; with the wildcards of file names (`*`, `[xy]`) where a part hangs on
+        name: of the metric; with the wildcards of file names (`*`, `[xy]`) where a part depends on
             the data.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares, `yes/no` for 1 and 0; empty where the
             name ends in it.
@@ -127,9 +127,9 @@ class MetricSpec:
         better: `lower`, `higher` or `one`: which values are better; empty where none are: then it
             is shown, and nobody is best in it.
         description: what else to know of it, e.g. how it is measured: one sentence.
-        headline: it says how good the result is: it stands on the first screen of a report, and
+        headline: it shows how good the result is: it stands on the first screen of a report, and
             comparisons show it unless they ask for others.
-        counted_by: metric of the same step that says how many items (photos, points) it sums up:
+        counted_by: metric of the same step that counts the items (photos, points) it sums up:
             values over unequal numbers of them are not ranked.
         needs: optional input ports without which it is not reported.
     """
@@ -216,7 +216,7 @@ class Method:
             An instance of `Out`.
 
         Raises:
-            OrthoflowError: no result is possible; one sentence says why.
+            OrthoflowError: no result is possible; one sentence states why.
         """
         mapped = mapped_port(type(self))
         if mapped is None:
@@ -237,7 +237,7 @@ class Method:
             An instance of `PartOut`.
 
         Raises:
-            OrthoflowError: no result is possible; one sentence says why.
+            OrthoflowError: no result is possible; one sentence states why.
         """
         raise AssertionError(f"{type(self).__name__} must implement run_part")
 
@@ -254,7 +254,7 @@ class Method:
             An instance of `Out`.
 
         Raises:
-            OrthoflowError: no result is possible; one sentence says why.
+            OrthoflowError: no result is possible; one sentence states why.
         """
         raise AssertionError(f"{type(self).__name__} must implement join")
 
@@ -282,7 +282,7 @@ class Method:
 
 
 def mapped_port(method: type[Method]) -> MappedPort | None:
-    """Say where the items are that a method maps over; None for a method that does not.
+    """Return where the items are that a method maps over; None for a method that does not.
 
     Raises:
         PluginError: it cannot map over what it names.

@@ -1,4 +1,4 @@
-"""Units as the names of parameters and metrics say them."""
+"""Units as the names of parameters and metrics state them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def unit_of(name: str) -> str:
-    """Give the unit that the last word of a name that is one says; a name alone is no length.
+    """Return the unit that the last word of a name states; a name alone is no length.
 
     >>> unit_of("tolerance_m"), unit_of("area_min_m2"), unit_of("area_m2_min"), unit_of("n_trials")
     ('m', 'm2', 'm2', '')

@@ -54,7 +54,8 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
     assert method.citations == ("doi:10.1000/xyz",)
     # A template that reports a metric declares it.
     text = (folder / project.package / "method.py").read_text(encoding="utf-8")
-    assert set(method.metrics) == set(re.findall(r"^ +ctx\.metric\(\"(\w+)", text, re.MULTILINE))
+    reported = set(re.findall(r"^ +ctx\.metric\(\"(\w+)", text, re.MULTILINE))
+    assert {metric.name for metric in method.metric_specs()} == reported
     comparison, told = folder / "compare.yaml", (folder / "README.md").read_text(encoding="utf-8")
     # Sources take no variants; their step stands in the text instead.
     assert comparison.exists() == (not catalog.kinds[kind].spec.is_source)

@@ -25,10 +25,10 @@ class RegisterSimilarity(Method):
     """Fit shift, rotation and scale to pairs of points, and move the cloud by them.
 
     The seven-parameter transformation of skarlatos2012: `points` are places in the cloud's own
-    coordinates, `control` the surveyed ones; equal names make a pair. All pairs count alike;
-    `sigma0_mm` is the standard deviation of one coordinate, `left_out_rms_mm` the distance of each
-    control point from where the other pairs put it, which no pair can flatter. Which way is up in
-    the cloud is that of the control from then on.
+    coordinates, `control` the surveyed ones; equal names make a pair. All pairs have equal
+    weights; `sigma0_mm` is the standard deviation of one coordinate, `left_out_rms_mm` the
+    distance of each control point from where the other pairs put it, which no pair can flatter.
+    Up in the cloud is then that of the control.
     """
 
     id: ClassVar[str] = "register.similarity"
@@ -135,7 +135,7 @@ class Similarity:
 def fit_similarity(
     points_source: NDArray[np.float64], points_target: NDArray[np.float64], *, with_scale: bool
 ) -> Similarity:
-    """Fit target_from_source by least squares, all coordinates alike (Umeyama 1991).
+    """Fit target_from_source by least squares, all coordinates weighted equally (Umeyama 1991).
 
     Args:
         points_source: (n, 3) metres, n >= 3, not on one line.

@@ -82,11 +82,11 @@ class Area:
 
 
 def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
-    """Tell face, open and hidden cells apart.
+    """Classify cells as face, open or hidden.
 
     Args:
         wall: the wall; of one with more than 32 million cells every nth row and column is taken.
-        lines: what rays tell of empty cells; None without a cloud, and then none is hidden.
+        lines: what rays show about empty cells; None without a cloud, and then none is hidden.
         rule: from which depth on a cell is behind the wall.
     """
     import cv2
@@ -120,7 +120,7 @@ def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
 def _face_m(depths_m: NDArray[np.float32], behind_m: float) -> float:
     """Depth of the face of a wall: its plane, or the middle of what lies behind if that is more.
 
-    A detector may have laid the plane over the fronts of pilasters, or across them.
+    A detector may have put the plane over the fronts of pilasters, or across them.
     """
     deeper = depths_m[depths_m <= -behind_m]
     return float(np.median(deeper)) if len(deeper) > _FACE_LEAST * len(depths_m) else 0.0

@@ -44,7 +44,7 @@ _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_
 class SegmentOpenings(Method):
     """Find windows, doors and niches: what lies behind a wall's face, or shows nothing.
 
-    Cells of a wall that lie behind its face, or are empty, and hang together are an opening where
+    Connected cells of a wall that lie behind its face, or are empty, are an opening where
     a square of some width fits in and the face was measured along most of the rim. The face is the
     plane, or where more than half of the wall lies behind that, the middle of what does. With the
     cloud, lines of sight are followed: an area through which some went is `through`; where they
@@ -52,7 +52,7 @@ class SegmentOpenings(Method):
     compact as a round window, is `no data`, glass or a mirror most often; what has a measured back
     is a `niche`, shut doors and windows set back among them.
 
-    Sides are lines through the borders of the cells along them. Each says how exact it is, by
+    Sides are lines through the borders of the cells along them. Each states how exact it is, by
     cells, the spacing of the points and its own scatter. With orthoimages of photos, long sides
     move to the edge of the picture that is surely the same, where the scan is too coarse for as
     good a place.
@@ -105,7 +105,7 @@ class SegmentOpenings(Method):
         level: bool = Field(default=False, description="Look at floors, ceilings and slopes, too.")
 
     class In(Ports):
-        """Walls; the cloud tells what is hidden, orthoimages make sides more exact."""
+        """Walls; the cloud shows what is hidden, orthoimages make sides more exact."""
 
         walls: Walls
         cloud: PointCloud | None = None
@@ -133,8 +133,8 @@ class SegmentOpenings(Method):
             inputs.cloud.require_points(2)
         else:
             ctx.warn(
-                "without the cloud nothing tells an opening from a place that furniture hides, or "
-                "one that was looked through from one that gave nothing: wire it"
+                "without the cloud an opening looks like a place that furniture hides, and "
+                "one that was looked through like one that gave nothing: wire it"
             )
         rule = AreaRule(
             behind_m=params.behind_m,
@@ -242,7 +242,7 @@ def _grey(
         return None
     if not image.frame.has_cells_of(wall.frame):
         ctx.warn(
-            f"{wall.name}: its orthoimage has other cells than its depth, so sides are told by "
+            f"{wall.name}: its orthoimage has other cells than its depth, so sides are placed by "
             "depth alone"
         )
         return None

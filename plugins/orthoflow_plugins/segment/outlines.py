@@ -117,7 +117,7 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
 
     found = outlines(cells.astype(np.int16) - 1)
     if len(found) != 1:
-        raise MethodError(f"an area of cells must hang together, got {len(found)} parts")
+        raise MethodError(f"an area of cells must be connected, got {len(found)} parts")
     ring = found[0][1][0][:-1]
     ways = np.roll(ring, -1, axis=0) - ring
     steps = np.rint(np.abs(ways).sum(axis=1)).astype(np.int64)
@@ -165,7 +165,7 @@ def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
 
 
 def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
-    """Lay a line through the middles between two corners, those far off left out."""
+    """Fit a line through the middles between two corners, those far off left out."""
     along = ring[first : last + 1] if first <= last else np.vstack([ring[first:], ring[: last + 1]])
     begin, end = along[0], along[-1]
     length = float(np.linalg.norm(end - begin))

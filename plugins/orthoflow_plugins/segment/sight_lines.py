@@ -28,7 +28,7 @@ _SHARE_LEAST: Final = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class SightLines:
-    """What lines of sight tell of a wall, on tiles of its raster.
+    """What lines of sight show about a wall, on tiles of its raster.
 
     Attributes:
         side: cells of the wall that a tile is wide and high.

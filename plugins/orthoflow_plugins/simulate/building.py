@@ -273,7 +273,7 @@ def add_block(
     Args:
         draft: what the rectangles go to.
         base: (3,) middle of its bottom, metres.
-        yaw_deg: turn about the vertical; 0 lays the first size along x.
+        yaw_deg: turn about the vertical; 0 puts the first size along x.
         size_m: length, depth, height.
         paint: all its faces.
     """

@@ -138,7 +138,7 @@ def truth_of(
 
 @dataclass(frozen=True, kw_only=True)
 class ScanStep:
-    """Spacing of the points on a wall, as if they lay in a square grid.
+    """Spacing of the points on a wall, as if they were in a square grid.
 
     Attributes:
         median_m: half of the wall is scanned at least as finely.
@@ -333,7 +333,7 @@ def check_points(
 
     Args:
         scene: the room, in its own frame.
-        views: the same, laid out for looking at it.
+        views: the same, arranged for viewing.
         stations: (s, 3) metres, room frame.
         world_from_room: (3, 3) rotation.
         shift_world_m: (3,) world position of the room's origin.

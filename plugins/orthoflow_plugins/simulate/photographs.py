@@ -145,7 +145,7 @@ _WALL_NAMES: Final = ("main wall", "opposite wall", "right wall", "left wall")
 
 
 def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
-    """Plan the photos of a layout; where exactly each is taken from hangs on the generator.
+    """Plan the photos of a layout; the generator decides where exactly each is taken.
 
     The photographer aims at a place, but stands aside and holds the camera a little askew. All
     photos share one camera with Brown distortion.

@@ -153,7 +153,7 @@ class SimulateRoom(Method):
             default=None,
             ge=0,
             description="Which of the drawn rooms, so that datasets have rooms of their own; "
-            "without it, the seed of the workflow says. Scanning errors do not hang on it.",
+            "by default the seed of the workflow. Scanning errors do not depend on it.",
         )
         obstacle: bool = Field(
             default=True, description="An object stands free 0.6 m before the main wall."

@@ -349,7 +349,7 @@ def _add_cornice(wall: Side, plan: RoomPlan) -> None:
 
 
 def _clipped(planes: list[TruePlane]) -> tuple[TruePlane, ...]:
-    """Cut each outline to the room and lay the smallest upright rectangle round what remains."""
+    """Cut each outline to the room; return the smallest upright rectangle of what remains."""
     bounds = [item.plane for item in planes if not item.name.startswith(("niche", "door"))]
     return tuple(
         TruePlane(name=item.name, plane=item.plane, outline=_visible_rectangle(item, bounds))

@@ -1,6 +1,6 @@
 """The simulated scanner: where it stands, what it sweeps, what it measures and how wrong it is.
 
-Noise hangs on the place in the grid of angles only, so that threads cannot change it.
+Noise depends on the place in the grid of angles only, so that threads cannot change it.
 
 Of a material the laser sees what the eye does not. Red lead, gold, wet plaster and retouchings
 change order between the laser's one wavelength and the three broad bands of a camera. Per material,
@@ -119,7 +119,7 @@ class Scanned(Rows):
     """What a scan gives, one entry per ray, column by column.
 
     Attributes:
-        x: float32 metres from the room's origin; y and z alike.
+        x: float32 metres from the room's origin; y and z likewise.
         y: see x.
         z: see x.
         intensity: float32 0..1.
@@ -142,7 +142,7 @@ class Scan:
     Attributes:
         points: what was measured.
         scan: (n,) number of the scan.
-        row: (n,) place in the scan's grid; column alike.
+        row: (n,) place in the scan's grid; column likewise.
         column: see row.
         stations: (s, 3) where each scan was made, room frame.
     """
@@ -472,7 +472,7 @@ class LaserBand:
 
     Attributes:
         scene: whose rectangles are seen; its origin at (0, 0, 0).
-        inversion: 0 when the laser sees what the scene's textures say, 1 when all contrast goes
+        inversion: 0 when the laser sees what the scene's textures show, 1 when all contrast goes
             by the materials' own response.
         seed: of materials, patches and spots.
     """

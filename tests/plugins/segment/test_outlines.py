@@ -216,7 +216,7 @@ def test_of_a_single_cell_nothing_is_left() -> None:
 def test_cells_that_do_not_hang_together_are_no_area() -> None:
     cells = block()
     cells[:, 70:80] = False
-    with pytest.raises(MethodError, match="must hang together, got 2 parts"):
+    with pytest.raises(MethodError, match="must be connected, got 2 parts"):
         outline(cells)
 
 
