@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError
 from orthoflow.files.photo_files import (
-    HOW_TO_READ_HEIC,
     MOST_PIXELS,
-    READABLE,
     is_whole_png,
     opened,
     photo_format,
     stated_size,
     tiff_pixels,
+    unreadable,
 )
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Photo
@@ -79,9 +78,12 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
     """Decode an image into RGB; of a PNG of 16 bits only 8 unless it is to be deep."""
     import cv2
 
+    problem = unreadable(encoded)
+    if problem:
+        raise InputError(f"{name} {problem}")
     kind = photo_format(encoded)
     # OpenCV makes room for a chunk of a PNG as long as it says that it is.
-    if kind not in READABLE or (kind == "PNG" and not is_whole_png(encoded)):
+    if kind == "PNG" and not is_whole_png(encoded):
         raise InputError(_not_an_image(encoded, name))
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
@@ -94,14 +96,13 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
             return tiff_pixels(encoded)
         if kind in ("HEIC", "AVIF"):
             with opened(encoded) as image:
-                if image is None:
-                    raise InputError(_not_an_image(encoded, name))
-                return np.asarray(image.convert("RGB"))
-        depth = cv2.IMREAD_ANYDEPTH if is_deep else 0
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | depth
-        decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+                decoded = None if image is None else np.asarray(image.convert("RGB"))
+        else:
+            depth = cv2.IMREAD_ANYDEPTH if is_deep else 0
+            flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | depth
+            decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
     except (cv2.error, ValueError, OSError, SyntaxError) as error:
-        reason = str(error) if kind in ("TIFF", "BigTIFF") else ""
+        reason = "" if kind in ("JPEG", "PNG", "WebP") else str(error)
         raise InputError(_not_an_image(encoded, name, reason)) from error
     if decoded is None:
         raise InputError(_not_an_image(encoded, name))
@@ -321,11 +322,6 @@ def _encode(suffix: str, image: Colours, options: list[int]) -> bytes:
 
 
 def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
-    kind = photo_format(encoded)
-    if kind == "HEIC":
-        return f"{name} is a HEIC file: {HOW_TO_READ_HEIC}"
-    if kind is not None and kind not in READABLE:
-        return f"{name} is a {kind} file: expected JPEG, PNG or TIFF; convert it"
     return (
         f"{name} cannot be decoded as an image ({len(encoded)} bytes"
         f"{f': {reason}' if reason else ''}): expected a whole JPEG, PNG or TIFF file; open it in "

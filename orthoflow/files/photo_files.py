@@ -98,6 +98,23 @@ def photo_format(encoded: bytes) -> str | None:
     return next((name for magic, name in _MAGICS if encoded.startswith(magic)), None)
 
 
+def unreadable(encoded: bytes) -> str:
+    """Say what a file is that cannot be read as a photo, and the way out; empty where it can."""
+    kind = photo_format(encoded)
+    if kind is None:
+        return (
+            f"is no JPEG, PNG, TIFF, WebP or HEIC file ({len(encoded)} bytes), whatever its name "
+            "says: copy it again, or take it out"
+        )
+    if kind == "HEIC":
+        with opened(encoded) as image:
+            return "" if image is not None else f"is a HEIC file: {HOW_TO_READ_HEIC}"
+    if kind in READABLE:
+        return ""
+    way_out = HOW_TO_DEVELOP if "raw" in kind else "convert it to JPEG or TIFF, at full size"
+    return f"is {kind}, which is not read: {way_out}"
+
+
 def _media_format(encoded: bytes) -> str:
     end = min(max(int.from_bytes(encoded[:4], "big"), 16), 256)
     brands = {encoded[at : at + 4] for at in range(8, end, 4)}

@@ -361,9 +361,9 @@ def test_jpeg_keeps_red_red() -> None:
 
 
 def test_what_is_no_image_is_refused() -> None:
-    with pytest.raises(InputError, match=r"photo\.jpg cannot be decoded as an image \(4 bytes\)"):
+    with pytest.raises(InputError, match=r"photo\.jpg is no JPEG.*\(4 bytes\)"):
         images.decode_image(b"text", "photo.jpg")
-    with pytest.raises(InputError, match="cannot be decoded"):
+    with pytest.raises(InputError, match=r"is no JPEG"):
         images.decode_image(b"", "photo.jpg")
     with pytest.raises(ProductError, match="must be uint8"):
         images.encode_png(np.zeros((2, 2, 5), np.uint8))

@@ -41,19 +41,16 @@ from orthoflow.files.images import (
 )
 from orthoflow.files.photo_files import (
     HOW_TO_DEVELOP,
-    HOW_TO_READ_HEIC,
-    READABLE,
     Exif,
     FocalLength,
     count_pages,
     damage,
     focal_length,
     opaque_pixels,
-    opened,
-    photo_format,
     read_exif,
     shifted_row,
     stated_bits,
+    unreadable,
 )
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
@@ -64,6 +61,7 @@ from orthoflow_plugins.read.masks import Masks, beside_photos
 
 _PLAIN_BITS: Final = 8
 _NAMED: Final = 3
+_MOST_PROBLEMS: Final = 20
 
 
 class ReadPhotos(Method):
@@ -146,11 +144,20 @@ class ReadPhotos(Method):
         )
         sources = _sources(ctx, inputs.files, beside, cubes)
         sheet = ContactSheet(len(sources))
-        read = []
+        read: list[_ReadPhoto] = []
+        problems: list[str] = []
         for index, source in enumerate(sources):
             ctx.progress(index / len(sources), source.name)
-            read.append(_masked(_read_photo(source, calibration, sheet), source, masks))
-            ctx.log(_described(read[-1]))
+            try:
+                read.append(_masked(_read_photo(source, calibration, sheet), source, masks))
+            except InputError as error:
+                problems.append(str(error))
+            else:
+                ctx.log(_described(read[-1]))
+        if problems:
+            more = len(problems) - _MOST_PROBLEMS
+            counted = [f"... and {more} more problems"] if more > 0 else []
+            raise InputError("\n".join(problems[:_MOST_PROBLEMS] + counted))
         masks.warn_of_unused(ctx)
         _warn(ctx, read, calibration)
         photos = Photos(photos=tuple(item.photo for item in read))
@@ -412,19 +419,9 @@ def _require_whole(name: str, encoded: bytes) -> str:
     Raises:
         InputError: it is no photo, of a format that is not read, or a part of it is lost.
     """
-    kind = photo_format(encoded)
-    if kind == "HEIC":
-        with opened(encoded) as image:
-            if image is None:
-                raise InputError(f"photo {name} is a HEIC file: {HOW_TO_READ_HEIC}")
-    elif kind is not None and kind not in READABLE:
-        way_out = HOW_TO_DEVELOP if "raw" in kind else "convert it to JPEG or TIFF, at full size"
-        raise InputError(f"photo {name} is {kind}, which is not read: {way_out}")
-    elif kind is None:
-        raise InputError(
-            f"photo {name} is no JPEG, PNG, TIFF, WebP or HEIC file ({len(encoded)} bytes), "
-            "whatever its name says: copy it again from the camera, or take it out"
-        )
+    problem = unreadable(encoded)
+    if problem:
+        raise InputError(f"photo {name} {problem}")
     found, is_lost = damage(encoded)
     if is_lost:
         raise InputError(

@@ -43,7 +43,7 @@ def test_every_field_is_read_as_text(tmp_path: Path) -> None:
             "block.yaml:1:23: revisions.0.texts: no field of a title block; did you mean text?",
         ),
         ("logo: none.png\n", "none.png cannot be read: No such file"),
-        ("logo: block.yaml\n", "block.yaml cannot be decoded as an image"),
+        ("logo: block.yaml\n", "block.yaml is no JPEG, PNG, TIFF"),
         ("title: [", "block.yaml:"),
         ("a" * 100_001, "block.yaml has 100001 bytes, a title block (YAML) at most 100000"),
     ],

@@ -521,6 +521,15 @@ def test_a_file_that_only_has_the_name_of_a_photo_is_named(
         read(*made.write(tmp_path, {"a.jpg": content}))
 
 
+def test_all_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, read: Reader) -> None:
+    whole = encode_jpeg(made.picture(256, 192))
+    files = {"a.jpg": whole, "b.jpg": whole[:5000], "c.jpg": b"", "d.tif": b"%PDF-1.7"}
+    with pytest.raises(InputError) as caught:
+        read(*made.write(tmp_path, files))
+    named = [line.split()[1] for line in str(caught.value).splitlines()]
+    assert named == ["b.jpg", "c.jpg", "d.tif"]
+
+
 def test_webp_under_the_name_of_a_jpeg_is_read(tmp_path: Path, read: Reader) -> None:
     image = made.picture(64, 48)
     (photo,) = read(*made.write(tmp_path, {"a.jpg": encode_webp(image)}))
