@@ -194,12 +194,14 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     lenses = {number: _lens_of(camera, images) for number, camera in model.cameras.items()}
     by_number = sorted(model.images.items())
     names = _whole_names(images) if suffix == ".txt" else {}
+    try:
+        names = {number: image.name for number, image in by_number} | names
+    except UnicodeDecodeError as error:
+        raise damaged(images, "the name of an image is no UTF-8 text") from error
     return tuple(
         given
         for number, image in by_number
-        for given in _given(
-            image, names.get(number, image.name), *lenses[image.camera_id], path=images
-        )
+        for given in _given(image, names[number], *lenses[image.camera_id], path=images)
     )
 
 

@@ -487,6 +487,7 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0\n"}, "cannot read the COLMAP model"),
         ({"cameras.txt": "1 PINHOLE 640 480 500 320 240\n", "images.txt": ""}, "cannot read the C"),
         ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
+        ({"cameras.txt": CAMERA, "images.txt": b"1 1 0 0 0 0 0 0 1 \xab.jpg\n\n"}, "is no UTF-8"),
         ({"cameras.bin": b"\0" * 8, "images.bin": b"\1" + b"\0" * 7 + b"x" * 64},
          "images.bin: it ends too early"),
         ({"b.out": "1 0\n", "list.txt": "a.jpg\nb.jpg\n"}, r"1 cameras .* list.txt \(2 lines\)"),

@@ -123,21 +123,19 @@ def _camera_files(folder: Path) -> None:
 
 
 # What must lie beside a file for it to be read.
-_BESIDE: Final = {
-    "cameras.txt": "images.txt",
-    "images.txt": "cameras.txt",
-    "cameras.bin": "images.bin",
-    "images.bin": "cameras.bin",
-    "bundle.out": "list.txt",
-    "list.txt": "bundle.out",
-}
+_TOGETHER: Final = (
+    ("cameras.txt", "images.txt", "rigs.txt", "frames.txt"),
+    ("cameras.bin", "images.bin"),
+    ("bundle.out", "list.txt"),
+)
 
 
 def _read_cameras(path: Path) -> object:
     paths = [path]
-    if path.name in _BESIDE:
-        paths.append(path.with_name(_BESIDE[path.name]))
-        paths[-1].write_bytes(_sound()[paths[-1].name])
+    for name in next((names for names in _TOGETHER if path.name in names), ()):
+        if name != path.name:
+            paths.append(path.with_name(name))
+            paths[-1].write_bytes(_sound()[name])
     return _read(ReadCameras, paths, photos=_photos())
 
 
