@@ -22,6 +22,7 @@ from unittest import mock
 
 import click
 import pytest
+from PIL import Image
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
@@ -29,6 +30,7 @@ from orthoflow.cli.options import Changes
 from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.calibration import lens_for, read_calibration
+from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.source import (
     shipped_workflow,
@@ -313,8 +315,10 @@ def test_every_piece_of_a_workflow_is_one(catalog: Catalog, readers_folder: Path
                 # A step more, behind those of the main job.
                 text = shipped_workflow("photos-on-scan").read_text() + indent(block, "  ")
             else:
-                # A calibration, a file of parameters, the first line of an editor.
-                assert first in ("cameras", "plane.hough2d.tolerance_m", "# yaml-language-server")
+                # A calibration, a title block (both read below), a file of parameters, the first
+                # line of an editor.
+                known = ("cameras", "layout", "plane.hough2d.tolerance_m", "# yaml-language-server")
+                assert first in known
                 continue
             (readers_folder / "block.yaml").write_text(text)
             load_workflow(readers_folder / "block.yaml", catalog)
@@ -328,6 +332,13 @@ def test_the_calibration_of_the_documents_is_read(readers_folder: Path) -> None:
     lens = lens_for(read_calibration(readers_folder / "shown.yaml"), "IMG_1.jpg", 6000, 4000)
     assert lens is not None
     assert lens.fx == 4210.5
+
+
+def test_the_title_block_of_the_documents_is_read(readers_folder: Path) -> None:
+    (block,) = blocks(ROOT / "docs" / "exports.md", "yaml", start="layout:")
+    (readers_folder / "office.yaml").write_text(block)
+    Image.new("RGB", (4, 4)).save(readers_folder / "logo.png")
+    assert read_title_block(readers_folder / "office.yaml").revisions[0].mark == "A"
 
 
 PYTHON_RUN_BY: Final = {
