@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 from xml.parsers.expat import ExpatError, ParserCreate
@@ -29,7 +29,7 @@ from orthoflow.files.points.blocks import (
     ScanFile,
     short_file_error,
 )
-from orthoflow.files.points.fields import columns_of_names
+from orthoflow.files.points.fields import columns_of_names, point_block
 from orthoflow.files.points.libraries import load_library, reading
 from orthoflow.files.points.units import (
     StatedUnit,
@@ -266,13 +266,14 @@ def _scan_blocks(
 
 def _buffers(
     libe57: Any, file: Any, names: list[str], capacity: int
-) -> tuple[dict[str, NDArray[np.float64]], Any]:
-    arrays: dict[str, NDArray[np.float64]] = {}
+) -> tuple[dict[str, NDArray[Any]], Any]:
+    arrays: dict[str, NDArray[Any]] = {}
     buffers = libe57.VectorSourceDestBuffer()
     for name in names:
-        # float64 for all: pye57 takes numpy's 64-bit integers for 32-bit ones and leaves rubbish,
-        # and its own readers' 16 bits are too few for rows and columns.
-        arrays[name] = np.zeros(capacity, dtype=np.float64)
+        # No integers: pye57 takes numpy's 64-bit ones for 32-bit ones and leaves rubbish, and its
+        # own readers' 16 bits are too few for rows and columns.
+        is_exact = name.startswith(("cartesian", "spherical", "row", "column"))
+        arrays[name] = np.zeros(capacity, dtype=np.float64 if is_exact else np.float32)
         buffers.append(
             libe57.SourceDestBuffer(
                 file.image_file, name, arrays[name], capacity, doConversion=True, doScaling=True
@@ -281,50 +282,35 @@ def _buffers(
     return arrays, buffers
 
 
-def _block(arrays: dict[str, NDArray[np.float64]], header: ScanHeader, scan: int) -> PointBlock:
-    n_read = len(next(iter(arrays.values())))
-    left_out: dict[str, int] = {}
-    state = arrays.get(header.invalid_state)
-    if state is not None and state.any():
-        arrays = {name: array[state == 0] for name, array in arrays.items()}
-        left_out["invalid"] = int(np.count_nonzero(state))
-    # No return: the origin of the scanner, or of the file's world, without a flag.
-    is_void = arrays[header.axes[0]] == 0.0
-    if is_void.any():
-        if header.axes is _CARTESIAN:
-            is_void &= (arrays[header.axes[1]] == 0.0) & (arrays[header.axes[2]] == 0.0)
-        if n_void := int(np.count_nonzero(is_void)):
-            arrays = {name: array[~is_void] for name, array in arrays.items()}
-            left_out["no_return"] = n_void
-    local = np.column_stack([arrays[name] for name in header.axes])
+def _block(arrays: dict[str, NDArray[Any]], header: ScanHeader, scan: int) -> PointBlock:
+    axes = np.stack([arrays[name] for name in header.axes])
     if header.axes is _SPHERICAL:
-        local = _cartesian(local)
-    is_posed = header.scan.station_is_posed
-    has_rgb, has_grid = ("rgb" in header.scan.fields, "grid" in header.scan.fields)
-    intensity = None
+        axes = _cartesian(axes)
+    values: dict[str, NDArray[np.generic]] = {}
     if header.intensity is not None:
-        intensity = arrays[header.intensity].astype(np.float32)
+        values["intensity"] = arrays[header.intensity]
         if (invalid := arrays.get("isIntensityInvalid")) is not None:
-            intensity[invalid != 0] = np.nan
-    colour_invalid = arrays.get("isColorInvalid") if has_rgb else None
-    return PointBlock(
-        points=local @ header.rotation.T + header.translation if is_posed else local,
-        scan=scan,
-        n_read=n_read,
-        left_out=left_out,
-        intensity=intensity,
-        rgb=np.column_stack([arrays[name] for name in _COLOURS]) if has_rgb else None,
-        has_rgb=None if colour_invalid is None else colour_invalid == 0,
-        row=arrays["rowIndex"].astype(np.int64) if has_grid else None,
-        column=arrays["columnIndex"].astype(np.int64) if has_grid else None,
+            values["intensity"] = np.where(invalid != 0, np.nan, values["intensity"])
+    if "rgb" in header.scan.fields:
+        values |= dict(zip("rgb", (arrays[name] for name in _COLOURS), strict=True))
+        if (invalid := arrays.get("isColorInvalid")) is not None:
+            values["has_rgb"] = invalid == 0
+    if "grid" in header.scan.fields:
+        values |= dict(zip(("row", "column"), (arrays[name] for name in _GRID), strict=True))
+    state = arrays.get(header.invalid_state)
+    block = point_block(
+        axes, values, causes=None if state is None else {"invalid": state != 0}, scan=scan
     )
+    if not header.scan.station_is_posed:
+        return block
+    return replace(block, points=block.points @ header.rotation.T + header.translation)
 
 
 def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
     """E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, radians."""
-    distance, azimuth, elevation = spherical.T
+    distance, azimuth, elevation = spherical
     level = distance * np.cos(elevation)
-    return np.column_stack(
+    return np.stack(
         [level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)]
     )
 

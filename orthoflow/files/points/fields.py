@@ -1,18 +1,24 @@
-"""What the fields of a point are: one table of names for all formats, and columns without names."""
+"""What the fields of a point are, by one table of names for all formats, and blocks of them."""
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import PointBlock, PointField
+from orthoflow.files.points.blocks import (
+    BLOCK_POINTS,
+    PointBlock,
+    PointField,
+    short_file_error,
+)
 from orthoflow.files.points.units import unit_of_word
 
 IGNORED: Final = "_"
@@ -226,37 +232,117 @@ def columns_of_values(
     return Columns(names=(*lead, "x", "y", "z", *readings[0]), rule="values")
 
 
-def point_block(table: NDArray[np.float64], columns: Columns) -> PointBlock:
-    """Turn a table (n, used columns) into a block of points; those without return are left out."""
-    is_void = without_returns(table[:, :3])
-    n_read, n_void = len(table), int(np.count_nonzero(is_void))
-    if n_void:
-        table = table[~is_void]
-    used = columns.used
-    place = {name: used.index(name) for name in used}
-    grid = "row" in place
-    rgb: NDArray[np.generic] | None = (
-        table[:, place["r"] : place["r"] + 3] if "r" in place else None
-    )
-    if "rgb" in place:
-        rgb = unpacked(_whole(table[:, place["rgb"]]))
+def point_block(
+    axes: NDArray[np.float64],
+    values: Mapping[str, NDArray[np.generic]],
+    *,
+    causes: Mapping[str, NDArray[np.bool_]] | None = None,
+    scan: int = 0,
+) -> PointBlock:
+    """Make a block of points of what a file has for them.
+
+    Args:
+        axes: (3, n) x, y, z; points where all three are exactly zero have no return.
+        values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
+            `column`; in the file's own types.
+        causes: (n,) points that are left out, by cause; each counts for the first one.
+        scan: for the block.
+    """
+    n_read = axes.shape[1]
+    is_void = axes[0] == 0.0
+    if is_void.any():
+        is_void &= (axes[1] == 0.0) & (axes[2] == 0.0)
+    left_out: dict[str, int] = {}
+    kept = np.ones(n_read, dtype=np.bool_)
+    for cause, is_out in {**(causes or {}), "no_return": is_void}.items():
+        if n_out := int(np.count_nonzero(kept & is_out)):
+            left_out[cause] = n_out
+            kept &= ~is_out
+    if left_out:
+        axes = axes[:, kept]
+        values = {name: array[kept] for name, array in values.items()}
+    rgb: NDArray[np.generic] | None = None
+    if "r" in values:
+        rgb = np.stack([values[name] for name in COLOURS]).T
+    elif "rgb" in values:
+        rgb = unpacked(values["rgb"])
+    has_rgb, intensity = values.get("has_rgb"), values.get("intensity")
+    row, column = values.get("row"), values.get("column")
     return PointBlock(
-        points=table[:, :3],
+        points=axes.T,
+        scan=scan,
         n_read=n_read,
-        left_out={"no_return": n_void} if n_void else {},
-        intensity=table[:, place["intensity"]].astype(np.float32) if "intensity" in place else None,
+        left_out=left_out,
+        intensity=None if intensity is None else intensity.astype(np.float32),
         rgb=rgb,
-        row=_whole(table[:, place["row"]]) if grid else None,
-        column=_whole(table[:, place["column"]]) if grid else None,
+        has_rgb=None if has_rgb is None else has_rgb.astype(np.bool_),
+        row=None if row is None else whole(row),
+        column=None if column is None else whole(column),
     )
 
 
-def without_returns(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Find points without a return: (n,) True where all three coordinates are exactly zero."""
-    found: NDArray[np.bool_] = (points[:, 0] == 0.0) & (points[:, 1] == 0.0)
-    if found.any():
-        found &= points[:, 2] == 0.0
-    return found
+def block_of_table(
+    table: NDArray[np.float64], columns: Columns, packed: np.dtype[np.generic] | None = None
+) -> PointBlock:
+    """Make a block of a table (n, used columns) of text.
+
+    Args:
+        table: as text has it.
+        columns: what its columns are.
+        packed: type of packed colours; None for whole numbers.
+    """
+    values: dict[str, NDArray[np.generic]] = dict(zip(columns.used, table.T, strict=True))
+    axes = np.stack([table[:, axis] for axis in range(3)])
+    if "rgb" in values:
+        values["rgb"] = whole(values["rgb"]) if packed is None else values["rgb"].astype(packed)
+    return point_block(axes, values)
+
+
+def record_blocks(
+    path: Path,
+    dtype: np.dtype[np.void],
+    columns: Columns,
+    *,
+    offset: int,
+    n_points: int,
+    what: str,
+) -> Iterator[dict[str, NDArray[np.generic]]]:
+    """Yield the used fields of records of one size, mapped into memory, a block at a time.
+
+    Args:
+        path: the file.
+        dtype: of a record; its fields are in the order of the columns.
+        columns: what they are.
+        offset: of the first record, bytes.
+        n_points: records that the header states.
+        what: holds them, for messages.
+
+    Raises:
+        InputError: there are fewer.
+    """
+    n_present = (path.stat().st_size - offset) // dtype.itemsize
+    if n_present < n_points:
+        raise short_file_error(path, what, f"{max(n_present, 0)} points", str(n_points))
+    records = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(n_points,))
+    for start in range(0, n_points, BLOCK_POINTS):
+        yield used_fields(records[start : start + BLOCK_POINTS], columns)
+
+
+def used_fields(records: NDArray[np.void], columns: Columns) -> dict[str, NDArray[np.generic]]:
+    """Fields of records (n,) that are used, by what they are."""
+    names = records.dtype.names or ()
+    return {
+        name: records[names[position]]
+        for name, position in zip(columns.used, columns.positions, strict=True)
+    }
+
+
+def axes_of(values: Mapping[str, NDArray[np.generic]]) -> NDArray[np.float64]:
+    """(3, n) coordinates, axis by axis in memory: later passes go along the axes."""
+    axes = np.empty((3, len(values["x"])))
+    for place, axis in enumerate("xyz"):
+        axes[place] = values[axis]
+    return axes
 
 
 def unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -268,8 +354,11 @@ def unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.column_stack([(bits >> shift) & 255 for shift in (16, 8, 0)]).astype(np.uint8)
 
 
-def _whole(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.nan_to_num(values, posinf=0.0, neginf=0.0).astype(np.int64)
+def whole(values: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Whole numbers; 0 for what is not finite."""
+    if values.dtype.kind == "f":
+        values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+    return values.astype(np.int64)
 
 
 def _split_unit(label: str) -> tuple[str, str | None]:

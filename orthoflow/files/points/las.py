@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +31,7 @@ from orthoflow.files.points.blocks import (
     short_file_error,
 )
 from orthoflow.files.points.copc import Node, Wish, read_octree
-from orthoflow.files.points.fields import columns_of_names, without_returns
+from orthoflow.files.points.fields import columns_of_names, point_block
 from orthoflow.files.points.libraries import guarded, load_library, reading
 from orthoflow.files.points.units import StatedUnit, unit_of_crs, unit_of_geo_keys
 
@@ -236,12 +236,9 @@ def _blocks(path: Path, laspy: Any, notes: list[str], wanted: _Wanted) -> Iterat
 
 
 def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
-    axes = _coordinates(chunk)
-    n_read = axes.shape[1]
-    intensity = np.asarray(chunk[wanted.intensity], dtype=np.float32)
-    rgb = None
+    values: dict[str, NDArray[np.generic]] = {"intensity": np.asarray(chunk[wanted.intensity])}
     if set(chunk.point_format.dimension_names) >= set(_COLOURS):
-        rgb = np.column_stack([np.asarray(chunk[name]) for name in _COLOURS])
+        values |= {name[0]: np.asarray(chunk[name]) for name in _COLOURS}
     causes: dict[str, NDArray[np.bool_]] = {}
     for cause in ("withheld", "synthetic"):
         flags = getattr(chunk, cause)
@@ -249,25 +246,8 @@ def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
             causes[cause] = np.asarray(flags, dtype=np.bool_)
     if wanted.classes:
         causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(wanted.classes))
-    is_void = without_returns(axes.T)
-    if is_void.any():
-        causes["no_return"] = is_void
-    left_out: dict[str, int] = {}
-    if causes:
-        kept = np.ones(n_read, dtype=np.bool_)
-        for cause, is_out in causes.items():
-            left_out[cause] = int(np.count_nonzero(kept & is_out))
-            kept &= ~is_out
-        axes, intensity = axes[:, kept], intensity[kept]
-        rgb = None if rgb is None else rgb[kept]
-    return PointBlock(
-        points=axes.T,
-        n_read=n_read,
-        left_out={cause: count for cause, count in left_out.items() if count},
-        intensity=intensity,
-        rgb=rgb,
-        bounds=_bounds(axes),
-    )
+    block = point_block(_coordinates(chunk), values, causes=causes)
+    return replace(block, bounds=_bounds(block.points.T))
 
 
 def _coordinates(chunk: Any) -> NDArray[np.float64]:

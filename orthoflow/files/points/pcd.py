@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -22,9 +24,10 @@ from orthoflow.files.points.blocks import (
 )
 from orthoflow.files.points.fields import (
     Columns,
+    axes_of,
     columns_of_names,
-    unpacked,
-    without_returns,
+    point_block,
+    record_blocks,
 )
 from orthoflow.files.points.tables import Layout, read_stated
 from orthoflow.files.points.units import StatedUnit, unit_of_comments
@@ -90,86 +93,48 @@ def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _blocks(path: Path, header: PcdHeader) -> Iterator[PointBlock]:
-    columns = (
-        _ascii_columns(path, header)
-        if header.data == "ascii"
-        else _binary_columns(path, header)
-        if header.data == "binary"
-        else _compressed_columns(path, header)
-    )
+    if header.data == "ascii":
+        named = _text_fields(path, header)
+    elif header.data == "binary":
+        named = record_blocks(
+            path,
+            header.dtype,
+            header.columns,
+            offset=header.n_bytes,
+            n_points=header.n_points,
+            what="data",
+        )
+    else:
+        named = _unpacked_fields(path, header)
     start = 0
-    for values in columns:
-        block = _block(values, header, start)
-        start += block.n_read
-        yield block
+    for values in named:
+        if header.height > 1:
+            index = np.arange(start, start + len(values["x"]), dtype=np.int64)
+            values["row"], values["column"] = index // header.width, index % header.width
+        start += len(values["x"])
+        yield point_block(axes_of(values), values)
 
 
-def _block(values: Mapping[str, NDArray[np.generic]], header: PcdHeader, start: int) -> PointBlock:
+def _text_fields(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
     columns = header.columns
-    named = {name: values[columns.labels[columns.names.index(name)]] for name in columns.used}
-    points = np.column_stack([named[axis].astype(np.float64) for axis in "xyz"])
-    n_read = len(points)
-    index = np.arange(start, start + n_read, dtype=np.int64)
-    rgb: NDArray[np.generic] | None = None
-    if "rgb" in named:
-        rgb = unpacked(named["rgb"])
-    elif "r" in named:
-        rgb = np.column_stack([named[name] for name in "rgb"])
-    intensity = named["intensity"].astype(np.float32) if "intensity" in named else None
-    is_void = without_returns(points)
-    n_void = int(np.count_nonzero(is_void))
-    if n_void:
-        points, index = points[~is_void], index[~is_void]
-        rgb = None if rgb is None else rgb[~is_void]
-        intensity = None if intensity is None else intensity[~is_void]
-    is_grid = header.height > 1
-    return PointBlock(
-        points=points,
-        n_read=n_read,
-        left_out={"no_return": n_void} if n_void else {},
-        intensity=intensity,
-        rgb=rgb,
-        row=index // header.width if is_grid else None,
-        column=index % header.width if is_grid else None,
-    )
-
-
-def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
-    widths = [_count(header, name) for name in header.fields]
-    starts = np.concatenate([[0], np.cumsum(widths)])
-    positions = {name: int(starts[index]) for index, name in enumerate(header.fields)}
-    wanted = _wanted(header)
-    packed = None
-    if "rgb" in header.columns.used:
-        packed = header.columns.labels[header.columns.names.index("rgb")]
-    layout = Layout(separator=r"\s+", decimal=".", n_columns=int(starts[-1]))
-    columns = [positions[name] for name in wanted]
+    widths = [math.prod(header.dtype[name].shape) for name in header.fields]
+    starts = [0, *itertools.accumulate(widths)]
+    layout = Layout(separator=r"\s+", decimal=".", n_columns=starts[-1])
+    places = [starts[position] for position in columns.positions]
     with path.open("rb") as file:
         line = file.read(header.n_bytes).count(b"\n") + 1
         for table in read_stated(
-            file, layout, columns, n_points=header.n_points, first_line=line, what="data"
+            file, layout, places, n_points=header.n_points, first_line=line, what="data"
         ):
-            yield {
-                name: table[:, index].astype(_base(header, name))
-                if name == packed
-                else table[:, index]
-                for index, name in enumerate(wanted)
-            }
+            values: dict[str, NDArray[np.generic]] = dict(zip(columns.used, table.T, strict=True))
+            if "rgb" in values:
+                kind = header.dtype[columns.names.index("rgb")].base
+                values["rgb"] = values["rgb"].astype(kind)
+            yield values
 
 
-def _binary_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
-    n_present = (path.stat().st_size - header.n_bytes) // header.dtype.itemsize
-    if n_present < header.n_points:
-        raise short_file_error(path, "data", f"{n_present} points", str(header.n_points))
-    points = np.memmap(
-        path, dtype=header.dtype, mode="r", offset=header.n_bytes, shape=(header.n_points,)
-    )
-    for start in range(0, header.n_points, BLOCK_POINTS):
-        part = points[start : start + BLOCK_POINTS]
-        yield {name: np.asarray(part[name]) for name in _wanted(header)}
-
-
-def _compressed_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
+def _unpacked_fields(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
+    """Fields of a compressed file, which holds field after field, not point after point."""
     from orthoflow.files.points.lzf_kernels import decompress_lzf
 
     n_plain = header.n_points * header.dtype.itemsize
@@ -188,34 +153,15 @@ def _compressed_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDA
             f"{path.name} cannot be unpacked: {header.n_points} points need {n_plain} bytes; the "
             "file is damaged, export it again"
         )
-    fields = _field_arrays(plain, header)
+    kinds = [header.dtype[name] for name in header.fields]
+    ends = np.cumsum([kind.itemsize for kind in kinds]) * header.n_points
+    parts = np.split(plain, ends[:-1])
     for start in range(0, header.n_points, BLOCK_POINTS):
-        yield {name: fields[name][start : start + BLOCK_POINTS] for name in _wanted(header)}
-
-
-def _field_arrays(plain: NDArray[np.uint8], header: PcdHeader) -> dict[str, NDArray[np.generic]]:
-    """Compressed files hold field after field, not point after point."""
-    arrays: dict[str, NDArray[np.generic]] = {}
-    offset = 0
-    for name in header.fields:
-        n_bytes = header.dtype[name].itemsize * header.n_points
-        if _count(header, name) == 1:
-            arrays[name] = plain[offset : offset + n_bytes].view(_base(header, name))
-        offset += n_bytes
-    return arrays
-
-
-def _wanted(header: PcdHeader) -> list[str]:
-    return [header.columns.labels[position] for position in header.columns.positions]
-
-
-def _base(header: PcdHeader, name: str) -> np.dtype[np.generic]:
-    return header.dtype[name].base
-
-
-def _count(header: PcdHeader, name: str) -> int:
-    shape = header.dtype[name].shape
-    return shape[0] if shape else 1
+        block = slice(start, start + BLOCK_POINTS)
+        yield {
+            name: parts[place].view(kinds[place].base)[block]
+            for name, place in zip(header.columns.used, header.columns.positions, strict=True)
+        }
 
 
 def _read_header(path: Path, intensity_field: str | None) -> PcdHeader:

@@ -7,7 +7,7 @@ row and property by property.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -27,10 +27,12 @@ from orthoflow.files.points.blocks import (
 )
 from orthoflow.files.points.fields import (
     Columns,
+    axes_of,
+    block_of_table,
     columns_of_names,
     point_block,
-    unpacked,
-    without_returns,
+    record_blocks,
+    used_fields,
 )
 from orthoflow.files.points.tables import Layout, read_stated, take_lines
 from orthoflow.files.points.units import unit_of_comments
@@ -146,35 +148,27 @@ def _binary_blocks(
         for element in before:
             _skip_binary(path, file, element, header.byte_order)
         offset = file.tell()
+    named: Iterator[dict[str, NDArray[np.generic]]]
     if vertex.has_list:
         rows = _rows_with_lists(path, header, vertex, offset)
+        named = (used_fields(part, columns) for part in rows)
     else:
-        rows = _rows(path, header, vertex, offset)
-    for part in rows:
-        # Axis by axis in memory: later passes go along the axes.
-        table = np.empty((len(columns.positions), len(part)))
-        for values, position in zip(table, columns.positions, strict=True):
-            values[:] = part[f"p{position}"]
-        block = point_block(table.T, columns)
-        if "rgb" in columns.used:
-            packed = unpacked(part[f"p{columns.names.index('rgb')}"])
-            block = replace(block, rgb=packed[~without_returns(table.T[:, :3])])
-        yield block
+        dtype = _dtype(vertex.types, header.byte_order)
+        named = record_blocks(
+            path, dtype, columns, offset=offset, n_points=vertex.count, what="vertex element"
+        )
+    for values in named:
+        yield point_block(axes_of(values), values)
 
 
-def _rows(
-    path: Path, header: PlyHeader, vertex: Element, offset: int
-) -> Iterator[NDArray[np.void]]:
-    dtype = np.dtype(
-        [(f"p{index}", header.byte_order + str(kind)) for index, kind in enumerate(vertex.types)]
+def _dtype(kinds: Sequence[str | tuple[str, str]], byte_order: str) -> np.dtype[np.void]:
+    """Type of a record; lists, which are read apart, take no room in it."""
+    return np.dtype(
+        [
+            (f"p{k}", "V0" if isinstance(kind, tuple) else byte_order + kind)
+            for k, kind in enumerate(kinds)
+        ]
     )
-    n_present = (path.stat().st_size - offset) // dtype.itemsize
-    if n_present < vertex.count:
-        found = f"{max(n_present, 0)} points"
-        raise short_file_error(path, "vertex element", found, str(vertex.count))
-    vertices = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(vertex.count,))
-    for start in range(0, vertex.count, BLOCK_POINTS):
-        yield vertices[start : start + BLOCK_POINTS]
 
 
 def _rows_with_lists(
@@ -196,7 +190,7 @@ def _rows_with_lists(
             parts[-1].append((f"p{k}", header.byte_order + kind))
     dtypes = [np.dtype(part) for part in parts]
     sizes = [dtype.itemsize for dtype in dtypes]
-    whole = np.dtype([member for part in parts for member in part])
+    whole = _dtype(vertex.types, header.byte_order)
     data = np.memmap(path, dtype=np.uint8, mode="r")
     n_bytes = len(data)
     place = offset
@@ -263,8 +257,11 @@ def _text_blocks(
                 first_line=line,
                 what=what,
             )
+        packed = None
+        if "rgb" in columns.used:
+            packed = np.dtype(str(vertex.types[columns.names.index("rgb")]))
         for table in tables:
-            yield point_block(table, columns)
+            yield block_of_table(table, columns, packed)
 
 
 def _tables_with_lists(

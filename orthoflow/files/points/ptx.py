@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import BLOCK_POINTS, PointBlock, Scan, ScanFile
-from orthoflow.files.points.fields import Columns, point_block
+from orthoflow.files.points.fields import Columns, axes_of, point_block
 from orthoflow.files.points.tables import Layout, find_layout, read_table, take_lines
 
 FORMAT: Final = "PTX"
@@ -134,21 +134,14 @@ def _blocks(path: Path, headers: list[ScanHeader]) -> Iterator[PointBlock]:
 
 
 def _placed(table: NDArray[np.float64], header: ScanHeader, scan: int, start: int) -> PointBlock:
-    block = point_block(table, header.columns)
     rotation, translation = header.world_from_scan[:3, :3], header.world_from_scan[:3, 3]
-    row = column = None
+    values: dict[str, NDArray[np.generic]]
+    values = dict(zip(header.columns.used, table.T, strict=True))
     if header.is_whole:
         index = np.arange(start, start + len(table), dtype=np.int64)
-        if block.left_out:
-            index = index[np.any(table[:, :3] != 0.0, axis=1)]
-        row, column = index % header.n_rows, index // header.n_rows
-    return replace(
-        block,
-        scan=scan,
-        points=block.points @ rotation.T + translation,
-        row=row,
-        column=column,
-    )
+        values["row"], values["column"] = index % header.n_rows, index // header.n_rows
+    block = point_block(axes_of(values), values, scan=scan)
+    return replace(block, points=block.points @ rotation.T + translation)
 
 
 def _find_headers(path: Path) -> list[tuple[int, int]]:

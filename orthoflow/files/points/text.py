@@ -22,10 +22,10 @@ from orthoflow.files.points.blocks import (
 from orthoflow.files.points.fields import (
     IGNORED,
     Columns,
+    block_of_table,
     columns_of_names,
     columns_of_values,
     meaning_of,
-    point_block,
 )
 from orthoflow.files.points.tables import (
     Layout,
@@ -114,7 +114,7 @@ def _blocks(path: Path, head: TextHead) -> Iterator[PointBlock]:
         )
         for table in tables:
             n_read += len(table)
-            yield point_block(table, head.columns)
+            yield block_of_table(table, head.columns)
     if head.n_stated is not None and n_read < head.n_stated:
         raise short_file_error(path, "list", f"{n_read} points", str(head.n_stated))
 
