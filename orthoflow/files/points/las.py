@@ -472,7 +472,7 @@ def _records(path: Path, laspy: Any, header: Any, wanted: _Wanted) -> Iterator[A
         n_present = min(wanted.n_points, (path.stat().st_size - start) // dtype.itemsize)
         points = np.memmap(path, dtype=dtype, mode="r", offset=start, shape=(n_present,))
         for first in range(0, n_present, BLOCK_POINTS):
-            part = np.array(points[first : first + BLOCK_POINTS])
+            part = np.asarray(points[first : first + BLOCK_POINTS])
             yield laspy.ScaleAwarePointRecord(
                 part, header.point_format, header.scales, header.offsets
             )
