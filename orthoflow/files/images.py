@@ -101,7 +101,7 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
             depth = cv2.IMREAD_ANYDEPTH if is_deep else 0
             flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | depth
             decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
-    except (cv2.error, ValueError, OSError, SyntaxError) as error:
+    except Exception as error:  # cv2.error, and whatever the plugins of Pillow raise
         reason = "" if kind in ("JPEG", "PNG", "WebP") else str(error)
         raise InputError(_not_an_image(encoded, name, reason)) from error
     if decoded is None:

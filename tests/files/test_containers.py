@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -309,6 +310,19 @@ def test_other_formats_that_are_cut_off_are_found(kind: str) -> None:
             decode_image(cut)
     else:
         assert damage(cut)[1]
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP", "AVIF", "JPEG"])
+def test_photos_with_bytes_changed_anywhere_are_decoded_or_refused(kind: str) -> None:
+    whole = saved(kind, np.ascontiguousarray(PHOTO[:80, :120]))
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        encoded = bytearray(whole)
+        for at in rng.integers(0, len(whole), 5):
+            encoded[at : at + 4] = rng.bytes(4)
+        opaque_pixels(bytes(encoded))
+        with suppress(InputError):
+            assert decode_image(bytes(encoded)).dtype == np.uint8
 
 
 def test_a_flipped_bit_in_a_png_is_found() -> None:
