@@ -397,16 +397,12 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
         (p, p) of the unknowns, and how many cells without common errors would fix them as well.
     """
     observed, design, weights = fit.observed, fit.observed.design, fit.weights()
-    used = weights > 0.0
-    design_used, weights_used = design[used], weights[used]
-    scores = (weights_used * fit.residuals_m()[used])[:, None] * design_used
-    products = (weights_used[:, None] * design_used)[:, :, None] * design_used[:, None, :]
+    scores, products, used = _scores(fit)
     rows, columns = observed.rows[used], observed.columns[used]
     factor = _flattening(fit, weights) ** -2
     largest = np.zeros((design.shape[1],) * 2)
-    inverse = np.linalg.inv(products.sum(axis=0))
-    # Every cell a tile of its own; what one of them has in the solution is too little to matter.
-    alone = before = _mean_variance(design, factor * inverse @ (scores.T @ scores) @ inverse)
+    # Every cell a tile of its own.
+    alone = before = _mean_variance(design, independent_covariance(fit))
     reach = -math.inf
     for size in _TILE_CELLS:
         tile = rows // size * (int(columns.max()) // size + 1) + columns // size
@@ -424,6 +420,30 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     variance = _mean_variance(design, covariance)
     effective = float(weights.sum() ** 2 / np.sum(weights**2))
     return covariance, effective * alone / variance if variance else effective
+
+
+def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
+    """Covariance (p, p) of the unknowns where every cell errs by itself.
+
+    The sandwich of M-estimates (Huber & Ronchetti 2009, section 7.6); what one of the cells has in
+    the solution is too little to matter.
+    """
+    scores, products, _ = _scores(fit)
+    inverse = np.linalg.inv(products.sum(axis=0))
+    factor = _flattening(fit, fit.weights()) ** -2
+    return np.asarray(factor * inverse @ (scores.T @ scores) @ inverse)
+
+
+def _scores(
+    fit: CellFit,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """(m, p) scores and (m, p, p) products of the cells with weight, and (n,) which those are."""
+    weights = fit.weights()
+    used = weights > 0.0
+    design, weights = fit.observed.design[used], weights[used]
+    scores = (weights * fit.residuals_m()[used])[:, None] * design
+    products = (weights[:, None] * design)[:, :, None] * design[:, None, :]
+    return scores, products, used
 
 
 def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.fit import adjust_plane
+from orthoflow_plugins.plane.fit import adjust_plane, independent_covariance
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
@@ -104,6 +106,34 @@ def test_stated_sigmas_of_walls_are_their_errors(
         trials.append(ratios(fit.plane, fit.stated()[0], raster.plane, middle))
     assert (rms(trials) > CALIBRATED[0]).all(), rms(trials)
     assert (rms(trials) < CALIBRATED[1]).all(), rms(trials)
+
+
+@pytest.mark.parametrize("tails", ["laplace", "two widths"])
+def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
+    """A fifth to a quarter of what the weights say is lost where many cells lose theirs."""
+    shape, squares, reach_m = (40, 60), [], 0.03
+    raster = replace(wall_of_cells(0, reach_cells=0.0, relief_m=0.0)[0], shape=shape)
+    number = np.full(shape, 25, dtype=np.int64)
+    for seed in range(250):
+        rng = np.random.default_rng(seed)
+        heights_m = rng.laplace(0.0, 0.001, shape)
+        if tails == "two widths":
+            heights_m = np.where(rng.random(shape) < 0.4, 3.2, 1.0) * rng.normal(0.0, 0.001, shape)
+        steps = np.rint(25 * heights_m * STEPS_PER_TOLERANCE / reach_m).astype(np.int64)
+        noise = (0.0002 * STEPS_PER_TOLERANCE / reach_m) ** 2
+        sums = CellSums(
+            n_near=number,
+            n_inner=number,
+            n_fit=number,
+            steps=steps,
+            squared_steps=np.rint(steps**2 / 25 + 25 * noise).astype(np.int64),
+        )
+        found = adjust_plane(raster, sums, number > 0, fit_tolerance_m=reach_m, freedom="free")
+        assert found is not None
+        # The true unknowns are zero.
+        covariance = independent_covariance(found.fit)
+        squares.append(found.fit.solution**2 / np.diag(covariance))
+    assert math.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.1)
 
 
 def test_waves_leave_few_independent_cells() -> None:

@@ -1,0 +1,239 @@
+"""What becomes of a candidate: refined, refused by a criterion, fitted to all points, labelled."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.plane.candidates import FoundPlane, fit_to_all, label, name_points, verify
+from orthoflow_plugins.plane.cloud import Search
+from orthoflow_plugins.plane.detector import Candidate, Constraint
+from orthoflow_plugins.plane.search import find_planes, greedy_search
+
+from orthoflow.geometry import Plane, angle_between_deg
+from tests.plane_scenes import (
+    ROOM,
+    TOLERANCE_M,
+    Rectangle,
+    prepared,
+    sampled,
+    search_in,
+)
+
+ALONG_Y = (0.0, 1.0, 0.0)
+FAR = Rectangle("far", (0, 9, 0), (2, 0, 0), (0, 1, 1), 6_000)
+
+
+def proposed(
+    normal: tuple[float, float, float], offset_m: float, constraint: Constraint = "any"
+) -> Candidate:
+    unit = np.array(normal) / np.linalg.norm(normal)
+    return Candidate(plane=Plane(normal=unit, offset_m=offset_m), constraint=constraint, votes=1.0)
+
+
+def wall(n_points: int = 8_000, *, half_m: tuple[float, float] = (2.0, 1.0)) -> Rectangle:
+    """At y = 2, upright."""
+    return Rectangle("wall", (0, 2, 0), (half_m[0], 0, 0), (0, 0, half_m[1]), n_points)
+
+
+@pytest.mark.parametrize("miss_m", [0.0, 0.03, -0.03])
+@pytest.mark.parametrize("lean", [0.0, 0.01])
+def test_a_candidate_is_moved_to_the_surface_near_it(miss_m: float, lean: float) -> None:
+    search = search_in(prepared(sampled((wall(), FAR))))
+    found = verify(proposed((0.0, 1.0, lean), 2.0 + miss_m, "vertical"), search)
+    assert found is not None
+    assert found.raster.plane.offset_m == pytest.approx(2.0, abs=2e-4)
+    assert angle_between_deg(found.raster.plane.normal, np.array(ALONG_Y)) < 0.02
+    sizes = np.diff(found.support.bounds_m.reshape(2, 2), axis=1)[:, 0]
+    np.testing.assert_allclose(sizes, [4.0, 2.0], atol=0.25)
+    # What is taken is the wall, and within the tolerance.
+    search.claim(found.claim(TOLERANCE_M))
+    assert (search.claims[:8_000] == 0).mean() > 0.99
+    assert (search.claims[8_000:] == -1).all()
+
+
+def barrel(radius_m: float) -> NDArray[np.float64]:
+    """Half a metre of arc of an upright cylinder whose nearest line is at y = 2."""
+    rng = np.random.default_rng(2)
+    turn = rng.uniform(-0.6, 0.6, 8_000) / radius_m
+    x, y = radius_m * np.sin(turn), 2.0 + radius_m * (1.0 - np.cos(turn))
+    noise = rng.normal(0.0, 0.001, 8_000)
+    return np.column_stack([x, y + noise, rng.uniform(-1.0, 1.0, 8_000)])
+
+
+def filled_slab() -> NDArray[np.float64]:
+    rng = np.random.default_rng(3)
+    return rng.uniform([-2.0, 1.8, -1.0], [2.0, 2.2, 1.0], (8_000, 3))
+
+
+def crowd_in_a_slab() -> NDArray[np.float64]:
+    """A slab filled evenly whose middle third is a wall."""
+    rng = np.random.default_rng(4)
+    thin = rng.uniform([-0.7, 1.999, -1.0], [0.7, 2.001, 1.0], (4_000, 3))
+    corners = rng.uniform([-2.0, 1.9, -1.0], [2.0, 2.1, 1.0], (60_000, 3))
+    corners = corners[np.abs(corners[:, 0]) > 0.7]
+    ends = rng.uniform([-2.0, 1.999, -1.0], [2.0, 2.001, -0.85], (4_000, 3))
+    return np.concatenate([thin, corners, ends])
+
+
+@pytest.mark.parametrize(
+    ("points", "candidate", "params", "criterion"),
+    [
+        (sampled((wall(), FAR)), proposed(ALONG_Y, 2.0), {"min_share": 0.7}, "few"),
+        (sampled((wall(), FAR)), proposed(ALONG_Y, 5.0), {}, "scattered"),
+        (filled_slab(), proposed(ALONG_Y, 2.0), {}, "scattered"),
+        (sampled((wall(half_m=(2.0, 0.03)), FAR)), proposed(ALONG_Y, 2.0), {}, "strip"),
+        (crowd_in_a_slab(), proposed(ALONG_Y, 2.0), {"min_share": 0.05}, "smear"),
+        (barrel(3.0), proposed(ALONG_Y, 2.0), {}, "bent"),
+        (
+            sampled((Rectangle("ramp", (0, 2, 0), (2, 0, 0), (0, 0.3, 1), 8_000), FAR)),
+            proposed((0.0, 1.0, -0.25), 1.94, "vertical"),
+            {},
+            "tilt",
+        ),
+    ],
+    ids=["few", "none", "filled", "strip", "smear", "barrel", "tilt"],
+)
+def test_a_refusal_has_the_criterion_that_refused(
+    points: NDArray[np.float64], candidate: Candidate, params: dict[str, Any], criterion: str
+) -> None:
+    search = search_in(prepared(points), **params)
+    assert verify(candidate, search) is None
+    assert [name for name, _ in search.refusals] == [criterion]
+
+
+def test_a_barrel_as_wide_as_a_wall_of_five_metres_radius_and_more_is_a_plane() -> None:
+    assert verify(proposed(ALONG_Y, 2.0), search_in(prepared(barrel(12.0)))) is not None
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_exact_walls_and_floors_lean_by_nothing(exact: bool) -> None:
+    lean = math.radians(2.0)
+    leaning = Rectangle("w", (0, 2, 0), (2, 0, 0), (0, math.sin(lean), math.cos(lean)), 8_000)
+    sloping = Rectangle(
+        "f", (0, 0, -2), (2, 0, 0), (0, 2 * math.cos(lean), 2 * math.sin(lean)), 8_000
+    )
+    search = search_in(prepared(sampled((leaning, sloping))), exact=exact)
+    for truth, offset_m, rise in ((leaning, 2.0, 0.0), (sloping, -2.0, 1.0)):
+        found = verify(proposed(tuple(truth.normal), float(truth.normal @ truth.centre)), search)
+        assert found is not None, offset_m
+        normal = found.raster.plane.normal
+        away_deg = angle_between_deg(normal * np.sign(normal @ truth.normal), truth.normal)
+        assert away_deg == pytest.approx(2.0 if exact else 0.0, abs=0.03)
+        if exact:
+            assert abs(normal[2]) == pytest.approx(rise, abs=1e-12)
+
+
+def test_a_niche_at_another_depth_does_not_pull_its_wall_askew() -> None:
+    niche = Rectangle("niche", (1.6, 2.03, 0), (0.4, 0, 0), (0, 0, 1), 3_000)
+    main = Rectangle("main", (-0.8, 2, 0), (1.2, 0, 0), (0, 0, 1), 8_000)
+    search = search_in(prepared(sampled((main, niche), noise_m=0.001)))
+    found = verify(proposed((0.012, -1.0, 0.0), -2.008), search)
+    assert found is not None
+    assert angle_between_deg(found.raster.plane.normal, np.array([0.0, -1.0, 0.0])) < 0.02
+    assert found.raster.plane.offset_m == pytest.approx(-2.0, abs=2e-4)
+
+
+class Listed:
+    """Proposes what it is given, one after the other."""
+
+    def __init__(self, candidates: list[Candidate]) -> None:
+        self._left, self.rejected = list(candidates), list[Candidate]()
+
+    def propose(self, search: Search) -> Candidate | None:
+        del search
+        return self._left.pop(0) if self._left else None
+
+    def reject(self, candidate: Candidate) -> None:
+        self.rejected.append(candidate)
+
+
+SURFACES = [proposed(tuple(r.normal), float(r.normal @ np.array(r.centre))) for r in ROOM]
+WRONG = proposed((1.0, 1.0, 1.0), 40.0)
+
+
+@pytest.mark.parametrize(
+    ("params", "n_found"),
+    [
+        ({"min_share": 0.005, "stop_unclassified_share": 0.0}, 7),
+        ({"min_share": 0.05, "stop_unclassified_share": 0.0}, 6),
+        ({"min_share": 0.005, "n_planes_max": 3}, 3),
+        # The four walls hold 62 % of the points; the floor, the next, 18 of the 38 % left.
+        ({"min_share": 0.005, "stop_unclassified_share": 0.4}, 4),
+        ({"min_share": 0.005, "stop_rest_share": 0.3, "stop_unclassified_share": 0.0}, 1),
+    ],
+)
+def test_a_search_ends_where_its_parameters_say(params: dict[str, Any], n_found: int) -> None:
+    search = search_in(prepared(sampled()), **params)
+    assert len(greedy_search(search, Listed(SURFACES))) == n_found
+
+
+@pytest.mark.parametrize(("n_wrong", "n_found"), [(29, 1), (30, 0)])
+def test_after_thirty_wrong_candidates_in_a_row_the_search_ends(n_wrong: int, n_found: int) -> None:
+    proposer = Listed([WRONG] * n_wrong + SURFACES[:1])
+    assert len(greedy_search(search_in(prepared(sampled())), proposer)) == n_found
+    assert len(proposer.rejected) == n_wrong
+
+
+def found_walls(
+    rectangles: tuple[Rectangle, ...], points: NDArray[np.float64], **params: Any
+) -> tuple[Search, list[FoundPlane]]:
+    search = search_in(prepared(points, parts=2), **{"min_share": 0.01, **params})
+    candidates = [
+        proposed(tuple(r.normal), float(r.normal @ np.array(r.centre))) for r in rectangles
+    ]
+    return search, find_planes(search, Listed(candidates))
+
+
+def test_points_belong_to_the_nearest_plane_whose_rectangle_holds_them() -> None:
+    walls = (wall(30_000), Rectangle("west", (-2, 0, 0), (0, 2, 0), (0, 0, 1), 10_000))
+    points = np.random.default_rng(1).permutation(sampled(walls))
+    search, found = found_walls(walls, points)
+    away_m = np.abs(np.column_stack([item.raster.plane.distances_m(points) for item in found]))
+    claims = search.cloud.claims
+    for k in range(2):
+        alone = (away_m[:, k] < 0.049) & (away_m[:, 1 - k] > 0.051)
+        assert alone.sum() > 9_000
+        assert (claims[alone] == k).mean() > 0.999
+    corner = (away_m < 0.049).all(axis=1) & (np.abs(away_m[:, 0] - away_m[:, 1]) > 1e-4)
+    assert corner.sum() > 30
+    np.testing.assert_array_equal(claims[corner], away_m[corner].argmin(axis=1))
+    names, labels = np.array([7, 3, -1], dtype=np.int16), np.empty(len(points), dtype=np.int16)
+    name_points(search.cloud, names, labels)
+    np.testing.assert_array_equal(labels, names[claims])
+
+
+def test_planes_that_all_points_do_not_bear_out_are_left_out() -> None:
+    walls = (wall(30_000), Rectangle("west", (-2, 0, 0), (0, 2, 0), (0, 0, 1), 10_000))
+    search, found = found_walls(walls, sampled(walls))
+    assert len(found) == 2
+    for share, n_left in ((0.3, 1), (0.8, 0)):
+        strict = search_in(search.cloud, min_share=share)
+        assert len(fit_to_all(found, strict)) == n_left
+        assert {name for name, _ in strict.refusals} == {"few"}
+
+
+@pytest.mark.parametrize("gap_m", [0.0, 0.8], ids=["connected", "in two parts"])
+def test_a_frame_around_a_wall_leaves_the_wall_its_points(gap_m: float) -> None:
+    # Its rectangle covers the wall, and its plane runs through the wall at an angle of one degree.
+    lean = 0.02
+    frame = (
+        Rectangle("side", (2.35, 1.98, 0), (0.15, 0, 0), (0, lean, 1), 6_000),
+        Rectangle(
+            "below", (-gap_m, 1.98 - 1.25 * lean, -1.25), (2.5, 0, 0), (0, 0.2 * lean, 0.2), 9_000
+        ),
+    )
+    on_wall, on_frame = sampled((wall(60_000),), noise_m=0.004), sampled(frame, noise_m=0.002)
+    alone = [
+        found_walls((truth,), points)[1][0]
+        for truth, points in ((wall(60_000), on_wall), (frame[0], on_frame))
+    ]
+    search = search_in(prepared(np.concatenate([on_wall, on_frame]), parts=2), min_share=0.01)
+    fitted = fit_to_all(alone, search)
+    label(fitted, search.cloud, TOLERANCE_M)
+    claims = search.cloud.claims
+    assert (claims[: len(on_wall)] == 0).mean() > 0.95
+    assert (claims[len(on_wall) :] == 1).mean() > 0.95
