@@ -50,7 +50,7 @@ class Delivery:
     Attributes:
         room: the room, in its own frame.
         scan: the scans, in the same frame.
-        world_from_room: (3, 3) rotation of zeros, ones and minus ones: turning is exact.
+        world_from_room: (3, 3) rotation; exact where it is of zeros, ones and minus ones.
         shift_world_m: (3,) world position of the room's origin.
     """
 
@@ -235,6 +235,9 @@ def _turned_axis(
     row: NDArray[np.float64], in_room: tuple[NDArray[np.float32], ...]
 ) -> NDArray[np.float32]:
     axis = int(np.argmax(np.abs(row)))
+    if np.count_nonzero(row) > 1:
+        a, b, c = row.astype(np.float32)
+        return np.asarray(a * in_room[0] + b * in_room[1] + c * in_room[2])
     return in_room[axis] if row[axis] > 0.0 else -in_room[axis]
 
 

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
@@ -220,6 +221,11 @@ class SimulateRoom(Method):
             "on vertical edges.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
+        turn_deg: float | Literal["drawn"] = Field(
+            0.0,
+            description="Turns the room about up, degrees; drawn: by an angle of the seed, so that "
+            "no wall lies on the steps of a search.",
+        )
         shift_world_m: tuple[float, float, float] = Field(
             (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
         )
@@ -274,10 +280,13 @@ class SimulateRoom(Method):
             ),
             wall_rng if params.decoration == "drawn" else None,
         )
+        turn_deg = params.turn_deg
+        if turn_deg == "drawn":
+            turn_deg = float(ctx.rng.spawn(1)[0].uniform(0.0, 360.0))
         delivery = Delivery(
             room=room,
             scan=_scan(room, params, scan_rng, ctx),
-            world_from_room=basis_from_up(up_vector(params.up)).T,
+            world_from_room=basis_from_up(up_vector(params.up)).T @ _turn_about_up(turn_deg),
             shift_world_m=np.array(params.shift_world_m),
         )
         shots = planned_shots(
@@ -305,6 +314,7 @@ class SimulateRoom(Method):
             "design_seed": None,
             "photo_exposure_share": 0.0,
             "n_passers_by": 0,
+            "turn_deg": 0.0,
         }
         left_out = {name for name, before in added.items() if getattr(params, name) == before}
         settings = params.model_dump(mode="json", exclude=left_out)
@@ -318,6 +328,14 @@ class SimulateRoom(Method):
             checkpoints=_check_points(delivery, views, params.check_points_most),
             truth=truth,
         )
+
+
+def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
+    """(3, 3) rotation about the room's z; the unit matrix, to the bit, for no turn."""
+    if turn_deg == 0.0:
+        return np.eye(3)
+    cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _scan(

@@ -84,6 +84,25 @@ def test_any_world_direction_may_be_up(tmp_path: Path, up: UpDirection) -> None:
         np.testing.assert_allclose(distances_m(out.cloud, out.truth, plane), 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("up", ["z", "-x"])
+def test_a_turned_room_is_where_its_truth_says(tmp_path: Path, up: UpDirection) -> None:
+    plain = simulate(tmp_path / "plain", **CLEAN, up=up)
+    turned = simulate(tmp_path / "turned", **CLEAN, up=up, turn_deg=33.3)
+    for plane in range(len(turned.truth.planes)):
+        np.testing.assert_allclose(distances_m(turned.cloud, turned.truth, plane), 0.0, atol=2e-6)
+    np.testing.assert_array_equal(turned.truth.labels, plain.truth.labels)
+    walls = np.abs(plain.truth.planes.normal @ plain.cloud.up) < 0.5
+    cosines = np.sum(plain.truth.planes.normal * turned.truth.planes.normal, axis=1)[walls]
+    np.testing.assert_allclose(cosines, np.cos(np.radians(33.3)), atol=1e-3)
+    # Each seed has an angle of its own.
+    drawn = [
+        simulate(tmp_path / str(seed), seed=seed, **CLEAN, turn_deg="drawn") for seed in (1, 2)
+    ]
+    place = int(np.argmax(walls))
+    first, second = (out.truth.planes.normal[place] for out in drawn)
+    assert abs(float(first @ second)) < np.cos(np.radians(1.0))
+
+
 def test_points_are_on_the_rays_of_their_rows_and_columns(tmp_path: Path) -> None:
     cloud = simulate(tmp_path, **COARSE).cloud
     assert cloud.scan is not None
