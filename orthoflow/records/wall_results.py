@@ -371,8 +371,9 @@ def _colours(run: Run, address: str) -> Phrase:
     if all(one.type_name != "photos" for one in given):
         greys = (before.params.get("skip_below_grey") for before in whence)
         least = next((grey for grey in greys if grey), None)
-        if least:
-            return Phrase(key="colours_scan_dark", values={"least": least})
+        reported = {one.code for before in whence for one in before.diagnostics}
+        if least or "black-points-left-out" in reported:
+            return Phrase(key="colours_scan_dark", values={"least": least or 1})
         return Phrase(key="colours_scan")
     gains = cell.params.get("gains")
     if gains is None:

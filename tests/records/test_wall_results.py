@@ -24,6 +24,7 @@ def cell(address: str = "", **known: Any) -> Any:
         "outputs": {},
         "inputs": {},
         "metrics": (),
+        "diagnostics": (),
         "params": {},
         "method": "mosaic.seams",
         "status": "ok",

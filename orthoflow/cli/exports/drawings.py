@@ -129,7 +129,7 @@ def export_relief(run: Run, folder: Path, chosen: Choices) -> str:
         depth, stem = wall.rasters["depth"], folder / f"wall_{wall.number}"
         frame, _ = placed_raster(depth)
         write_relief(depth, Path(f"{stem}_relief.tif"), light)
-        write_depth_figure(depth, Path(f"{stem}_relief.png"), light)
+        write_depth_figure(depth, frame, Path(f"{stem}_relief.png"), light)
         interval_m = write_contours(depth, frame, Path(f"{stem}_contours.geojson"))
         intervals.append(f"{wall.name} {1e3 * interval_m:g} mm")
     return f"{counted(len(walls), 'wall')}, contour lines every: {', '.join(intervals)}"

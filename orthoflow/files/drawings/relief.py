@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,13 @@ from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.sidecars import write_json
 from orthoflow.geometry import WallFrame
 
-if TYPE_CHECKING:
-    from matplotlib.cm import ScalarMappable
-
 NOTHING: Final = 0
 _BAND_ROWS: Final = 1024
 _FIGURE_PX: Final = 1600
 # Contours as those of a drawing at this scale: half a millimetre of its paper smooths them.
 _CONTOUR_SCALE: Final = 20
+# Before the plane, behind it.
+_CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,14 +103,7 @@ def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
 
     Each line has `depth_mm`, positive towards the viewer.
     """
-    whole = Part(
-        left_m=0.0,
-        top_m=0.0,
-        right_m=frame.width * frame.gsd_m,
-        bottom_m=frame.height * frame.gsd_m,
-    )
     interval_m = stretch_of(depth).interval
-    lines = contours(depth, whole, scale=_CONTOUR_SCALE, interval_m=interval_m)
     write_json(
         path,
         {
@@ -122,21 +114,31 @@ def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
                     "properties": {"depth_mm": round(1e3 * level, 3)},
                     "geometry": {
                         "type": "LineString",
-                        "coordinates": np.round(
-                            frame.raster_from_wall(points / frame.gsd_m), 4
-                        ).tolist(),
+                        "coordinates": np.round(points, 4).tolist(),
                     },
                 }
-                for level, points in lines
+                for level, points in _contours(depth, frame, interval_m)
             ],
         },
     )
     return interval_m
 
 
-def write_depth_figure(depth: Path, path: Path, light: Light) -> None:
-    """Write a PNG: depths in colour over the raking light, with a legend in millimetres."""
+def _contours(
+    depth: Path, frame: WallFrame, interval_m: float
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Contours in X and Y (n, 2) of the raster's GeoTIFF."""
+    size_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
+    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+    found = contours(depth, whole, scale=_CONTOUR_SCALE, interval_m=interval_m)
+    return [(level, frame.raster_from_wall(points / frame.gsd_m)) for level, points in found]
+
+
+def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) -> None:
+    """Write a PNG: depths in colour over the raking light, contours, a legend in millimetres."""
     from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import TwoSlopeNorm
     from matplotlib.figure import Figure
 
     with RasterParts(depth) as source:
@@ -144,33 +146,35 @@ def write_depth_figure(depth: Path, path: Path, light: Light) -> None:
         factor = max(1.0, max(rows, columns) / _FIGURE_PX)
         shape = (max(2, round(rows / factor)), max(2, round(columns / factor)))
         depths, shown = source.read((0.0, 0.0, float(columns), float(rows)), shape)
-        left, top = source.corner_m
-        extent = (left, left + columns * source.gsd_m, top - rows * source.gsd_m, top)
         gsd_m = source.gsd_m * factor
     values = np.where(shown, np.asarray(depths, np.float32), np.nan)
     stretch = stretch_of(depth)
-    half_mm = 1e3 * max(abs(stretch.low), abs(stretch.high))
+    # The plane is white; what stands before it red, what lies behind it blue, each up to its own.
+    norm = TwoSlopeNorm(0.0, min(1e3 * stretch.low, -1.0), max(1e3 * stretch.high, 1.0))
     grey = shaded(values, gsd_m, light)
-    colours = colormaps["RdBu_r"](np.clip(0.5 + 500.0 * values / half_mm, 0.0, 1.0))[..., :3]
+    colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)).filled())[..., :3]
     mixed = np.clip(colours * (0.35 + 0.65 * grey[..., None] / grey.max(initial=1)), 0.0, 1.0)
     mixed[grey == NOTHING] = 1.0
+    corners = frame.raster_from_wall(np.array([[0.0, frame.height], [frame.width, 0.0]]))
     wide = 9.0
     high = min(12.0, max(2.5, wide * rows / columns + 0.8))
     figure = Figure(figsize=(wide, high), layout="constrained")
     axes = figure.add_subplot()
+    extent = (corners[0, 0], corners[1, 0], corners[0, 1], corners[1, 1])
     axes.imshow(mixed, extent=extent, interpolation="nearest")
-    axes.set_xlabel("X, m")
-    axes.set_ylabel("Y, m (height of upright walls)")
+    for level, points in _contours(depth, frame, stretch.interval):
+        axes.plot(*points.T, color=_CONTOUR_COLOURS[level < 0.0], linewidth=0.5)
+    upright = frame.raster_axes == "wall"
+    axes.set_xlabel("X along the wall, m" if upright else "X, m")
+    axes.set_ylabel("height, m" if upright else "Y, m")
     axes.set_aspect("equal")
+    axes.set_title(f"contour lines every {1e3 * stretch.interval:g} mm", fontsize="medium")
     scale = figure.colorbar(
-        _scale(half_mm), ax=axes, label="depth towards the viewer, mm", shrink=0.9
+        ScalarMappable(norm=norm, cmap="RdBu_r"),
+        ax=axes,
+        label="depth towards the viewer, mm",
+        shrink=0.9,
+        spacing="proportional",
     )
     scale.outline.set_linewidth(0.5)
     figure.savefig(path, dpi=150, metadata={"Software": None})
-
-
-def _scale(half_mm: float) -> ScalarMappable:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    return ScalarMappable(norm=Normalize(-half_mm, half_mm), cmap="RdBu_r")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,18 +26,37 @@ _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
 
 
-def displacements_cells(layers: Sequence[Layer]) -> NDArray[np.float64]:
-    """Displacements (n, 2) = (u, v) in cells between the two best layers of patches of a wall.
+@dataclass(frozen=True, kw_only=True)
+class Overlaps:
+    """How far pairs of photos lie apart where both show a wall.
+
+    Attributes:
+        shifts_cells: (n, 2) displacements (u, v) of the second against the first photo.
+        centres: (n, 2) column and row of the middle of each patch.
+        photos: names of both photos of each patch.
+    """
+
+    shifts_cells: NDArray[np.float64]
+    centres: NDArray[np.float64]
+    photos: tuple[tuple[str, str], ...]
+
+
+def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overlaps:
+    """Measure the displacements between layers in patches of a wall.
 
     Patches of 64 x 64 cells that both layers paint wholly are compared by phase correlation, which
     is good to about a tenth of a cell.
+
+    Args:
+        layers: photos of one wall.
+        of_all_pairs: compare every two layers of a patch, not the two best only.
     """
     import cv2
 
-    pairs = _best_pairs(layers)
+    pairs = _pairs(layers, of_all_pairs=of_all_pairs)
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), _PATCHES_MOST)).round().astype(int)
     window = cv2.createHanningWindow((PATCH_CELLS, PATCH_CELLS), cv2.CV_32F)
-    found = []
+    shifts, centres, photos = [], [], []
     for row, column, first, second in (pairs[place] for place in chosen):
         part = (slice(row, row + PATCH_CELLS), slice(column, column + PATCH_CELLS))
         patches = [_grey(eight_bits(layers[index].rgb[part])) for index in (first, second)]
@@ -44,27 +64,29 @@ def displacements_cells(layers: Sequence[Layer]) -> NDArray[np.float64]:
             continue
         shift, response = cv2.phaseCorrelate(patches[0], patches[1], window)
         if response >= _RESPONSE_LEAST:
-            found.append(shift)
-    return np.array(found, dtype=np.float64).reshape(-1, 2)
+            shifts.append(shift)
+            centres.append((column + 0.5 * PATCH_CELLS, row + 0.5 * PATCH_CELLS))
+            photos.append((layers[first].source, layers[second].source))
+    return Overlaps(
+        shifts_cells=np.array(shifts, dtype=np.float64).reshape(-1, 2),
+        centres=np.array(centres, dtype=np.float64).reshape(-1, 2),
+        photos=tuple(photos),
+    )
 
 
-def _best_pairs(layers: Sequence[Layer]) -> list[tuple[int, int, int, int]]:
-    """Row and column of patches, and the two best layers that paint them wholly."""
+def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
+    """Row and column of patches, and two layers that paint them wholly."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
         return []
     qualities = np.stack([_patch_qualities(layer, (n_rows, n_columns)) for layer in layers])
-    order = np.argsort(-qualities, axis=0, kind="stable")[:2]
-    second = np.take_along_axis(qualities, order[1:], axis=0)[0]
-    return [
-        (
-            int(row) * PATCH_CELLS,
-            int(column) * PATCH_CELLS,
-            int(order[0, row, column]),
-            int(order[1, row, column]),
-        )
-        for row, column in np.argwhere(second > 0.0)
-    ]
+    order = np.argsort(-qualities, axis=0, kind="stable")
+    found = []
+    for row, column in np.ndindex(n_rows, n_columns):
+        whole = [index for index in order[:, row, column].tolist() if qualities[index, row, column]]
+        for first, second in combinations(whole if of_all_pairs else whole[:2], 2):
+            found.append((row * PATCH_CELLS, column * PATCH_CELLS, first, second))
+    return found
 
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -2,12 +2,14 @@
 
 Three causes move what a cell shows along the wall, each independent of the others: the photo's pose
 (its covariance, carried onto the wall), the depth of the cell (times the tangent of the view), and
-what neither explains of how far photos of an overlap lie apart.
+what neither explains of how far photos of an overlap lie apart. Overlaps separate the last two:
+photos that see a place from different sides lie apart by its depth, all others by their poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,14 +19,15 @@ from orthoflow.geometry.bands import Allocate, row_bands
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.robust import NMAD_FACTOR
 from orthoflow.products import Camera, Cameras, SurfaceMask, TieRole, Wall
+from orthoflow_plugins.mosaic.agreement import Overlaps
 
 if TYPE_CHECKING:
     from orthoflow.geometry import WallFrame
 
 # Errors of poses are smooth: they are computed on so many nodes a side and are linear between.
 _NODES: Final = 48
-# Phase correlation is good to about a tenth of a cell (`agreement`), which says nothing of photos.
-_PARALLAX_NOISE_CELLS: Final = 0.1
+# Noise of phase correlation: 0.06 and 0.07 cells in a drawn room whose poses err by 0.01 cells.
+_PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
 # A view flatter than 84 degrees paints nothing.
 _MOST_TANGENT: Final = 10.0
@@ -37,6 +40,12 @@ _SPREAD_TIMES: Final = 2.0
 # simulated room, 1.2 and 2.4 mm in a stuccoed hall, 1.7 and 5.2 mm in a fountain's stereo cloud).
 _PATCH_M: Final = 0.05
 _PATCHY_TIMES: Final = 1.5
+# Overlaps show errors of depths where tangents of views differ by that much, in so many patches.
+_LEAST_TANGENTS: Final = 0.3
+_LEAST_SLANTED: Final = 20
+# Displacements of more than so many deviations are matches of something else.
+_OUTLIER: Final = 3.0
+_ROUNDS: Final = 8
 
 
 def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
@@ -64,7 +73,7 @@ def expected_errors_m(
     source: NDArray[np.int16],
     sources: Sequence[str],
     cameras: Mapping[str, Camera],
-    shifts_cells: NDArray[np.float64],
+    overlaps: Overlaps,
     *,
     allocate: Allocate,
 ) -> NDArray[np.float32]:
@@ -75,7 +84,7 @@ def expected_errors_m(
         source: (rows, cols) index of the photo that paints each cell, -1 for none.
         sources: names of the photos.
         cameras: of oriented photos, by name; only those with a covariance say how wrong they are.
-        shifts_cells: (n, 2) how far photos of overlaps lie apart.
+        overlaps: how far photos lie apart where two show the wall.
         allocate: gives the array.
 
     Returns:
@@ -93,7 +102,11 @@ def expected_errors_m(
         ].astype(np.float64)
     )
     noise_m, patchy_m = _depth_noises_m(wall)
-    total, count = 0.0, 0
+    excess = _excess_of_overlaps(wall, cameras, overlaps)
+    if excess is not None and excess.depth_m is not None:
+        # Relief of five centimetres looks like errors of that size; overlaps do not confuse them.
+        patchy_m = excess.depth_m
+    unexplained = np.float64(0.0 if excess is None else excess.position_m**2)
     for index, name in enumerate(sources):
         camera = cameras.get(name)
         if camera is None or camera.covariance is None:
@@ -110,13 +123,7 @@ def expected_errors_m(
             down = down + rows.start
             variances = _between(of_pose, down, across, step)
             variances += _depth_variances(wall, down, across, centre, (noise_m, patchy_m))
-            errors_m[down, across] = np.sqrt(variances)
-            total, count = total + float(variances.sum()), count + len(variances)
-    if count:
-        unexplained = _parallax_variance(shifts_cells, frame.gsd_m) - total / count
-        if unexplained > 0.0:
-            for rows in row_bands(frame.shape):
-                errors_m[rows] = np.sqrt(errors_m[rows] ** 2 + np.float32(unexplained))
+            errors_m[down, across] = np.sqrt(variances + unexplained)
     return errors_m
 
 
@@ -214,9 +221,84 @@ def _depth_variances(
     return np.asarray(0.5 * squares * (sigma_m**2 + patchy_m**2), dtype=np.float64)
 
 
-def _parallax_variance(shifts_cells: NDArray[np.float64], gsd_m: float) -> float:
-    """Variance of a coordinate of one photo, by how far two lie apart; 0 where that is noise."""
-    if len(shifts_cells) < _LEAST_OVERLAPS:
-        return 0.0
-    spread = NMAD_FACTOR * float(np.median(np.abs(shifts_cells)))
-    return 0.5 * gsd_m**2 * max(0.0, spread**2 - _PARALLAX_NOISE_CELLS**2)
+@dataclass(frozen=True, kw_only=True)
+class _Excess:
+    """What displacements in overlaps say beyond stated poses.
+
+    Attributes:
+        position_m: standard deviation of a coordinate of one photo.
+        depth_m: that of depths over a patch; None where views differ too little.
+    """
+
+    position_m: float
+    depth_m: float | None
+
+
+def _excess_of_overlaps(
+    wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
+) -> _Excess | None:
+    """Split displacements into those of poses and of depths; None where there are too few.
+
+    Squares of displacements are sums of the variances of both poses, of twice what poses do not
+    state, and of the variance of the depth times the square of what the tangents of both views
+    differ by: a least squares fit with weights, without negative variances and outliers.
+    """
+    from scipy.optimize import nnls
+
+    known = {
+        name: _views_of(wall, cameras[name], overlaps.centres)
+        for name in {name for pair in overlaps.photos for name in pair}
+        if name in cameras and cameras[name].covariance is not None
+    }
+    rows = [
+        (place, known[first], known[second])
+        for place, (first, second) in enumerate(overlaps.photos)
+        if first in known and second in known
+    ]
+    if len(rows) < _LEAST_OVERLAPS:
+        return None
+    places = np.array([place for place, _, _ in rows])
+    stated = np.array([one[0][place] + other[0][place] for place, one, other in rows])
+    apart = np.array([one[1][place] - other[1][place] for place, one, other in rows])
+    gsd_m = wall.frame.gsd_m
+    squares = (gsd_m * overlaps.shifts_cells[places]) ** 2
+    fixed = stated[:, None] + (_PARALLAX_NOISE_CELLS * gsd_m) ** 2
+    finite = np.isfinite(squares + fixed + apart).all(axis=1)
+    squares, fixed, apart = squares[finite], fixed[finite], apart[finite]
+    n_slanted = np.count_nonzero(np.linalg.norm(apart, axis=1) > _LEAST_TANGENTS)
+    columns = [np.full(squares.size, 2.0)]
+    if n_slanted >= _LEAST_SLANTED:
+        columns.append((apart**2).ravel())
+    matrix, wanted = np.column_stack(columns), squares.ravel()
+    known_part = np.broadcast_to(fixed, squares.shape).ravel()
+    # Half of all displacements are below 0.67 deviations.
+    predicted = np.full(len(wanted), max(float(np.median(wanted)) * NMAD_FACTOR**2, 1e-12))
+    found = np.zeros(len(columns))
+    for _ in range(_ROUNDS):
+        kept = wanted <= _OUTLIER**2 * predicted
+        if np.count_nonzero(kept) < _LEAST_OVERLAPS:
+            return None
+        weights = 1.0 / predicted[kept]
+        found, _ = nnls(matrix[kept] * weights[:, None], (wanted - known_part)[kept] * weights)
+        predicted = np.maximum(known_part + matrix @ found, 1e-12)
+    return _Excess(
+        position_m=float(np.sqrt(found[0])),
+        depth_m=float(np.sqrt(found[1])) if len(found) > 1 else None,
+    )
+
+
+def _views_of(
+    wall: Wall, camera: Camera, centres: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variances (n,) that a pose states at places, and tangents (n, 2) of its views of them."""
+    frame = wall.frame
+    depths_m = np.nan_to_num(
+        wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)
+    )
+    variances = _pose_variances(camera, frame, centres[:, None], depths_m[:, None])
+    centre = frame.wall_from_world(camera.viewing().centre_world[None])[0]
+    before = np.maximum(centre[2] - depths_m, 1e-3)
+    tangents = (frame.gsd_m * centres - frame.gsd_m * centre[:2]) / before[:, None]
+    if variances is None:
+        variances = np.full((len(centres), 1), np.nan)
+    return variances[:, 0], tangents

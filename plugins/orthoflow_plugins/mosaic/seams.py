@@ -35,10 +35,11 @@ from orthoflow.products import (
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.agreement import (
+    Overlaps,
     SeamSteps,
     count_seams,
-    displacements_cells,
     is_seam,
+    overlaps_of,
     seam_steps,
 )
 from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
@@ -124,7 +125,7 @@ class MosaicSeams(Method):
     """
 
     id: ClassVar[str] = "mosaic.seams"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     repeatable: ClassVar[tuple[str, ...]] = ("seams",)
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
@@ -267,7 +268,7 @@ class MosaicSeams(Method):
             verdict = _join(group, name, params, surroundings, allocate)
             image = _with_errors(
                 replace(verdict.image, plane_index=inputs.layers.number(index)),
-                verdict.shifts_cells,
+                verdict.all_overlaps,
                 surroundings,
                 inputs.cameras,
                 ctx,
@@ -298,7 +299,8 @@ class _Joined:
 
     Attributes:
         image: the orthoimage.
-        shifts_cells: (n, 2) displacements between the photos of overlaps.
+        overlaps: how far the two best photos of places lie apart.
+        all_overlaps: the same of every two photos.
         steps: of colours along seams.
         n_seam: cells of seams.
         n_edge_seam: cells of seams at depth edges, None when the surface is not known.
@@ -309,7 +311,8 @@ class _Joined:
     """
 
     image: Orthoimage
-    shifts_cells: NDArray[np.float64]
+    overlaps: Overlaps
+    all_overlaps: Overlaps
     steps: SeamSteps
     n_seam: int
     n_edge_seam: int | None
@@ -404,7 +407,8 @@ def _join(
     n_seam, n_edge_seam = count_seams(source, None if wall is None else wall.depth_m)
     return _Joined(
         image=image,
-        shifts_cells=displacements_cells(group),
+        overlaps=overlaps_of(group),
+        all_overlaps=overlaps_of(group, of_all_pairs=True),
         steps=steps,
         untouched=untouched,
         n_seam=n_seam,
@@ -417,7 +421,7 @@ def _join(
 
 def _with_errors(
     image: Orthoimage,
-    shifts_cells: NDArray[np.float64],
+    overlaps: Overlaps,
     surroundings: _Surroundings,
     cameras: Cameras | None,
     ctx: StepContext,
@@ -437,7 +441,7 @@ def _with_errors(
         image.source,
         image.sources,
         surroundings.cameras,
-        shifts_cells,
+        overlaps,
         allocate=allocate,
     )
     return replace(image, error_m=errors_m, n_check_points=n_check)
@@ -537,7 +541,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     edges = [item.n_edge_seam for item in verdicts if item.n_edge_seam is not None]
     if edges and n_seam:
         ctx.metric("seam_on_depth_edge_share", sum(edges) / n_seam, "1")
-    shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
+    shifts_cells = np.concatenate([item.overlaps.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
         rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
@@ -545,7 +549,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         ctx.metric("overlap_v_rms_cells", rms[1], "cells")
         # In millimetres two runs compare whose cells have other sizes.
         shifts_mm = np.concatenate(
-            [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
+            [1e3 * item.image.frame.gsd_m * item.overlaps.shifts_cells for item in verdicts]
         )
         rms_mm = np.sqrt(np.mean(shifts_mm**2, axis=0))
         ctx.metric("overlap_u_rms_mm", rms_mm[0], "mm")

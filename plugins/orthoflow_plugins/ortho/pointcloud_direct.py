@@ -21,7 +21,7 @@ from orthoflow.geometry.bands import (
 )
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
     Inpainting,
@@ -41,6 +41,16 @@ _POINTS_AT_ONCE: Final = 1 << 22
 _BLACK_WORTH_WORDS: Final = 0.001
 # Files with black points have some that are almost black, too.
 _ALMOST_BLACK_GREY: Final = 10
+# Of clouds with more black points black is a colour.
+_MOST_SPECKS: Final = 0.1
+
+SPECKS: Final = DiagnosticSpec(
+    code="black-points-left-out",
+    severity="note",
+    text="{n_points:,} points of {subject} ({share:.1%}) are pure black, as points without a "
+    "colour are in many files: they paint no pixel",
+    remedy="{step}.skip_below_grey=0 paints them, 10 leaves out almost black ones, too",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +72,7 @@ class PointcloudDirect(Method):
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("painted_share", label="cells painted"),
@@ -96,13 +106,12 @@ class PointcloudDirect(Method):
             "on the topmost surface; gaussian mean of that surface by distance to the centre; "
             "median of its n_top highest points.",
         )
-        skip_below_grey: int = Field(
-            default=0,
-            ge=0,
-            le=255,
+        skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
+            default=None,
             description="Points no channel of which reaches this have no colour, as in many files "
             "those that no camera saw: they paint no cell, and keep their depth. 1: those of pure "
-            "black; 10: almost black ones, too; 0: none.",
+            "black; 10: almost black ones, too; 0: none. Without it those of pure black, where "
+            "these are specks: at most a tenth of all, and more than there are almost black ones.",
         )
         layer_m: float = Field(
             default=0.02,
@@ -215,26 +224,33 @@ def _left_out(
 
     They paint no cell, and keep their depth. Black points that are painted are reported.
     """
-    n_points, least, has_rgb = len(rgb), params.skip_below_grey, cloud.has_rgb
-    is_dark = _mask(ctx, n_points) if least > 0 or has_rgb is not None else None
+    n_points, has_rgb = len(rgb), cloud.has_rgb
     counts = np.zeros(256, dtype=np.int64)
-    for first in range(0, n_points, _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
-        brightest = rgb[part].max(axis=1)
+    parts = [slice(k, k + _POINTS_AT_ONCE) for k in range(0, n_points, _POINTS_AT_ONCE)]
+    for part in parts:
         valid = slice(None) if has_rgb is None else np.asarray(has_rgb[part])
-        counts += np.bincount(brightest[valid], minlength=256)
-        if is_dark is not None:
-            is_dark[part] = brightest < least
+        counts += np.bincount(rgb[part].max(axis=1)[valid], minlength=256)
+    n_black, n_almost = int(counts[0]), int(counts[1:_ALMOST_BLACK_GREY].sum())
+    is_worth_words = n_black >= _BLACK_WORTH_WORDS * n_points
+    are_specks = is_worth_words and n_almost <= n_black <= _MOST_SPECKS * n_points
+    least = params.skip_below_grey
+    if least is None:
+        least = int(are_specks)
+    is_dark = _mask(ctx, n_points) if least > 0 or has_rgb is not None else None
+    if is_dark is not None:
+        for part in parts:
+            is_dark[part] = rgb[part].max(axis=1) < least
             if has_rgb is not None:
                 is_dark[part] |= ~np.asarray(has_rgb[part])
-    n_black, n_dark = counts[0], counts[:least].sum()
-    n_almost = counts[1:_ALMOST_BLACK_GREY].sum()
-    if least > 0:
+    n_dark = int(counts[:least].sum())
+    if params.skip_below_grey:
         ctx.log(
             f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
             f"skip_below_grey = {least}; they paint no cell"
         )
-    elif n_black >= _BLACK_WORTH_WORDS * n_points:
+    elif least > 0:
+        ctx.report(SPECKS, subject="the cloud", n_points=n_dark, share=n_dark / n_points)
+    elif is_worth_words:
         ctx.warn(
             f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
             f"without a colour are in many files, and {n_almost} almost; they are "

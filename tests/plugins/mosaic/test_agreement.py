@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import agreement as module
 from orthoflow_plugins.mosaic.agreement import (
     count_seams,
-    displacements_cells,
     is_seam,
+    overlaps_of,
     seam_steps,
 )
 from orthoflow_plugins.mosaic.depth_edges import depth_edges
@@ -67,11 +67,13 @@ def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None
             if len(best) >= 2:
                 wanted.append((row, column, best[0], best[1]))
     assert 2 < len(wanted) <= 6
-    assert module._best_pairs(layers) == wanted
-    assert module._best_pairs(layers[:1]) == []
+    assert module._pairs(layers, of_all_pairs=False) == wanted
+    assert module._pairs(layers[:1], of_all_pairs=False) == []
     small = [layer(shape=(63, 300)), layer(shape=(63, 300))]
-    assert module._best_pairs(small) == []
-    assert len(module._best_pairs([layer(shape=(64, 64))] * 2)) == 1
+    assert module._pairs(small, of_all_pairs=False) == []
+    three = [layer(shape=(64, 64))] * 3
+    assert len(module._pairs(three, of_all_pairs=False)) == 1
+    assert len(module._pairs(three, of_all_pairs=True)) == 3
 
 
 def texture(spread_grey: float) -> NDArray[np.float64]:
@@ -86,7 +88,7 @@ def texture(spread_grey: float) -> NDArray[np.float64]:
 def test_flat_patches_tell_no_displacement(spread_grey: float, n_found: int) -> None:
     whole = np.rint(texture(spread_grey)).astype(np.uint8)
     pair = [layer(rgb=np.dstack([whole[:, k : k + 64]] * 3), shape=(64, 64)) for k in (0, 2)]
-    found = displacements_cells(pair)
+    found = overlaps_of(pair).shifts_cells
     assert len(found) == n_found
     if n_found:
         np.testing.assert_allclose(found, [[-2.0, 0.0]], atol=0.4)
@@ -108,9 +110,9 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
         pair = [one, np.rint((1.0 - weight) * one + weight * other).astype(np.uint8)]
         layers = [layer(rgb=np.dstack([part] * 3), shape=(64, 64)) for part in pair]
         if 0.16 < peak(pair) < 0.28:
-            told["fifth"] = len(displacements_cells(layers))
+            told["fifth"] = len(overlaps_of(layers).photos)
         elif 0.07 < peak(pair) < 0.14:
-            told["tenth"] = len(displacements_cells(layers))
+            told["tenth"] = len(overlaps_of(layers).photos)
     assert told == {"fifth": 1, "tenth": 0}
 
 
@@ -118,7 +120,7 @@ def test_two_hundred_patches_are_enough() -> None:
     shape = (64, 64 * 240)
     row = np.rint(texture(30.0)[:, :64]).astype(np.uint8)
     same = layer(rgb=np.dstack([np.tile(row, (1, 240))] * 3), shape=shape)
-    found = displacements_cells([same, same])
+    found = overlaps_of([same, same]).shifts_cells
     assert len(found) == 200
     np.testing.assert_allclose(found, 0.0, atol=0.05)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.mosaic.agreement import Overlaps
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 
 from orthoflow.geometry import WallFrame
@@ -20,7 +21,7 @@ SURVEY = np.array([4_512_345.25, 5_300_210.5, 187.125])
 GSD_M = 0.02
 FRAME = samples.facing_south(GSD_M, 150, 100, SURVEY)
 TURN_RAD, SHIFT_M = 2e-4, 1e-3
-NO_SHIFTS = np.zeros((0, 2))
+NO_OVERLAPS = Overlaps(shifts_cells=np.zeros((0, 2)), centres=np.zeros((0, 2)), photos=())
 
 
 def wall(frame: WallFrame = FRAME, *, spread_m: float = 0.0) -> Wall:
@@ -101,7 +102,7 @@ def test_errors_are_as_large_as_drawn_poses_and_depths_make_them(spread_m: float
         np.zeros(FRAME.shape, np.int16),
         ("a.jpg",),
         {"a.jpg": camera(viewing)},
-        NO_SHIFTS,
+        NO_OVERLAPS,
         allocate=in_memory,
     )
     columns, rows = places.T.astype(int)
@@ -113,7 +114,7 @@ def test_a_lens_that_was_estimated_adds_what_its_photo_states() -> None:
     source = np.zeros(FRAME.shape, np.int16)
     plain, wider = (
         expected_errors_m(
-            wall(), source, ("a.jpg",), {"a.jpg": item}, NO_SHIFTS, allocate=in_memory
+            wall(), source, ("a.jpg",), {"a.jpg": item}, NO_OVERLAPS, allocate=in_memory
         )
         for item in (camera(viewing), camera(viewing, sigma_wall_m=0.01))
     )
@@ -121,18 +122,64 @@ def test_a_lens_that_was_estimated_adds_what_its_photo_states() -> None:
     np.testing.assert_allclose(wider / plain, np.median(wider / plain), rtol=1e-4)
 
 
+def overlaps(shifts_m: NDArray[np.float64], photos: tuple[str, str]) -> Overlaps:
+    """Displacements at places all over the wall."""
+    rng = np.random.default_rng(3)
+    centres = rng.uniform((10.0, 10.0), (140.0, 90.0), (len(shifts_m), 2))
+    return Overlaps(
+        shifts_cells=shifts_m / GSD_M, centres=centres, photos=(photos,) * len(shifts_m)
+    )
+
+
 def test_photos_that_lie_apart_by_more_than_they_state_are_no_better_than_that() -> None:
-    shifts = np.random.default_rng(2).normal(0.0, 1.0, (400, 2))
+    shifts_m = np.random.default_rng(2).normal(0.0, GSD_M, (400, 2))
     errors = expected_errors_m(
         wall(),
         np.zeros(FRAME.shape, np.int16),
         ("a.jpg",),
         {"a.jpg": camera(oblique())},
-        shifts,
+        overlaps(shifts_m, ("a.jpg", "a.jpg")),
         allocate=in_memory,
     )
     rms_m = float(np.sqrt(np.mean(errors.astype(np.float64) ** 2)))
     assert rms_m == pytest.approx(GSD_M / np.sqrt(2.0), rel=0.1)
+
+
+@pytest.mark.parametrize(("position_m", "depth_m"), [(0.004, 0.0), (0.0, 0.012), (0.004, 0.012)])
+def test_overlaps_tell_errors_of_depths_from_those_of_poses(
+    position_m: float, depth_m: float
+) -> None:
+    names = ("a.jpg", "b.jpg")
+    left = oblique()
+    # The same from the other side.
+    centre = left.centre_world + 4.0 * FRAME.u_world
+    right = replace(left, translation=-left.rotation @ centre)
+    cameras = {
+        name: replace(posed, photo=name, covariance=1e-8 * posed.covariance)
+        for name, posed in zip(names, (camera(left), camera(right)), strict=True)
+    }
+    rng = np.random.default_rng(4)
+    place = overlaps(np.zeros((200, 2)), names)
+    at_m = GSD_M * (place.centres - [75.0, 50.0])
+    tangents = [(at_m - [side, 0.0]) / 3.0 for side in (-2.0, 2.0)]
+    depths_m = rng.normal(0.0, depth_m, (200, 1)) if depth_m else np.zeros((200, 1))
+    shifts_m = depths_m * (tangents[0] - tangents[1])
+    shifts_m += rng.normal(0.0, position_m, (200, 2)) - rng.normal(0.0, position_m, (200, 2))
+    shifts_m += rng.normal(0.0, 0.1 * GSD_M, (200, 2))
+    # Some are matches of something else.
+    shifts_m[::20] = 1.0
+    stated = expected_errors_m(
+        wall(),
+        np.zeros(FRAME.shape, np.int16),
+        names[:1],
+        cameras,
+        replace(place, shifts_cells=shifts_m / GSD_M),
+        allocate=in_memory,
+    )
+    for column, row in ((30, 20), (120, 80)):
+        across, down = (GSD_M * (np.array([column, row]) + 0.5 - [75.0, 50.0]) + [2.0, 0.0]) / 3.0
+        expected = np.hypot(position_m, depth_m * np.sqrt(0.5 * (across**2 + down**2)))
+        assert stated[row, column] == pytest.approx(expected, rel=0.15, abs=0.0007)
 
 
 def test_nothing_is_stated_of_cells_whose_photo_is_not_known() -> None:
@@ -144,7 +191,7 @@ def test_nothing_is_stated_of_cells_whose_photo_is_not_known() -> None:
         source,
         ("a.jpg", "b.jpg"),
         {"a.jpg": camera(oblique()), "b.jpg": poseless},
-        NO_SHIFTS,
+        NO_OVERLAPS,
         allocate=in_memory,
     )
     assert np.isfinite(errors[:10]).all()

@@ -223,6 +223,24 @@ def test_points_of_pure_black_are_told(tmp_path: Path, *, n_black: int, is_told:
     assert len(ctx.warnings) == len(told)
 
 
+def test_specks_of_pure_black_paint_no_cell_and_are_reported(tmp_path: Path) -> None:
+    cloud, walls = holey_wall(np.zeros((10, 20), dtype=bool))
+    assert cloud.rgb is not None
+    rgb = np.full_like(cloud.rgb, 120)
+    rgb[5::20] = 0
+    specked = dataclasses.replace(cloud, rgb=rgb)
+    ctx = scenes.context(tmp_path)
+    inputs = PointcloudDirect.In(walls=walls, cloud=specked)
+    layer = PointcloudDirect().run(inputs, PointcloudDirect.Params(), ctx).layers.layers[0]
+    shown = layer.mask == LayerMask.PAINTED
+    assert (layer.rgb[shown] == 120).all()
+    (told,) = [one for one in ctx.diagnostics if one.code == "black-points-left-out"]
+    assert told.values["n_points"] == np.count_nonzero((rgb == 0).all(axis=1))
+    # They are painted where that is asked for.
+    layer = painted(specked, walls, tmp_path, skip_below_grey=0)
+    assert (layer.rgb == 0).all(axis=2).any()
+
+
 @pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
 @pytest.mark.parametrize("least", [1, 10])
 def test_points_without_a_colour_are_skipped_where_that_is_asked_for(
