@@ -18,8 +18,6 @@ def orthoflow_kinds():
         KindSpec(name="make", summary="makes numbers", is_source=True),
         KindSpec(name="work", summary="works on numbers", inputs={"numbers": "numbers"},
                  outputs={"numbers": "numbers"}),
-        KindSpec(name="tell", summary="tells of rows", inputs={"rows": "rows"},
-                 outputs={"numbers": "numbers"}),
         KindSpec(name="thin", summary="makes few of many", inputs={"scan": "scan"},
                  outputs={"numbers": "numbers"}),
     ]
@@ -28,22 +26,19 @@ def orthoflow_kinds():
 def orthoflow_products():
     return [ProductSpec(type_name="numbers", target="toy_plugin.products:Numbers",
                         summary="numbers", publisher="toy_plugin.products:publish"),
-            ProductSpec(type_name="rows", target="toy_plugin.products:Rows", summary="rows"),
             ProductSpec(type_name="scan", target="toy_plugin.products:Scan", summary="many")]
 
 @hookimpl
 def orthoflow_methods():
     makes = [MethodSpec(id=f"make.{name}", target=f"toy_plugin.makes:{name.title()}", summary="")
-             for name in ("range", "file", "rows", "scan", "survey")]
+             for name in ("range", "file", "scan", "survey")]
     works = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.works:{name}", summary="")
              for name in WORKS]
     thins = [MethodSpec(id=f"thin.{name}", target=f"toy_plugin.works:{name.title()}", summary="")
              for name in ("means", "sketch")]
     mischief = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.mischief:{name}", summary="")
                 for name in MISCHIEF]
-    tells = [MethodSpec(id=f"tell.{name}", target=f"toy_plugin.works:{name.title()}", summary="")
-             for name in ("sums", "seen")]
-    return [*makes, *works, *thins, *tells, *mischief]
+    return [*makes, *works, *thins, *mischief]
 """
 
 PRODUCTS = """
@@ -62,17 +57,6 @@ class Numbers(Product):
     type_name: ClassVar[str] = "numbers"
     values: NDArray[np.float64]
     note: str = ""
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    name: str
-    values: NDArray[np.float32]
-
-@dataclass(frozen=True, kw_only=True)
-class Rows(Product):
-    type_name: ClassVar[str] = "rows"
-    items: ClassVar[str] = "rows"
-    rows: tuple[Row, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Scan(Product):
@@ -114,25 +98,6 @@ class Range(Method):
     def run(self, inputs, params, ctx):
         ctx.metric("count", params.count, "1")
         return self.Out(numbers=Numbers(values=np.arange(float(params.count))))
-
-class Rows(Method):
-    id = "make.rows"
-
-    class Params(MethodParams):
-        count: int = Field(5, ge=0, description="How many.")
-
-    class In(Ports):
-        pass
-
-    class Out(Ports):
-        rows: products.Rows
-
-    def run(self, inputs, params, ctx):
-        rows = tuple(
-            products.Row(name=f"row{nth}", values=np.sqrt(np.arange(nth + 3, dtype=np.float32)))
-            for nth in range(params.count)
-        )
-        return self.Out(rows=products.Rows(rows=rows))
 
 class Scan(Method):
     id = "make.scan"
@@ -207,8 +172,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import InputError, MethodError
-from orthoflow.sdk import Method, MethodParams, Part, Ports
-from toy_plugin.products import Numbers, Rows, Scan, Strangers
+from orthoflow.sdk import Method, MethodParams, Ports
+from toy_plugin.products import Numbers, Scan, Strangers
 
 class Work(Method):
     class Params(MethodParams):
@@ -450,75 +415,4 @@ class Sketch(Means):
         ctx.metric("dots", 1, "1")
         return super().run(inputs, params, ctx)
 
-@dataclass(frozen=True, kw_only=True)
-class RowSums(Part):
-    sums: tuple[float, ...]
-    cubes: NDArray[np.float32]
-
-class Sums(Method):
-    id = "tell.sums"
-    maps_over = "rows"
-    PartOut = RowSums
-
-    class Params(MethodParams):
-        bad: str = Field("", description="Name of the row at which it fails, and how.")
-        wait_s: float = Field(0.0, description="So long each row takes.")
-        bad_join: bool = Field(False, description="Whether the parts cannot be joined.")
-
-    class In(Ports):
-        rows: Rows
-
-    class Out(Ports):
-        numbers: Numbers
-
-    def run_part(self, inputs, items, params, ctx):
-        print("rows", items.start, items.stop)
-        ctx.warn("rows are short")
-        sums, cubes = [], []
-        for item in items:
-            row = inputs.rows.rows[item]
-            ctx.progress(len(sums) / len(items), row.name)
-            time.sleep(params.wait_s)
-            if params.bad == row.name:
-                raise MethodError("no sum is large enough")
-            if params.bad == f"{row.name} metric":
-                ctx.metric("sum", 1.0, "1")
-            if params.bad == f"{row.name} warns":
-                ctx.warn(f"{row.name} is odd")
-            if params.bad == f"{row.name} gives":
-                return inputs.rows
-            sums.append(float(np.sum(row.values)))
-            cubes.append(row.values ** 3)
-        return RowSums(sums=tuple(sums), cubes=np.concatenate([np.empty(0, np.float32), *cubes]))
-
-    def join(self, inputs, parts, params, ctx):
-        if params.bad_join:
-            raise MethodError("these do not go together")
-        sums = [value for part in parts for value in part.sums]
-        cubes = np.concatenate([part.cubes for part in parts])
-        ctx.metric("n_rows", len(sums), "1")
-        ctx.warn("sums are sums")
-        return self.Out(numbers=Numbers(values=np.concatenate([sums, cubes.astype(float)])))
-
-class Seen(Sums):
-    # Knows of parts what it must not.
-    id = "tell.seen"
-
-    def join(self, inputs, parts, params, ctx):
-        return self.Out(numbers=Numbers(values=np.array([float(len(part.sums)) for part in parts])))
-
-class wrong_type(Work):
-    id = "work.wrong_type"
-    def run(self, inputs, params, ctx):
-        return self.Out(numbers=Strangers())
-
-class wrong_out(Work):
-    id = "work.wrong_out"
-    def run(self, inputs, params, ctx):
-        return inputs.numbers
-
-class bad_param(Work):
-    id = "work.bad_param"
-    def run(self, inputs, params, ctx):
-        ctx.metric("nan", float("nan"), "1")
 """

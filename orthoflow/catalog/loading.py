@@ -20,7 +20,6 @@ from orthoflow.sdk.methods import (
     MetricSpec,
     Ports,
     PortSpec,
-    mapped_port,
     port_specs,
 )
 
@@ -86,7 +85,6 @@ def load_method(
         try:
             complaint = (
                 _port_complaint(method, kind, product_types)
-                or _mapping_complaint(method)
                 or _contested_complaint(method, contested, distribution)
                 or next(filter(None, map(product_complaint, _products_of(*_hints(method.Out)))), "")
             )
@@ -122,25 +120,21 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
             isinstance(metrics, tuple)
             and all(isinstance(one, MetricSpec | str) and one for one in metrics)
         ),
-        "it has no run": method.run is not Method.run or bool(method.maps_over),
+        "it has no run": method.run is not Method.run,
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
 
 def product_complaint(cls: type[Product]) -> str:
     """Say which name in the class of a product is none of its fields; empty when all are."""
-    own: Mapping[str, object] | None = getattr(cls, "__dataclass_fields__", None)
-    if own is None:
+    if not hasattr(cls, "__dataclass_fields__"):
         return f"{cls.__qualname__} must be a frozen dataclass"
-    within: Mapping[str, object] = dict.fromkeys(_names_within(cls, set()))
-    named = [("items", cls.items, own)] if cls.items else []
-    named += [("item_name", cls.item_name, within)] if cls.item_name != Product.item_name else []
-    named += [("tolerances", name, within) for name in cls.tolerances]
+    known = dict.fromkeys(_names_within(cls, set()))
     return next(
         (
-            f"{attribute} of {cls.__qualname__} names {name}, which is no field"
+            f"tolerances of {cls.__qualname__} names {name}, which is no field"
             f"{did_you_mean(name, known)}"
-            for attribute, name, known in named
+            for name in cls.tolerances
             if name not in known
         ),
         "",
@@ -211,14 +205,6 @@ def _contested_complaint(
                 f"its {cls.type_name} is {cls.__module__}:{cls.__qualname__}, but that name is "
                 f"taken by {target} of another plugin: disable that one, or rename the product"
             )
-    return ""
-
-
-def _mapping_complaint(method: type[Method]) -> str:
-    try:
-        mapped_port(method)
-    except PluginError as error:
-        return str(error)
     return ""
 
 

@@ -27,7 +27,7 @@ _WORD: Final = re.compile(r"-?[A-Za-z][A-Za-z0-9_.-]*")
 # What YAML of one version or another takes for something else.
 _NO_WORDS: Final = frozenset(("true", "false", "null", "yes", "no", "on", "off", "y", "n"))
 _OF_STEPS: Final = ("only", "from_", "until", "force")
-_WHOLE: Final = ("jobs", "retries", "cores", "parts")
+_WHOLE: Final = ("jobs", "retries", "cores")
 _SHORT: Final = 60
 _FORM_OF_SET: Final = "a mapping of step.parameter to a value, such as {'wall.gsd_m': 0.005}"
 _FORM_OF_INPUTS: Final = (

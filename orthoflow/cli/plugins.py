@@ -241,7 +241,6 @@ def _method_json(entry: MethodEntry) -> dict[str, object]:
         "target": entry.spec.target,
         "result_version": method.result_version,
         "determinism": method.determinism,
-        "maps_over": method.maps_over,
         "citations": list(method.citations),
         "metrics": [dataclasses.asdict(one) for one in method.metric_specs()],
         "params": [
@@ -285,8 +284,6 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
     echo(f"state         {entry.state}")
     echo(f"class         {entry.spec.target}")
     echo(f"determinism   {method.determinism}, result version {method.result_version}")
-    if method.maps_over:
-        echo(f"in parts      over {method.maps_over}, where workers of a cluster are idle")
     for citation in method.citations:
         echo(f"citation      {citation}")
     echo()

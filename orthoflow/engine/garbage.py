@@ -13,7 +13,6 @@ from typing import Final
 from orthoflow.engine.durability import size_of
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.locks import exclusive_lock
-from orthoflow.engine.splitting import parts_folder
 from orthoflow.engine.store import Store
 from orthoflow.engine.store_folder import is_store, require_store
 from orthoflow.errors import ArgumentError
@@ -78,7 +77,6 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
         *damaged,
         *failures,
         *_children(store.scratch),
-        *_children(parts_folder(store)),
         *_half_written(store),
     )
     freed = sum(size_of(path) for path in (*results, *objects, *preimages, *rest))

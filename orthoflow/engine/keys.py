@@ -28,7 +28,7 @@ from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue
-from orthoflow.sdk.methods import MappedPort, Method, mapped_port, port_specs
+from orthoflow.sdk.methods import Method, port_specs
 from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import Cell
 
@@ -68,7 +68,6 @@ class MethodFacts(MethodIdentity):
         outputs: port -> product type.
         sources: the files behind `code`.
         repeatable: input ports whose files may repeat each other's content.
-        maps_over: where the items are that it may compute in parts, if it does.
     """
 
     target: str
@@ -79,7 +78,6 @@ class MethodFacts(MethodIdentity):
     outputs: Mapping[str, str]
     sources: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
     repeatable: frozenset[str] = frozenset()
-    maps_over: MappedPort | None = None
 
     def is_code_unchanged(self) -> bool:
         """Whether the code on the disk is still the one in the keys."""
@@ -128,7 +126,6 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         inputs={name: port.type_name for name, port in port_specs(cls.In).items()},
         outputs={name: port.type_name for name, port in port_specs(cls.Out).items()},
         repeatable=frozenset(cls.repeatable),
-        maps_over=mapped_port(cls),
     )
 
 

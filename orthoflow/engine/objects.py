@@ -2,7 +2,7 @@
 
 A figure's folder has the SHA-256 of its bytes for a name. A product's has the digest of its content
 for one, which says nothing about the bytes of its files: `object.json` does, and begins with the
-digest of its own text. In earlier versions it had no digests (`EarlierProduct`).
+digest of its own text.
 """
 
 from __future__ import annotations
@@ -53,20 +53,11 @@ class StoredProduct:
         files: path in the folder -> file; `object.json` is not among them.
     """
 
-    format: Literal["orthoflow/object/2"] = "orthoflow/object/2"
+    format: Literal["orthoflow/object/1"] = "orthoflow/object/1"
     object: str
     type: str
     publisher: str
     files: Mapping[str, ObjectFile]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EarlierProduct:
-    """What it said before it had digests."""
-
-    type: str
-    size_bytes: int
-    publisher: str
 
 
 class CheckedFiles:
@@ -140,7 +131,7 @@ def require_plain_files(folder: Path, who: str) -> None:
             raise ProductError(f"{who} publishes {path.name!r}, which {problem}")
 
 
-def read_description(folder: Path) -> StoredProduct | EarlierProduct | None:
+def read_description(folder: Path) -> StoredProduct | None:
     """Read `object.json`; None when it is damaged, of another object, or not there.
 
     Raises:
@@ -155,23 +146,16 @@ def read_description(folder: Path) -> StoredProduct | EarlierProduct | None:
         return None
     except ValueError:
         return None
-    if isinstance(found, EarlierProduct):
-        return found if not text.startswith('{"sha256"') else None
     return found if is_checked(text) and found.object == folder.name else None
 
 
 def files_of(folder: Path) -> Mapping[str, ObjectFile]:
-    """The files that an object must have, by path in its folder; empty when nobody knows.
-
-    Of a product of an earlier version that is the product alone, without a digest.
-    """
+    """The files that an object must have, by path in its folder; empty when nobody knows."""
     if folder.is_symlink():
         return {}
     if (folder / BLOB).exists():
         return {BLOB: ObjectFile(size_bytes=-1, sha256=folder.name)}
     found = read_description(folder)
-    if isinstance(found, EarlierProduct):
-        return {PRODUCT: ObjectFile(size_bytes=found.size_bytes, sha256="")}
     return found.files if found is not None else {}
 
 
@@ -207,5 +191,5 @@ def _has_size(path: Path, expected: ObjectFile) -> bool:
 
 
 @cache
-def _codec() -> TypeAdapter[StoredProduct | EarlierProduct]:
-    return TypeAdapter(StoredProduct | EarlierProduct)
+def _codec() -> TypeAdapter[StoredProduct]:
+    return TypeAdapter(StoredProduct)

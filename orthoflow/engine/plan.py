@@ -70,8 +70,6 @@ class RunOptions:
         until: run these steps and what they need.
         force: run these steps although their results are in the store.
         cores: processors to use in all; None for all this process may use.
-        parts: in how many parts to compute a step whose method maps over something; 0 for as many
-            as workers of a cluster would have nothing else to do, and 1 on one machine.
     """
 
     jobs: int = 1
@@ -83,7 +81,6 @@ class RunOptions:
     until: tuple[str, ...] = ()
     force: tuple[str, ...] = ()
     cores: int | None = None
-    parts: int = 0
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
@@ -96,8 +93,6 @@ class RunOptions:
             raise ArgumentError("--scheduler is for --executor dask")
         if self.retries < 0:
             raise ArgumentError(f"--retries must be 0 or more, got {self.retries}")
-        if self.parts < 0:
-            raise ArgumentError(f"parts must be 0 or more, got {self.parts}")
 
     @property
     def selection(self) -> Selection:

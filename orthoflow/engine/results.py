@@ -46,9 +46,7 @@ __all__ = [
     "shared_fields",
 ]
 
-FORMAT: Final = "orthoflow/result/2"
-# Without the digest of its own text.
-_EARLIER_FORMAT: Final = "orthoflow/result/1"
+FORMAT: Final = "orthoflow/result/1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +109,9 @@ def result_from_json(text: str, where: str) -> CellResult:
     try:
         content = parse_json(text)
         form = content.get("format") if isinstance(content, dict) else None
-        if not isinstance(content, dict) or form not in (FORMAT, _EARLIER_FORMAT):
+        if not isinstance(content, dict) or form != FORMAT:
             raise StoreError(f"{where} has a result format that this orthoflow cannot read")
-        if not is_checked(text) and (form == FORMAT or "sha256" in content):
+        if not is_checked(text):
             raise StoreError(f"{where} is damaged: it does not have the digest that it states")
         return _codec().validate_json(text, strict=True)
     except ValidationError as error:

@@ -56,7 +56,6 @@ from orthoflow.engine.run_folder import (
     RunWent,
     cell_file_name,
 )
-from orthoflow.engine.splitting import Splits
 from orthoflow.engine.store import Store
 from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import (
@@ -69,7 +68,7 @@ from orthoflow.errors import (
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
-from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput, compared_cells
+from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = DiagnosticSpec(
@@ -184,11 +183,10 @@ def execute(
                 logs=folder / LOGS,
                 run_id=journal.run_id,
             )
-            splits = Splits(store)
             executor = _executor_of(
-                plan, scratch, _passing_on(listen, splits), lambda: interruption.is_asked
+                plan, scratch, _passing_on(listen), lambda: interruption.is_asked
             )
-            run = _Run(tasks, splits, journal, listen)
+            run = _Run(tasks, journal, listen)
             try:
                 with closing(executor):
                     run.go(executor, interruption)
@@ -213,12 +211,10 @@ class _Run:
     def __init__(
         self,
         tasks: _TaskMaker,
-        splits: Splits,
         journal: Journal,
         listen: RunListener,
     ) -> None:
         self._tasks = tasks
-        self._splits = splits
         self._plan = tasks.plan
         self._store = tasks.store
         self._failures = Failures.of_store(tasks.store.folder)
@@ -233,7 +229,6 @@ class _Run:
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
         self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
-        self._compared = compared_cells(item.cell for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
         """Run until every cell has a result.
@@ -241,7 +236,7 @@ class _Run:
         Raises:
             CancelledStepError: interrupted.
         """
-        while self._waiting or self._running or self._splits.addresses:
+        while self._waiting or self._running:
             if interruption.is_asked:
                 self._break_off(executor)
             self._advance(executor)
@@ -288,7 +283,6 @@ class _Run:
 
     def _advance(self, executor: Executor) -> None:
         """Settle or start every cell whose inputs are known, as far as the cores go."""
-        self._go_on_in_parts(executor)
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
@@ -381,8 +375,7 @@ class _Run:
 
     def _is_under_way(self, key: CellKey) -> bool:
         """Whether an equal cell runs already; its result will then serve both."""
-        is_running = any(task.key == key.key for task in self._running.values())
-        return is_running or self._splits.has_key(key.key)
+        return any(task.key == key.key for task in self._running.values())
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
         if not self._running:
@@ -392,52 +385,17 @@ class _Run:
         return len(self._running) < capacity.n_tasks and is_fitting
 
     def _start(self, cell: Cell, ready: _Ready, executor: Executor) -> None:
-        task = dataclasses.replace(
-            self._tasks.make(cell, ready.key, ready.refs, _cores(cell, executor.capacity)),
-            is_compared=cell.address in self._compared,
-        )
+        cores = _cores(cell, executor.capacity)
+        task = self._tasks.make(cell, ready.key, ready.refs, cores)
         del self._waiting[cell.address]
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
-        facts, n_parts = self._plan.methods[cell.method], self._n_parts(task, executor.capacity)
-        is_forced = cell.step in self._plan.options.force and not self._journal.is_resumed
-        if self._splits.begin(task, facts, n_parts, is_forced=is_forced):
-            self._go_on_in_parts(executor)
-        else:
-            self._run(task, executor)
-
-    def _run(self, task: Task, executor: Executor) -> None:
         self._running[task.address] = task
         executor.start(task)
 
-    def _n_parts(self, task: Task, capacity: Capacity) -> int:
-        """In how many parts to compute a step, if it can be: as many as would keep all busy."""
-        options = self._plan.options
-        # Times of steps in parts hold what each part prepares.
-        if options.parts or options.executor != "dask" or task.is_compared:
-            return options.parts or 1
-        # Workers of its own share the cores of this machine.
-        n_most = capacity.n_tasks if options.scheduler else min(capacity.n_tasks, options.all_cores)
-        n_others = sum(1 for address in self._waiting if address in self._ready)
-        return (n_most - len(self._running)) // (n_others + 1)
-
-    def _go_on_in_parts(self, executor: Executor) -> None:
-        """Start parts of cells, and what joins them, as far as the cores go."""
-        for address in self._splits.addresses:
-            cell = next(item.cell for item in self._plan.cells if item.cell.address == address)
-            while self._has_room(cell, executor.capacity):
-                task = self._splits.next_task(address)
-                if task is None:
-                    break
-                self._run(task, executor)
-
     def _take(self, end: TaskEnd) -> None:
-        ended = self._running.pop(end.address)
-        remove_tree(Path(ended.folder))
-        over = self._splits.take(ended, end)
-        if over is None:
-            return
-        task, result = over
+        task, result = self._running.pop(end.address), end.result
+        remove_tree(Path(task.folder))
         planned = next(item for item in self._plan.cells if item.cell.address == task.address)
         cell = planned.cell
         if self._is_to_repeat(cell, task, result):
@@ -449,7 +407,6 @@ class _Run:
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
             self._store.trust(result)
-            self._splits.forget(task.key)
             self._failures.forget(task.key)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
@@ -519,11 +476,10 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
 
 
-def _passing_on(listen: RunListener, splits: Splits) -> Tell:
-    def tell(task: str, event: StepEvent) -> None:
-        address, fraction = splits.said_by(task, event.fraction)
+def _passing_on(listen: RunListener) -> Tell:
+    def tell(address: str, event: StepEvent) -> None:
         if event.kind == "progress":
-            listen(CellProgress(address=address, fraction=fraction, text=event.text))
+            listen(CellProgress(address=address, fraction=event.fraction, text=event.text))
         elif event.diagnostic is not None:
             listen(CellReported(address=address, diagnostic=event.diagnostic))
         else:

@@ -10,7 +10,6 @@ Layout below the store's folder:
     failures/<key>.json             how cells failed last time (`failures`); disposable
     digests.json                    memory of input files' digests; disposable
     scratch/<run id>/               work in progress; removed with its run
-    parts/<key>/                    a store of what parts of a step gave (`splitting`); disposable
     lock                            shared by runs, exclusive for garbage collection
     damaged.lock                    held by who sets something aside
 
@@ -57,8 +56,6 @@ from orthoflow.engine.objects import (
     SHORTAGES,
     WHOLE,
     CheckedFiles,
-    EarlierProduct,
-    StoredProduct,
     describe_product,
     files_of,
     missing_part,
@@ -259,9 +256,7 @@ class Store:
         """
         folder = self._object(digest)
         found = read_description(folder)
-        if isinstance(found, EarlierProduct) and self.is_sound(digest):
-            found = read_description(folder)
-        if not isinstance(found, StoredProduct):
+        if found is None:
             raise DamageError(f"the store {self.folder} has no sound product {digest}")
         prefix = f"{PUBLISHED}/"
         return {
@@ -469,15 +464,12 @@ class Store:
     def _is_there(self, folder: Path, publisher_tag: str) -> bool:
         """Whether an equal object is there, sound, and needs no newer published files."""
         found = read_description(folder)
-        is_current = isinstance(found, StoredProduct) and found.publisher == publisher_tag
+        is_current = found is not None and found.publisher == publisher_tag
         return is_current and not self._damaged_part(folder, with_published=True, again=True)
 
     def _damaged_part(
         self, folder: Path, *, with_published: bool = False, again: bool = False
     ) -> str:
-        found = read_description(folder)
-        if isinstance(found, EarlierProduct):
-            return "" if self._adopt(folder, found) else part_name(PRODUCT)
         files = files_of(folder)
         if not files:
             return missing_part(folder)
@@ -489,26 +481,6 @@ class Store:
             if not self._checked.is_sound(folder / name, expected):
                 return part_name(name)
         return ""
-
-    def _adopt(self, folder: Path, earlier: EarlierProduct) -> bool:
-        """Give a product of an earlier version its digests, if its content is what its name says.
-
-        Nobody knows any more what its published files were: they are taken as they are, once.
-        """
-        from orthoflow_provenance.arrays import (  # noqa: PLC0415 - as above
-            payload_digest,
-            read_product_file,
-        )
-
-        try:
-            stored = read_product_file(folder / PRODUCT, map_arrays=True)
-            if payload_digest(stored) != f"sha256:{folder.name}":
-                return False
-        except (OSError, ValueError, KeyError, RuntimeError):
-            return False
-        with contextlib.suppress(StoreError):
-            describe_product(folder, folder.name, earlier.type, earlier.publisher)
-        return True
 
     def _set_aside(self, path: Path, is_damaged: Callable[[], object]) -> bool:
         """Move a file or folder out of the way, if it is there and still damaged.

@@ -14,8 +14,7 @@ _MADE: Final = ("scratch", "results", "objects", "preimages")
 # What else may come first, as a lock does. A disk of its own has `lost+found`, and systems leave
 # hidden files everywhere.
 _OURS: Final = frozenset(
-    {*_MADE, "failures", "damaged", "parts", "digests.json", "lock"}
-    | {"damaged.lock", "lost+found"}
+    {*_MADE, "failures", "damaged", "digests.json", "lock"} | {"damaged.lock", "lost+found"}
 )
 
 

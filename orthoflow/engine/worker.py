@@ -65,7 +65,7 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
-from orthoflow.sdk.methods import Method, Part, Ports, checked_part, labelled
+from orthoflow.sdk.methods import Method, labelled
 from orthoflow.system import children_processor_s, flags
 
 # Inputs up to this size are digested again after the run: they must not have changed.
@@ -77,9 +77,6 @@ _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
 _PROGRESS_EVERY_S: Final = 0.1
-
-# The output port of a part.
-PART: Final = "part"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,23 +129,8 @@ class TaskOutput:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskPart:
-    """Some of the items that a method maps over.
-
-    Attributes:
-        first: index of the first one.
-        end: index behind the last one.
-        ref: what the part came to; None before it ran.
-    """
-
-    first: int
-    end: int
-    ref: ProductRef | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Task(MethodIdentity):
-    """One method call: of a whole step, of a part of one, or the one that joins parts.
+    """One method call.
 
     Everything its process needs, nothing left to decide.
 
@@ -169,10 +151,6 @@ class Task(MethodIdentity):
         log: file that takes stdout and stderr.
         kernels: names the folder for compiled kernels.
         environment: where it will run.
-        is_compared: whether its times stand beside those of others.
-        part: the part to compute; None for a whole step.
-        parts: the parts to join, in order; empty where there are none.
-        parts_store: folder of the store that has them.
     """
 
     address: str
@@ -191,10 +169,6 @@ class Task(MethodIdentity):
     log: str
     kernels: str
     environment: RecordedEnvironment | None = None
-    is_compared: bool = False
-    part: TaskPart | None = None
-    parts: tuple[TaskPart, ...] = ()
-    parts_store: str = ""
 
     @property
     def who(self) -> str:
@@ -518,10 +492,9 @@ class _Call:
         cls = cast("type[Method]", load_target(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
         params = self._params(cls)
-        parts = tuple(self._read_part(cls, part) for part in self.task.parts)
         wall_s, cpu_s, process = self._meter.clock_s(), self._cpu_s(), os.getpid()
         try:
-            outputs = self._compute(cls(), cls.In(**inputs), parts, params)
+            outputs = cast("object", cls().run(cls.In(**inputs), params, self._context))
         finally:
             if os.getpid() != process:
                 # The method forked, and this is not the process whose result counts.
@@ -535,25 +508,12 @@ class _Call:
         self._check_inputs(inputs)
         result = dataclasses.replace(
             blank_result(self.task),
-            outputs=self._keep_part(outputs) or self._keep(self._products(cls, outputs, inputs)),
+            outputs=self._keep(self._products(cls, outputs, inputs)),
             metrics=labelled(cls, self._context.metrics),
             figures=self._keep_figures(),
         )
-        if self.task.part is None:
-            self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
+        self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
         return result
-
-    def _compute(
-        self, method: Method, inputs: Ports, parts: tuple[Part, ...], params: object
-    ) -> object:
-        part = self.task.part
-        if part is not None:
-            items = range(part.first, part.end)
-            return checked_part(method, inputs, items, params, self._context)
-        # Any: what a method returns is judged afterwards.
-        if parts:
-            return cast("object", method.join(inputs, parts, params, self._context))
-        return cast("object", method.run(inputs, params, self._context))
 
     def _cpu_s(self) -> float:
         """Processor seconds of this process and its children, without loading and samples."""
@@ -566,19 +526,6 @@ class _Call:
             return InputFiles(name=given.input_name, paths=paths)
         cls = cast("type[Product]", load_target(given.target))
         return self._store.get_product(given.ref.digest, cls, is_checked=True)
-
-    def _parts_store(self) -> Store:
-        return Store(Path(self.task.parts_store), workspace=Path(self.task.folder))
-
-    def _read_part(self, cls: type[Method], part: TaskPart) -> Part:
-        assert part.ref is not None  # noqa: S101 - only parts that are there are joined
-        return self._parts_store().get_product(part.ref.digest, cls.PartOut)
-
-    def _keep_part(self, output: object) -> dict[str, ProductRef]:
-        """Keep a part; nothing where a whole step has run."""
-        if self.task.part is None:
-            return {}
-        return {PART: self._parts_store().put_product(cast("Part", output))}
 
     def _params(self, cls: type[Method]) -> object:
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +15,6 @@ from orthoflow.products.photographs import Cameras
 from orthoflow.products.planes import Planes
 from orthoflow.products.product import (
     JsonValue,
-    Payload,
     Product,
     Tolerance,
     require_shapes,
@@ -116,36 +115,6 @@ class Truth(Product):
     cameras: Cameras | None = None
     photos: tuple[TakenPhoto, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
-
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Read encoding 1, in which elevations, spoilt points and photos stood in `details`."""
-        metadata, stored = dict(payload.metadata), payload.metadata.get("details")
-        details = dict(stored) if isinstance(stored, dict) else {}
-        for name in ("lowest_elevation_deg", "highest_elevation_deg", "n_spoilt"):
-            if name in details:
-                metadata[name] = details.pop(name)
-        # What is not as version 1 wrote it stays where people can read it.
-        if "photos" in details and (photos := _photos_of_version_1(details["photos"])) is not None:
-            del details["photos"]
-            metadata["photos"] = photos
-        metadata["details"] = details
-        return super().upgraded(replace(payload, metadata=metadata))
-
-
-def _photos_of_version_1(stored: JsonValue) -> list[JsonValue] | None:
-    """Photos as `TakenPhoto` has them; None where they are not as version 1 wrote them."""
-    photos: list[JsonValue] = []
-    for entry in stored if isinstance(stored, list) else [None]:
-        if not isinstance(entry, dict):
-            return None
-        name, gsd_mm = entry.get("name"), entry.get("gsd_mm")
-        same = ("wall", "obliquity_deg", "roll_deg")
-        kept: dict[str, JsonValue] = {key: entry[key] for key in same if key in entry}
-        if name is None or not isinstance(gsd_mm, float | int) or len(kept) < len(same):
-            return None
-        photos.append({"photo": name, "gsd_m": 1e-3 * gsd_mm, **kept})
-    return photos
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import ClassVar, Self
 
@@ -14,7 +14,6 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products.product import (
     JsonValue,
-    Payload,
     Product,
     Tolerance,
     require_shapes,
@@ -129,7 +128,6 @@ class Photos(Product):
 
     type_name: ClassVar[str] = "photos"
     embedded: ClassVar[bool] = False
-    items: ClassVar[str] = "photos"
 
     photos: tuple[Photo, ...]
 
@@ -303,12 +301,6 @@ class Ties(Product):
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Take walls and search radii, which version 1 had among the details, out of them."""
-        upgraded = replace(payload, metadata=_ties_of_version_2(payload.metadata))
-        return super().upgraded(upgraded)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
@@ -415,8 +407,6 @@ class Cameras(Product):
         "covariance": Tolerance(limit=1e-4, unit="1"),
         "residual_px": Tolerance(limit=0.05, unit="px"),
     }
-    items: ClassVar[str] = "cameras"
-    item_name: ClassVar[str] = "photo"
 
     cameras: tuple[Camera, ...]
     ties: Ties | None = None
@@ -455,51 +445,6 @@ class Cameras(Product):
                     f"camera {camera.photo}: covariance must be finite, with variances of 0 or more"
                 )
         _require_photos("cameras", [camera.photo for camera in self.cameras], others)
-
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Take the table of residuals out of the details of version 1, and the like of its ties."""
-        metadata = dict(payload.metadata)
-        details = _mapping(metadata.get("details"))
-        rows = details.get("residual_table")
-        needed = {entry.name for entry in fields(ResidualRow) if entry.default is MISSING}
-        if isinstance(rows, list) and all(needed <= _mapping(row).keys() for row in rows):
-            metadata["residual_table"] = rows
-            metadata["details"] = _without(details, "residual_table")
-        if "ties" in metadata:
-            metadata["ties"] = _ties_of_version_2(_mapping(metadata["ties"]))
-        return super().upgraded(replace(payload, metadata=metadata))
-
-
-def _ties_of_version_2(metadata: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """Metadata of ties whose details had `walls`, and `search_radius_px` of each photo."""
-    found, details = dict(metadata), dict(_mapping(metadata.get("details")))
-    walls, needed = details.get("walls"), {"corners_world", "normal"}
-    if isinstance(walls, list) and all(needed <= _mapping(wall).keys() for wall in walls):
-        found["walls"] = [_wall_of_version_2(_mapping(wall)) for wall in walls]
-        details = _without(details, "walls")
-    photos, names = _mapping(details.get("photos")), metadata.get("photo_names")
-    if isinstance(names, list) and any("search_radius_px" in _mapping(p) for p in photos.values()):
-        found["search_radius_px"] = [
-            _mapping(photos.get(str(name))).get("search_radius_px") for name in names
-        ]
-        details["photos"] = {
-            name: _without(_mapping(entry), "search_radius_px") for name, entry in photos.items()
-        }
-    return found | {"details": details}
-
-
-def _wall_of_version_2(wall: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    return _without(wall, "normal") | {"normal_world": wall["normal"]}
-
-
-def _mapping(value: JsonValue) -> dict[str, JsonValue]:
-    """Give a JSON object; empty where there is none."""
-    return value if isinstance(value, dict) else {}
-
-
-def _without(entries: Mapping[str, JsonValue], name: str) -> dict[str, JsonValue]:
-    return {key: value for key, value in entries.items() if key != name}
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:

@@ -191,23 +191,6 @@ class Planes(Product):
                 f"{count}"
             )
 
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Move what stood in the details of version 1: tolerance, thickness, row of the scan."""
-        stored = payload.metadata.get("details")
-        details = dict(stored) if isinstance(stored, dict) else {}
-        moved: dict[str, JsonValue] = {}
-        given = [details.pop(name, None) for name in ("find_tolerance_m", "tolerance_m")]
-        for value in given:
-            if isinstance(value, float | int) and value > 0.0 and "tolerance_m" not in moved:
-                moved["tolerance_m"] = float(value)
-        for name in ("thickness", "scan_row"):
-            value = details.pop(name, None)
-            if value is not None:
-                moved[name] = value
-        metadata = {**payload.metadata, **moved, "details": details}
-        return super().upgraded(replace(payload, metadata=metadata))
-
     def to_payload(self) -> Payload:
         """Give the planes as arrays and JSON; what all planes share is said once."""
         payload = super().to_payload()

@@ -71,13 +71,11 @@ class Product:
 
     Attributes:
         type_name: identity in workflows, store and record; never changes.
-        encoding_version: raised when the fields change; `upgraded` reads the older ones.
+        encoding_version: raised when the fields change.
         mapped: store contiguous and memory-map on reading (for products of scan size; any product
             of more than 1 GiB is).
         embedded: put the arrays into the record, not only their digest.
         tolerances: field name -> how far replays may differ; fields not named must be equal.
-        items: name of the field, a tuple, whose entries a method may map over; empty for none.
-        item_name: name of the field of an entry that says which one it is, for people.
     """
 
     type_name: ClassVar[str]
@@ -85,8 +83,6 @@ class Product:
     mapped: ClassVar[bool] = False
     embedded: ClassVar[bool] = True
     tolerances: ClassVar[Mapping[str, Tolerance]] = {}
-    items: ClassVar[str] = ""
-    item_name: ClassVar[str] = "name"
 
     def to_payload(self) -> Payload:
         """Give the product as named arrays and JSON; arrays are not copied."""
@@ -117,36 +113,22 @@ class Product:
         """Build the product again from `to_payload`'s result; arrays are not copied.
 
         Raises:
-            ProductError: the payload is of another type, of a newer encoding, or incomplete.
+            ProductError: the payload is of another type, of another encoding, or incomplete.
         """
         if payload.type_name != cls.type_name:
             raise ProductError(f"expected a {cls.type_name} product, got {payload.type_name}")
-        if payload.encoding_version > cls.encoding_version:
+        if payload.encoding_version != cls.encoding_version:
             raise ProductError(
                 f"{cls.type_name} has encoding version {payload.encoding_version}, this orthoflow "
-                f"reads version {cls.encoding_version} and older: use the orthoflow that wrote it"
+                f"reads version {cls.encoding_version}: use the orthoflow that wrote it"
             )
-        stored = payload.encoding_version
-        if stored < cls.encoding_version:
-            payload = cls.upgraded(payload)
         try:
             return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
         except _LackingFieldsError as error:
-            # Whoever mends it is the author of the class: a record that is read is sealed.
             raise ProductError(
-                f"{error}: it has encoding_version {stored}, {cls.__name__} has "
-                f"{cls.encoding_version}; give new fields a default, or let "
-                f"{cls.__name__}.upgraded fill them in for versions below"
+                f"{error}: raise the encoding_version of {cls.__name__}, which is "
+                f"{cls.encoding_version}, with its fields"
             ) from error
-
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Give a payload of an older encoding as the present one has it.
-
-        Fields that are new have defaults, which are taken; a subclass moves what stood elsewhere
-        before. It is not asked where the version is the present one: raise that with the fields.
-        """
-        return dataclasses.replace(payload, encoding_version=cls.encoding_version)
 
 
 def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:

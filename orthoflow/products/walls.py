@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import ClassVar, Final, Literal
 
@@ -17,7 +17,7 @@ from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
-from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
+from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
 # Percentiles of larger rasters are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 25
@@ -142,7 +142,6 @@ class Walls(Product):
         "v_world": Tolerance(limit=1e-6, unit="1"),
         "normal_world": Tolerance(limit=1e-6, unit="1"),
     }
-    items: ClassVar[str] = "walls"
 
     walls: tuple[Wall, ...]
     up: NDArray[np.float64]
@@ -198,18 +197,6 @@ class Walls(Product):
         density = n_points / n_known if n_known else 1.0
         return wall.frame.gsd_m / math.sqrt(max(density, 0.1))
 
-    @classmethod
-    def upgraded(cls, payload: Payload) -> Payload:
-        """Move the percentiles, which stood in the details before version 2."""
-        metadata = dict(payload.metadata)
-        details = metadata.get("details")
-        if payload.encoding_version < 2 and isinstance(details, dict):
-            metadata["details"] = {
-                name: value for name, value in details.items() if name != "percentiles"
-            }
-            metadata["percentiles"] = details.get("percentiles", [])
-        return super().upgraded(replace(payload, metadata=metadata))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
@@ -260,8 +247,6 @@ class Layers(Product):
         "quality": Tolerance(limit=1e-3, unit="1"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
     }
-    items: ClassVar[str] = "layers"
-    item_name: ClassVar[str] = "source"
 
     layers: tuple[Layer, ...]
     names: tuple[str, ...] = ()
@@ -351,7 +336,6 @@ class Orthoimages(Product):
         "error_m": Tolerance(limit=1e-4, unit="m"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
     }
-    items: ClassVar[str] = "images"
 
     images: tuple[Orthoimage, ...]
     icc_profile: bytes | None = None

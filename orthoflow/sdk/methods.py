@@ -6,15 +6,14 @@ import dataclasses
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar, Final, Literal, Union, dataclass_transform
 
 from pydantic import BaseModel, ConfigDict
 
-from orthoflow.errors import MethodError, PluginError
-from orthoflow.products.product import Product
+from orthoflow.errors import PluginError
 from orthoflow.sdk.context import Metric, StepContext
 from orthoflow.sdk.lines import is_name, one_line
 from orthoflow.sdk.units import unit_of
@@ -87,32 +86,6 @@ def port_specs(ports: type[Ports]) -> dict[str, PortSpec]:
     return specs
 
 
-class Part(Product):
-    """Base of what a method that maps gives for some of the items: a frozen dataclass, as products.
-
-    It lies on the disk for as long as the step runs, and nobody else ever sees it.
-    """
-
-    type_name: ClassVar[str] = "part"
-    mapped: ClassVar[bool] = True
-    embedded: ClassVar[bool] = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class MappedPort:
-    """Where the items are that a method maps over.
-
-    Attributes:
-        port: the input port.
-        field: of its product, a tuple with an entry per item.
-        item_name: field of an entry that names it.
-    """
-
-    port: str
-    field: str
-    item_name: str
-
-
 @dataclass(frozen=True)
 class MetricSpec:
     """A metric that a method may report.
@@ -163,10 +136,7 @@ class MetricSpec:
 class Method:
     """Base of all methods.
 
-    A method implements `run`. One that does the same to every photo, wall or other item may name
-    the input port of the items in `maps_over` and implement `run_part` and `join` instead: `run`
-    is then the join of one part with all items, and the engine may compute several parts on
-    several machines.
+    A method implements `run`.
 
     Attributes:
         id: `kind.method`.
@@ -184,9 +154,6 @@ class Method:
         Params: parameters.
         In: input ports.
         Out: output ports.
-        maps_over: input port whose product's `items` may be computed in parts; empty for none.
-            The method draws nothing from `ctx.rng`, and gives the same whichever parts there are.
-        PartOut: what `run_part` gives; only of a method that maps.
     """
 
     id: ClassVar[str]
@@ -199,8 +166,6 @@ class Method:
     Params: ClassVar[type[MethodParams]]
     In: ClassVar[type[Ports]]
     Out: ClassVar[type[Ports]]
-    maps_over: ClassVar[str] = ""
-    PartOut: ClassVar[type[Part]]
 
     # Any: each method narrows inputs and params to its own nested classes, which no common
     # supertype can express without making every author write three type parameters.
@@ -218,45 +183,7 @@ class Method:
         Raises:
             OrthoflowError: no result is possible; one sentence states why.
         """
-        mapped = mapped_port(type(self))
-        if mapped is None:
-            raise AssertionError(f"{type(self).__name__} must implement run")
-        items = range(len(getattr(getattr(inputs, mapped.port), mapped.field)))
-        return self.join(inputs, (checked_part(self, inputs, items, params, ctx),), params, ctx)
-
-    def run_part(self, inputs: Any, items: range, params: Any, ctx: StepContext) -> Any:
-        """Compute what belongs to some of the items.
-
-        Args:
-            inputs: an instance of `In`, whole.
-            items: indices of the items; a part may have all of them.
-            params: an instance of `Params`.
-            ctx: as for `run`, but metrics and figures are for `join`, which knows all parts.
-
-        Returns:
-            An instance of `PartOut`.
-
-        Raises:
-            OrthoflowError: no result is possible; one sentence states why.
-        """
-        raise AssertionError(f"{type(self).__name__} must implement run_part")
-
-    def join(self, inputs: Any, parts: Sequence[Any], params: Any, ctx: StepContext) -> Any:
-        """Make the outputs of all parts.
-
-        Args:
-            inputs: an instance of `In`, whole.
-            parts: what `run_part` gave, in the order of the items; one at least.
-            params: an instance of `Params`.
-            ctx: as for `run`.
-
-        Returns:
-            An instance of `Out`.
-
-        Raises:
-            OrthoflowError: no result is possible; one sentence states why.
-        """
-        raise AssertionError(f"{type(self).__name__} must implement join")
+        raise AssertionError(f"{type(self).__name__} must implement run")
 
     @classmethod
     def may_report(cls, metric: str) -> bool:
@@ -279,62 +206,6 @@ class Method:
     def tools(cls) -> Mapping[str, str]:
         """Return versions besides those of the libraries that the distribution requires."""
         return {}
-
-
-def mapped_port(method: type[Method]) -> MappedPort | None:
-    """Return where the items are that a method maps over; None for a method that does not.
-
-    Raises:
-        PluginError: it cannot map over what it names.
-    """
-    port = method.maps_over
-    if not port:
-        return None
-    hint = typing.get_type_hints(method.In).get(port)
-    field = getattr(hint, "items", "")
-    is_mapped = isinstance(hint, type) and issubclass(hint, Product) and bool(field)
-    part_out = getattr(method, "PartOut", None)
-    rules = {
-        f"maps_over must name an input port that is always wired and whose product has items, got "
-        f"{port!r}": is_mapped,
-        # There is one generator for a step, and no telling which part would draw from it.
-        "maps_over asks for determinism exact or loose, got seeded": (
-            method.determinism != "seeded"
-        ),
-        "maps_over asks for run_part and join in the place of run": (
-            method.run_part is not Method.run_part
-            and method.join is not Method.join
-            and method.run is Method.run
-        ),
-        "maps_over asks for a PartOut that is a subclass of Part": (
-            isinstance(part_out, type) and issubclass(part_out, Part)
-        ),
-    }
-    for rule, is_kept in rules.items():
-        if not is_kept:
-            raise PluginError(rule)
-    return MappedPort(port=port, field=field, item_name=getattr(hint, "item_name", ""))
-
-
-# Any: as for `run`.
-def checked_part(method: Method, inputs: Any, items: range, params: Any, ctx: StepContext) -> Part:
-    """Compute a part, and hold the method to what a part must be.
-
-    Raises:
-        OrthoflowError: what the method raises.
-        MethodError: the part is of another type, or something was reported that only a whole has.
-    """
-    part = method.run_part(inputs, items, params, ctx)
-    if not isinstance(part, method.PartOut):
-        raise MethodError(
-            f"method {method.id} must give its PartOut for a part, got {type(part).__name__}"
-        )
-    if ctx.metrics or ctx.figures:
-        raise MethodError(
-            f"method {method.id} reports metrics or figures of a part; it must do that in join, "
-            f"which knows all parts"
-        )
-    return part
 
 
 def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, ...]:

@@ -9,7 +9,7 @@ import re
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise, zip_longest
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -221,30 +221,6 @@ def threads_do_not_show(subject: Subject) -> None:
         require(is_same, f"output {name} depends on the number of cores")
 
 
-def parts_do_not_show(subject: Subject) -> None:
-    """One part with all items or a part for each of them give the same digest and metrics.
-
-    With determinism `loose` only the names of outputs and metrics have to agree.
-    """
-    whole, joined = subject.witness.first.run, subject.witness.in_parts
-    exact = subject.method.determinism == "exact"
-    for name, digest in whole.digests.items():
-        require(
-            name in joined.digests and (not exact or joined.digests[name] == digest),
-            f"output {name} depends on the parts that {subject.method.maps_over} came in",
-        )
-    for one, other in zip_longest(whole.metrics, joined.metrics):
-        require(
-            one is not None and other is not None and one.name == other.name,
-            f"the metrics {one and one.name} and {other and other.name} depend on the parts",
-        )
-        # Times differ, however a step is computed.
-        require(
-            not exact or one.unit == "s" or one.value == other.value,
-            f"metric {one.name} depends on the parts: {one.value:g} of a whole, {other.value:g}",
-        )
-
-
 def _cloud_ports(method: type[Method]) -> Iterator[str]:
     yield from (name for name, port in port_specs(method.In).items() if port.type_name == "cloud")
 
@@ -362,10 +338,6 @@ def _is_reproducible(method: type[Method]) -> bool:
     return method.determinism != "loose"
 
 
-def _maps(method: type[Method]) -> bool:
-    return bool(method.maps_over)
-
-
 def _makes_its_own(method: type[Method]) -> bool:
     return any(port.type_name not in _OURS for port in port_specs(method.Out).values())
 
@@ -405,7 +377,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(nothing_is_written_outside_scratch, _always, is_quick=False),
     _check(results_repeat, _always, is_quick=False),
     _check(threads_do_not_show, _is_reproducible),
-    _check(parts_do_not_show, _maps, is_quick=False),
     _check(progress_never_goes_back, _always),
     _check(cancel_is_honoured, _always),
     _check(empty_cloud_is_refused, _takes_a_cloud),

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from orthoflow.engine.store import Store, digest_of
+from orthoflow.engine.store import digest_of
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, Metric, StepContext, StepEvent
 from orthoflow.sdk.context import Drawing, DrawnFigure
-from orthoflow.sdk.methods import checked_part, mapped_port
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,31 +92,6 @@ def run_trial(
     method = trial.method
     returned = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     return _what_came(method, returned, ctx, events)
-
-
-def run_trial_in_parts(trial: Trial, folder: Path) -> TrialRun:
-    """Run a method that maps with a part for each item, kept in a store before they are joined.
-
-    Args:
-        trial: what to run.
-        folder: takes the store and the scratch folders.
-
-    Raises:
-        OrthoflowError: what the method raises.
-        AssertionError: the method returned something that is not its `Out`.
-    """
-    method, store = trial.method, Store(folder / "store", workspace=folder / "aside")
-    mapped = mapped_port(method)
-    assert mapped is not None  # noqa: S101 - only such methods are run so
-    inputs, params = method.In(**trial.inputs), method.Params(**trial.params)
-    items = getattr(getattr(inputs, mapped.port), mapped.field)
-    parts = []
-    for item in range(len(items)):
-        ctx, _ = _context(trial, folder / f"part-{item}", draws=False)
-        part = checked_part(method(), inputs, range(item, item + 1), params, ctx)
-        parts.append(store.get_product(store.put_product(part).digest, method.PartOut))
-    ctx, events = _context(trial, folder / "joined", draws=False)
-    return _what_came(method, method().join(inputs, parts, params, ctx), ctx, events)
 
 
 def _context(

@@ -16,7 +16,7 @@ from orthoflow.products import Product
 from orthoflow.sdk import Method
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.isolation import ElsewhereRun, run_elsewhere
-from orthoflow.testing.trials import Trial, TrialRun, run_trial, run_trial_in_parts
+from orthoflow.testing.trials import Trial, TrialRun, run_trial
 
 Array = NDArray[np.generic]
 
@@ -73,12 +73,6 @@ class Witness:
     def on_two_cores(self) -> TrialRun:
         """The same on two cores."""
         return _run(replace(self.trial, cores=2))
-
-    @cached_property
-    def in_parts(self) -> TrialRun:
-        """The same with a part for each item, of a method that maps."""
-        with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
-            return run_trial_in_parts(self.trial, Path(folder))
 
     @cached_property
     def elsewhere(self) -> ElsewhereRun:

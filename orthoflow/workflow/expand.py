@@ -10,7 +10,6 @@ import heapq
 import itertools
 import json
 import math
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -110,19 +109,6 @@ class Cell:
     def sources(self) -> tuple[str, ...]:
         """Addresses of the cells that it takes products of."""
         return tuple(one.address for one in self.inputs.values() if isinstance(one, CellOutput))
-
-
-def compared_cells(cells: Iterable[Cell]) -> frozenset[str]:
-    """Return the addresses of cells whose times stand beside each other: variants and repeats.
-
-    Those of one step on one dataset; what differs in its data alone is no comparison of methods.
-    """
-    similar: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
-    for cell in cells:
-        similar[cell.step, cell.assignment.get(DATA, "")].append(cell.address)
-    return frozenset(
-        address for addresses in similar.values() if len(addresses) > 1 for address in addresses
-    )
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:

@@ -403,11 +403,6 @@ CHANGES = {
         "is labels in kind plane, but orthoflow.products.planes:Planes says type_name 'planes'",
     ),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
-    "no items to map over": (
-        "    Params",
-        "    maps_over = 'cloud'\n    Params",
-        "maps_over must name an input port that is always wired and whose product has items",
-    ),
     "name lacks": ("class Mine(", "class Yours(", "_class has no Mine"),
     "import fails": ("from orthoflow.sdk", "import no_such_library\nfrom orthoflow.sdk", "No mod"),
 }
@@ -451,10 +446,8 @@ def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"items": "wals"}, "items of Own names wals, which is no field (did you mean walls?)"),
-        ({"item_name": "nam"}, "item_name of Own names nam, which is no field"),
         ({"tolerances": {"rbg": 1}}, "tolerances of Own names rbg, which is no field"),
-        ({"items": "walls", "tolerances": {"depth_m": 1, "gsd_m": 1}}, ""),
+        ({"tolerances": {"depth_m": 1, "gsd_m": 1}}, ""),
     ],
 )
 def test_names_in_a_product_are_those_of_its_fields(

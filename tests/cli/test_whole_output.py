@@ -398,7 +398,6 @@ def test_a_method_is_shown_with_ports_and_parameters() -> None:
         "target": "laboratory.methods:Ransac",
         "result_version": 1,
         "determinism": "seeded",
-        "maps_over": "",
         "citations": [],
         "params": [
             {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 
 from orthoflow.engine.events import CellStarted, RunEvent
 from orthoflow.engine.garbage import collect_garbage
-from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.soundness import check_store
 from orthoflow.engine.store import Store
@@ -190,43 +188,6 @@ def test_a_result_file_that_is_damaged_is_set_aside(world: World) -> None:
     assert path.read_text() != text
     again = run(world, STEPS, into="again")
     assert (computed(again), again.damaged) == ({"noise"}, {"noise": "result file"})
-
-
-# Stores of versions that kept no digests ----------------------------------------------------------
-
-
-def make_earlier(store: Store) -> None:
-    """Make a store what the version before wrote: no digest but in names."""
-    for path in store.results.iterdir():
-        result: CellResult = result_from_json(path.read_text(), path.name)
-        content = json.loads(result_to_json(result))
-        del content["sha256"]
-        path.write_text(json.dumps({**content, "format": "orthoflow/result/1"}))
-    for path in store.objects.glob("*/object.json"):
-        content = json.loads(path.read_text())
-        size = (path.parent / "product.h5").stat().st_size
-        earlier = {"type": content["type"], "size_bytes": size, "publisher": content["publisher"]}
-        path.write_text(json.dumps(earlier))
-
-
-def test_a_store_of_the_version_before_is_taken_over(world: World) -> None:
-    first = run(world, STEPS)
-    make_earlier(world.store)
-    again = run(world, STEPS + MORE, into="again", force=("noise",))
-    assert (again.damaged, computed(again)) == ({}, {"noise", "more"})
-    assert check_store(world.store).damaged == ()
-    assert {**digests(again), **digests(first)} == digests(again)
-    flip(product_file(world, first, "scan"))
-    assert len(check_store(world.store).damaged) == 2  # the product, and its result
-
-
-def test_damage_in_a_store_of_the_version_before_is_found_by_content(world: World) -> None:
-    first = run(world, STEPS)
-    make_earlier(world.store)
-    flip(product_file(world, first, "scan"))
-    again = run(world, STEPS, into="again", force=("means",))
-    assert again.damaged == {"scan": "product file"}
-    assert digests(again) == digests(first)
 
 
 # Reading without a run ----------------------------------------------------------------------------

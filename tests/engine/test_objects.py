@@ -16,7 +16,6 @@ from orthoflow.engine.objects import (
     PRODUCT,
     PUBLISHED,
     CheckedFiles,
-    EarlierProduct,
     ObjectFile,
     StoredProduct,
     describe_product,
@@ -97,14 +96,6 @@ def test_an_object_says_which_files_it_has(folder: Path) -> None:
     assert read_description(folder) is None
     (folder / DESCRIPTION).unlink()
     assert read_description(folder) is None
-
-
-def test_an_object_of_an_earlier_version_has_its_product(folder: Path) -> None:
-    text = '{"type": "heights", "size_bytes": 7, "publisher": "p0"}'
-    (folder / DESCRIPTION).write_text(text)
-    found = read_description(folder)
-    assert found == EarlierProduct(type="heights", size_bytes=7, publisher="p0")
-    assert files_of(folder) == {PRODUCT: ObjectFile(size_bytes=7, sha256="")}
 
 
 def test_want_of_open_files_says_nothing_of_an_object(

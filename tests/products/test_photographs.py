@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 
 from orthoflow.errors import ProductError
 from orthoflow.products import (
-    Camera,
     Cameras,
     Intrinsics,
     JsonValue,
-    Payload,
     ResidualRow,
     TieRole,
     Ties,
@@ -50,14 +47,6 @@ def ties(**more: object) -> Ties:
     )
 
 
-def old_tie_metadata(details: dict[str, JsonValue]) -> dict[str, JsonValue]:
-    """Metadata of ties as version 1 had them."""
-    arrays: dict[str, JsonValue] = {
-        name: {"$array": "numeric"} for name in ties().to_payload().arrays
-    }
-    return {"photo_names": ["a.jpg", "b.jpg"], **arrays, "details": details}
-
-
 OLD_DETAILS: dict[str, JsonValue] = {
     "photos": {
         "a.jpg": {"n_key_points": 812, "search_radius_px": 22.0},
@@ -73,89 +62,12 @@ OLD_DETAILS: dict[str, JsonValue] = {
         }
     ],
 }
-NEW_DETAILS = {
-    "photos": {"a.jpg": {"n_key_points": 812}, "b.jpg": {"n_key_points": 40}},
-    "intensity_source": "laser",
-}
 
 
 def test_ties_come_back_with_what_they_say_of_walls_and_of_the_search() -> None:
     given = ties(walls=(WALL,), search_radius_px=(22.0, None))
     found = Ties.from_payload(given.to_payload())
     assert (found.walls, found.search_radius_px) == ((WALL,), (22.0, None))
-
-
-def test_ties_of_version_1_hand_over_what_their_details_had() -> None:
-    payload = Payload(
-        type_name="ties",
-        encoding_version=1,
-        metadata=old_tie_metadata(OLD_DETAILS),
-        arrays=ties().to_payload().arrays,
-    )
-    found = Ties.from_payload(payload)
-    assert found.walls == (WALL,)
-    assert found.search_radius_px == (22.0, None)
-    assert found.details == NEW_DETAILS
-    np.testing.assert_array_equal(found.pixels_photo, ties().pixels_photo)
-
-
-@pytest.mark.parametrize(
-    "details",
-    [{}, {"photos": ["a.jpg"], "walls": "two"}, {"walls": [{"gsd_m": 0.01}]}],
-    ids=["nothing", "other-words", "half-a-wall"],
-)
-def test_ties_of_version_1_keep_details_that_mean_something_else(
-    details: dict[str, JsonValue],
-) -> None:
-    payload = Payload(
-        type_name="ties",
-        encoding_version=1,
-        metadata=old_tie_metadata(details),
-        arrays=ties().to_payload().arrays,
-    )
-    found = Ties.from_payload(payload)
-    assert (found.walls, found.search_radius_px, found.details) == ((), (), details)
-
-
-def test_cameras_of_version_1_hand_over_their_table_and_the_facts_of_their_ties() -> None:
-    refused = Camera(photo="b.jpg", status="only 3 ties, 8 are needed")
-    rows: list[JsonValue] = [ROW | NUMBERS | {"shift_p": None}, ROW | NUMBERS | {"shift_p": 0.5}]
-    payload = Payload(
-        type_name="cameras",
-        encoding_version=1,
-        metadata={
-            "cameras": [{"photo": refused.photo, "status": refused.status}],
-            "ties": old_tie_metadata(OLD_DETAILS),
-            "details": {"residual_table": rows, "sigma0": 1.25},
-        },
-        arrays={f"ties/{name}": array for name, array in ties().to_payload().arrays.items()},
-    )
-    found = Cameras.from_payload(payload)
-    assert found.cameras == (refused,)
-    assert [row.shift_p for row in found.residual_table] == [None, 0.5]
-    assert dataclasses.asdict(found.residual_table[1]) == {
-        **ROW,
-        **NUMBERS,
-        "shift_p": 0.5,
-        "skewness": None,
-        "beyond_cells": None,
-    }
-    assert found.details == {"sigma0": 1.25}
-    assert found.ties is not None
-    assert (found.ties.walls, found.ties.search_radius_px) == ((WALL,), (22.0, None))
-    assert found.ties.details == NEW_DETAILS
-
-
-def test_a_table_of_other_rows_stays_where_it_was() -> None:
-    details: dict[str, JsonValue] = {"residual_table": [{"photo": "a.jpg", "u": 0.5}]}
-    payload = Payload(
-        type_name="cameras",
-        encoding_version=1,
-        metadata={"cameras": [], "details": details},
-        arrays={},
-    )
-    found = Cameras.from_payload(payload)
-    assert (found.residual_table, found.details, found.ties) == ((), details, None)
 
 
 def test_the_table_of_residuals_comes_back() -> None:
@@ -173,19 +85,6 @@ def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
     found = TieWall.of(wall)
     assert (found.name, found.gsd_m, found.normal_world) == ("north", 0.01, (0.0, -1.0, 0.0))
     np.testing.assert_array_equal(found.corners_world, frame.corners_world())
-
-
-def test_upgrading_leaves_the_older_payload_as_it_was() -> None:
-    metadata = old_tie_metadata({"photos": {"a.jpg": {"search_radius_px": 22.0}}})
-    before = json.dumps(metadata)
-    payload = Payload(
-        type_name="ties",
-        encoding_version=1,
-        metadata=metadata,
-        arrays=ties().to_payload().arrays,
-    )
-    assert Ties.from_payload(payload).search_radius_px == (22.0, None)
-    assert json.dumps(metadata) == before
 
 
 def test_walls_and_radii_of_another_shape_are_refused() -> None:

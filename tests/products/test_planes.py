@@ -9,8 +9,6 @@ import pytest
 
 from orthoflow.errors import ProductError
 from orthoflow.products import (
-    JsonValue,
-    Payload,
     Planes,
     ScanRow,
     Spread,
@@ -28,77 +26,6 @@ def two_planes() -> Planes:
         rms_m=np.array([0.002, 0.003]),
         names=("wall 0", "floor"),
     )
-
-
-def of_version_1(details: dict[str, JsonValue]) -> Payload:
-    """What version 1 wrote: facts that others read stood in the details."""
-    payload = two_planes().to_payload()
-    metadata = {
-        name: value
-        for name, value in payload.metadata.items()
-        if name not in {"tolerance_m", "thickness", "scan_row"}
-    }
-    return replace(payload, encoding_version=1, metadata={**metadata, "details": details})
-
-
-def test_planes_of_version_1_say_in_fields_what_stood_in_their_details() -> None:
-    fabric: dict[str, JsonValue] = {
-        "name": "fabric", "low": 0.0, "high": 0.3, "n_points": 70, "sigma_m": 0.004,
-    }  # fmt: skip
-    by_angle: dict[str, JsonValue] = {"low": 10.0, "high": 20.0, "n_points": 90, "sigma_m": 0.002}
-    planes = Planes.from_payload(
-        of_version_1(
-            {
-                "find_tolerance_m": 0.03,
-                "fit_tolerance_m": 0.01,
-                "thickness": [
-                    {
-                        "sigma_m": 0.002,
-                        "width_95_m": 0.008,
-                        "scan_step_m": 0.005,
-                        "incidence_deg": [by_angle],
-                        "material": [fabric],
-                    },
-                    None,
-                ],
-                "scan_row": {"row": 7, "scan": 1, "n_points": 40, "sigma_m": None},
-            }
-        )
-    )
-    assert planes.tolerance_m == 0.03
-    assert planes.thickness == (
-        Thickness(
-            sigma_m=0.002,
-            width_95_m=0.008,
-            scan_step_m=0.005,
-            incidence_deg=(Spread(low=10.0, high=20.0, n_points=90, sigma_m=0.002),),
-            material=(Spread(low=0.0, high=0.3, n_points=70, sigma_m=0.004, name="fabric"),),
-        ),
-        None,
-    )
-    assert planes.scan_row == ScanRow(row=7, scan=1, n_points=40)
-    assert planes.details == {"fit_tolerance_m": 0.01}
-
-
-@pytest.mark.parametrize(
-    ("details", "tolerance_m"),
-    [
-        ({}, 0.05),
-        ({"tolerance_m": 0.02}, 0.02),
-        ({"tolerance_m": 0.02, "find_tolerance_m": 0.04}, 0.04),
-        ({"tolerance_m": -1.0}, 0.05),
-        ({"tolerance_m": "wide"}, 0.05),
-        ({"thickness": None, "scan_row": None}, 0.05),
-    ],
-)
-def test_the_tolerance_of_version_1_is_that_of_the_paper_unless_it_was_stated(
-    details: dict[str, JsonValue], tolerance_m: float
-) -> None:
-    planes = Planes.from_payload(of_version_1(details))
-    assert planes.tolerance_m == tolerance_m
-    assert planes.thickness == ()
-    assert planes.scan_row is None
-    assert planes.details == {}
 
 
 def test_what_was_measured_on_planes_comes_back_as_it_was() -> None:

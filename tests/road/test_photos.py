@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import laspy
@@ -14,17 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 import orthoflow
-from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.plan import RunOptions, plan_run
-from orthoflow.engine.scheduler import execute
-from orthoflow.engine.store import Store
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
 from orthoflow.records.runs import Run
-from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.expand import expand_cells
 from tests.long_loops import IS_LONG
-from tests.road.conftest import ROOT, Ended, Shell, metrics_of
+from tests.road.conftest import Ended, Shell, metrics_of
 from tests.scan_files import write_las
 
 # A third of the shipped recipe's cells, and of its points of the main wall, fewer of the others;
@@ -78,29 +71,6 @@ def test_the_orthoimages_of_the_simulated_room_are_true(quick: Shell) -> None:
 def test_a_second_run_comes_from_the_cache(quick: Shell, again: Ended) -> None:
     assert "all 10 steps were cached" in again.out
     assert quick("verify", "again").code == 0
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="larger pictures: .ci/run --long")
-@pytest.mark.parametrize("how", [{"jobs": 2, "parts": 3}, {"executor": "dask", "jobs": 4}])
-def test_steps_in_parts_give_the_same_digests(quick: Shell, how: dict[str, Any]) -> None:
-    whole = orthoflow.open_run(quick.folder / "run").cells
-    store, catalog = Store(quick.store), discover_catalog()
-    settings = [text for text in SMALL if text != "--set"]
-    workflow = load_workflow(ROOT / "workflows" / "quickstart.yaml", catalog, sets=settings)
-    steps = ("ties", "reties", "ortho")
-    options = RunOptions(force=steps, until=("ortho",), **how)
-    plan = plan_run(expand_cells(workflow, catalog), workflow, catalog, store, options)
-    outcome = execute(plan, quick.folder / f"parts-{options.executor}", store)
-    for step in steps:
-        result = outcome.results[step]
-        assert result.status == "ok", result.error_message
-        assert "part 2 of " in result.log
-        for port, product in whole[step].outputs.items():
-            assert result.outputs[port].digest == product.digest
-        told = {metric.name: metric.value for metric in result.metrics if metric.unit != "s"}
-        said = {metric.name: metric.value for metric in whole[step].metrics if metric.unit != "s"}
-        assert told == said
 
 
 def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import CancelledStepError, PluginError, ProductError
-from orthoflow.products import Photos, Planes, PointCloud
+from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import (
     Method,
     Metric,
     MetricSpec,
-    Part,
     Ports,
     StepContext,
     StepEvent,
     port_specs,
 )
-from orthoflow.sdk.methods import MappedPort, labelled, mapped_port
+from orthoflow.sdk.methods import labelled
 
 
 class Inputs(Ports):
@@ -46,49 +45,6 @@ def test_ports_are_read_from_annotations() -> None:
 def test_a_port_that_carries_no_product_is_refused() -> None:
     with pytest.raises(PluginError, match=r"Wrong.cloud must be annotated with a product class"):
         port_specs(Wrong)
-
-
-class Shots(Ports):
-    photos: Photos
-    more: Photos | None = None
-    planes: Planes
-
-
-class Mapping(Method):
-    id = "tell.photos"
-    In = Shots
-    maps_over = "photos"
-    PartOut = Part
-
-    def run_part(self, inputs: Shots, items: range, params: object, ctx: StepContext) -> Part:
-        return Part()
-
-    def join(self, inputs: Shots, parts: object, params: object, ctx: StepContext) -> object:
-        return parts
-
-
-def test_a_method_says_what_it_maps_over() -> None:
-    assert mapped_port(Mapping) == MappedPort(port="photos", field="photos", item_name="name")
-    assert mapped_port(Method) is None
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"maps_over": "more"}, "whose product has items, got 'more'"),
-        ({"maps_over": "planes"}, "whose product has items, got 'planes'"),
-        ({"maps_over": "walls"}, "whose product has items, got 'walls'"),
-        ({"determinism": "seeded"}, "asks for determinism exact or loose, got seeded"),
-        ({"run": Mapping.join}, "run_part and join in the place of run"),
-        ({"join": Method.join}, "run_part and join in the place of run"),
-        ({"run_part": Method.run_part}, "run_part and join in the place of run"),
-        ({"PartOut": Photos}, "a PartOut that is a subclass of Part"),
-        ({"PartOut": None}, "a PartOut that is a subclass of Part"),
-    ],
-)
-def test_a_method_that_cannot_map_is_refused(changes: dict[str, object], said: str) -> None:
-    with pytest.raises(PluginError, match=said):
-        mapped_port(type("Wrong", (Mapping,), changes))
 
 
 def test_ports_are_frozen_and_take_keywords_only() -> None:

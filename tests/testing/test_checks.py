@@ -26,9 +26,6 @@ from orthoflow.products import (
 from orthoflow.sdk import Method, MethodParams, Metric, Ports, StepContext
 from orthoflow.testing import checks
 from orthoflow.testing.examples import example_room, few_points
-from orthoflow.testing.trials import Trial
-from orthoflow.testing.witnesses import Subject, Witness
-from tests.engine_world import toy_world
 
 
 class Finding(Method):
@@ -293,29 +290,6 @@ def test_refusing_without_a_word_is_no_refusal() -> None:
 def test_a_rule_is_about_the_methods_that_it_names(name: str, methods: set[type[Method]]) -> None:
     (check,) = (check for check in checks.CHECKS if check.name == name)
     assert {method for method in (Finding, Guessing, Posing) if check.applies(method)} == methods
-
-
-def test_parts_that_show_are_noticed(tmp_path: Path) -> None:
-    with toy_world(tmp_path):
-        from toy_plugin.products import Row, Rows
-        from toy_plugin.works import Seen, Sums
-
-        class Counting(Sums):
-            def join(self, inputs: Any, parts: Any, params: Any, ctx: StepContext) -> Any:
-                ctx.metric("n_parts", len(parts), "1")
-                return super().join(inputs, parts, params, ctx)
-
-        rows = Rows(rows=tuple(Row(name=f"{n}", values=np.ones(n, np.float32)) for n in range(3)))
-
-        def check(method: type[Method]) -> None:
-            trial = Trial(method=method, inputs={"rows": rows})
-            checks.parts_do_not_show(Subject(witness=Witness(trial), folder=tmp_path))
-
-        check(Sums)
-        with pytest.raises(AssertionError, match="output numbers depends on the parts that rows"):
-            check(Seen)
-        with pytest.raises(AssertionError, match="n_parts depends on the parts: 1 of a whole, 3"):
-            check(Counting)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,6 @@ from orthoflow.workflow.expand import (
     Selection,
     WorkflowInput,
     check_step_names,
-    compared_cells,
     derive_seed,
     expand_cells,
 )
@@ -445,22 +444,6 @@ def test_cells_carry_what_the_file_asks_for(catalog: Catalog, write: Path) -> No
     assert (bundle.method, bundle.cores, bundle.timeout_s) == ("orient.bundle", 2, 1800.0)
     assert cells["wall@plane=ransac"].params == {"gsd_m": 1.0}
     assert cells["wall@plane=ransac"].params_set == {"gsd_m": 1}
-
-
-def test_cells_of_one_step_on_one_dataset_are_compared() -> None:
-    def cell(address: str, step: str, **assignment: str) -> Cell:
-        return Cell(address=address, step=step, method="x.y", assignment=assignment)
-
-    cells = [
-        cell("scan", "scan"),
-        cell("plane", "plane", data="hall", plane="a"),
-        cell("plane#1", "plane", data="hall", plane="a"),
-        cell("plane@court", "plane", data="court", plane="a"),
-        cell("wall@a", "wall", plane="a"),
-        cell("wall@b", "wall", plane="b"),
-    ]
-    assert compared_cells(cells) == {"plane", "plane#1", "wall@a", "wall@b"}
-    assert compared_cells(cells[:2]) == frozenset()
 
 
 @pytest.mark.parametrize(("design", "n_cells"), [("one-at-a-time", 7), ("product", 8)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final, Literal
 
@@ -20,7 +19,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Part, Ports, StepContext
+from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
@@ -45,30 +44,6 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedImage:
-    """What one orthoimage shares with the intensity of its wall.
-
-    Attributes:
-        place: index of the orthoimage.
-        pairs: of it.
-        floor: of the intensity with itself.
-        quality: what else is found of it.
-    """
-
-    place: int
-    pairs: KeyPairs
-    floor: KeyPairs
-    quality: tuple[Finding, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedImages(Part):
-    """Some of the orthoimages; empty where the walls hold nothing to compare with."""
-
-    images: tuple[ComparedImage, ...]
 
 
 class InspectSurf(Method):
@@ -146,43 +121,19 @@ class InspectSurf(Method):
 
         inspection: Inspection
 
-    maps_over: ClassVar[str] = "orthoimages"
-    PartOut: ClassVar[type[Part]] = ComparedImages
-
-    def run_part(
-        self, inputs: In, items: range, params: Params, ctx: StepContext
-    ) -> ComparedImages:
-        """Compare wall by wall."""
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Compare wall by wall, and put all walls together."""
         images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
-        compared = []
-        for nth, place in enumerate(items if _unfit(inputs) is None else ()):
-            image = images[place]
-            ctx.progress(nth / len(items), image.name)
-            wall = wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid"))
-            comparison = _Comparison(inputs.cameras, params.radius_cells, ctx.cores)
-            verdict = comparison.of(image, wall)
-            compared.append(
-                ComparedImage(
-                    place=place, pairs=verdict.pairs, floor=verdict.floor, quality=verdict.quality
-                )
-            )
-        return ComparedImages(images=tuple(compared))
-
-    def join(
-        self, inputs: In, parts: Sequence[ComparedImages], params: Params, ctx: StepContext
-    ) -> Out:
-        """Put all walls together."""
-        images = on_walls(inputs.orthoimages, inputs.walls).images
         reason = _unfit(inputs)
-        verdicts = [
-            _Verdict(
-                image=images[item.place], pairs=item.pairs, floor=item.floor, quality=item.quality
+        verdicts: list[_Verdict] = []
+        for place, image in enumerate(images if reason is None else ()):
+            ctx.progress(place / len(images), image.name)
+            wall = wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid"))
+            verdicts.append(
+                _Comparison(inputs.cameras, params.radius_cells, ctx.cores).of(image, wall)
             )
-            for part in parts
-            for item in part.images
-        ]
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)

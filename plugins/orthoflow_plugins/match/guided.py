@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Part, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.hand_ties import (
     is_by_hand_alone,
@@ -160,12 +160,14 @@ class MatchGuided(Method):
 
         ties: Ties
 
-    maps_over: ClassVar[str] = "photos"
-    PartOut: ClassVar[type[Part]] = TracedPhotos
-    # What this very object laid out for its parts, if it computed any.
+    # What this very object laid out, if it traced photos.
     _desk: _Desk | None = None
 
-    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> TracedPhotos:
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Trace the photos on the walls, find those without a pose, and make ties."""
+        return self._ties(inputs, self._traced(inputs, params, ctx), params, ctx)
+
+    def _traced(self, inputs: In, params: Params, ctx: StepContext) -> TracedPhotos:
         """Trace oriented photos on the walls."""
         from orthoflow_plugins.match.tracing import estimated_lens, trace_photo
 
@@ -176,7 +178,7 @@ class MatchGuided(Method):
         if is_by_hand_alone(inputs.hand, walls):
             return TracedPhotos()
         oriented = _oriented(inputs.cameras)
-        indices = [index for index in items if photos[index].name in oriented]
+        indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
         if params.preset == "paper":
             ratio = largest_ratio(params.ratio)
             return _masked(inputs.photos, walls, (oriented, indices), ratio, ctx)
@@ -202,23 +204,21 @@ class MatchGuided(Method):
                 ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
         return TracedPhotos(photos=tuple(traced))
 
-    def join(
-        self, inputs: In, parts: Sequence[TracedPhotos], params: Params, ctx: StepContext
-    ) -> Out:
+    def _ties(self, inputs: In, found: TracedPhotos, params: Params, ctx: StepContext) -> Out:
         """Find the photos without a pose on what the others show, and make ties."""
         photos, walls = inputs.photos, inputs.walls
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
         if params.preset == "paper":
-            of_paper = [piece for part in parts for piece in part.pieces]
-            ties = ties_of(of_paper, photos, walls, {"intensity_source": walls.intensity_source})
+            ties = ties_of(
+                found.pieces, photos, walls, {"intensity_source": walls.intensity_source}
+            )
             _report(ctx, ties, {})
             return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-        traced = [found for part in parts for found in part.photos]
-        traces = {photos.photos[found.photo].name: found for found in traced}
+        traces = {photos.photos[one.photo].name: one for one in found.photos}
         if params.finds_missing:
-            traces |= self._recovered(inputs, traced, params, ctx)
+            traces |= self._recovered(inputs, found.photos, params, ctx)
         ties = ties_of(
             [piece for found in traces.values() for piece in found.pieces],
             photos,

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Part, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.hand_ties import (
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairedPhotos(Part):
-    """What some of the photos share with the walls.
+class PairedPhotos:
+    """What the photos share with the walls.
 
     Attributes:
         photos: of each photo, without descriptors.
@@ -163,11 +163,13 @@ class MatchSift(Method):
 
         ties: Ties
 
-    maps_over: ClassVar[str] = "photos"
-    PartOut: ClassVar[type[Part]] = PairedPhotos
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Match photos with every wall, and make ties."""
+        return self._ties(inputs, self._paired(inputs, params, ctx), params, ctx)
 
-    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PairedPhotos:
+    def _paired(self, inputs: In, params: Params, ctx: StepContext) -> PairedPhotos:
         """Match photos with every wall."""
+        items = range(len(inputs.photos.photos))
         photos, walls = inputs.photos.photos, inputs.walls
         require_photos(inputs.photos)
         if is_by_hand_alone(inputs.hand, walls):
@@ -189,21 +191,20 @@ class MatchSift(Method):
             ctx.progress(len(paired) / (len(items) + 1), photos[index].name)
         return PairedPhotos(photos=tuple(paired), walls=_undescribed(on_walls))
 
-    def join(
-        self, inputs: In, parts: Sequence[PairedPhotos], params: Params, ctx: StepContext
-    ) -> Out:
+    def _ties(self, inputs: In, found: PairedPhotos, params: Params, ctx: StepContext) -> Out:
         """Place photos that show no wall clearly with the help of the others, and make ties."""
         photos, walls = inputs.photos, inputs.walls
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
-        on_walls = parts[0].walls
+        on_walls = found.walls
         if params.preset == "paper":
-            of_paper = [piece for part in parts for piece in part.pieces]
-            ties = ties_of(of_paper, photos, walls, {"intensity_source": walls.intensity_source})
+            ties = ties_of(
+                found.pieces, photos, walls, {"intensity_source": walls.intensity_source}
+            )
             _report(ctx, ties, on_walls)
             return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-        paired = [pairs for part in parts for pairs in part.photos]
+        paired = found.photos
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
         radii_px: list[float] = []

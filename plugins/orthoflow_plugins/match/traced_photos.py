@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Self
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photo, Wall
-from orthoflow.sdk import Part
 from orthoflow_plugins.match.tie_pieces import TiePiece
 
 if TYPE_CHECKING:
@@ -82,8 +81,8 @@ class TracedPhoto:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TracedPhotos(Part):
-    """Some of the photos on the walls.
+class TracedPhotos:
+    """Photos on the walls.
 
     Attributes:
         photos: those that were traced.

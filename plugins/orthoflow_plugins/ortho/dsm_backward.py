@@ -13,13 +13,12 @@ from pydantic import Field
 
 from orthoflow.geometry.bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask
-from orthoflow.sdk import Determinism, Method, MetricSpec, Part, StepContext
+from orthoflow.sdk import Determinism, Method, MetricSpec, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
-    PaintedPart,
+    PaintedPhotos,
     count_shown,
-    total_seconds,
 )
 from orthoflow_plugins.ortho.photos_on_walls import (
     LayersOfPhotos,
@@ -30,7 +29,6 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     level_of_all,
     oriented_photos,
     pixels_of,
-    places_in_part,
 )
 
 if TYPE_CHECKING:
@@ -40,8 +38,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaintedTiles(PaintedPart):
-    """What some of the photos paint, and how they see the tiles that they paint.
+class PaintedTiles(PaintedPhotos):
+    """What the photos paint, and how they see the tiles that they paint.
 
     Attributes:
         n_cells: (n,) int64 painted cells of each tile.
@@ -110,12 +108,15 @@ class DsmBackward(Method):
 
     In = PhotosOnWalls
     Out = LayersOfPhotos
-    maps_over: ClassVar[str] = "cameras"
-    PartOut: ClassVar[type[Part]] = PaintedTiles
 
-    def run_part(
-        self, inputs: PhotosOnWalls, items: range, params: Params, ctx: StepContext
-    ) -> PaintedTiles:
+    def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
+        """Project the photos onto all walls, and put their layers in order."""
+        painted = self._painted(inputs, params, ctx)
+        out = layers_of_photos(inputs, painted, ctx)
+        _report(ctx, count_shown(inputs.walls, out.layers), painted)
+        return out
+
+    def _painted(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> PaintedTiles:
         """Take photo by photo, and lay each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -134,10 +135,8 @@ class DsmBackward(Method):
         seconds["occluders_s"] += ctx.clock_s() - started
         stack = LayerStack(inputs.walls, ctx)
         footprints: list[CellFootprint] = []
-        places = places_in_part(inputs.cameras, items)
-        for nth, place in enumerate(places):
-            (photo, camera), viewer = oriented[place], viewers[place]
-            ctx.progress(nth / len(places), photo.name)
+        for nth, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
+            ctx.progress(nth / len(oriented), photo.name)
             started = ctx.clock_s()
             pixels = pixels_of(photo, camera, level)
             decoded = ctx.clock_s()
@@ -158,14 +157,6 @@ class DsmBackward(Method):
             photo_gsd_m=np.array([tile.photo_gsd_m for tile in footprints], dtype=np.float64),
             obliquity_deg=np.array([tile.obliquity_deg for tile in footprints], dtype=np.float64),
         )
-
-    def join(
-        self, inputs: PhotosOnWalls, parts: Sequence[PaintedTiles], params: Params, ctx: StepContext
-    ) -> LayersOfPhotos:
-        """Put the layers of all photos in order."""
-        out = layers_of_photos(inputs, parts, ctx)
-        _report(ctx, count_shown(inputs.walls, out.layers), parts)
-        return out
 
 
 def _lay(
@@ -235,17 +226,17 @@ def _layer(painting: Painting, source: str, surface: Surface, wall: int) -> Laye
     )
 
 
-def _report(ctx: StepContext, counts: CellCounts, parts: Sequence[PaintedTiles]) -> None:
-    ctx.metric("n_layers", sum(len(part.layers) for part in parts), "1")
+def _report(ctx: StepContext, counts: CellCounts, painted: PaintedTiles) -> None:
+    ctx.metric("n_layers", len(painted.layers), "1")
     ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("occluded_share", counts.n_hidden / max(1, counts.n_surface), "1")
-    n_cells = np.concatenate([part.n_cells for part in parts])
-    gsds = np.concatenate([part.photo_gsd_m for part in parts])
-    angles = np.concatenate([part.obliquity_deg for part in parts])
+    n_cells = painted.n_cells
+    gsds = painted.photo_gsd_m
+    angles = painted.obliquity_deg
     ctx.metric("photo_gsd_mm", 1e3 * _weighted_median(gsds, n_cells), "mm")
     ctx.metric("obliquity_deg", _weighted_median(angles, n_cells), "deg")
     for name in ("occluders_s", "decoding_s", "painting_s"):
-        ctx.metric(name, total_seconds(parts, name), "s")
+        ctx.metric(name, painted.seconds.get(name, 0.0), "s")
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:

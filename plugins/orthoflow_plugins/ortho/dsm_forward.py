@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -22,13 +21,12 @@ from orthoflow.geometry.bands import (
 )
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask
-from orthoflow.sdk import Determinism, Method, MetricSpec, Part, StepContext
+from orthoflow.sdk import Determinism, Method, MetricSpec, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
-    PaintedPart,
+    PaintedPhotos,
     count_shown,
-    total_seconds,
 )
 from orthoflow_plugins.ortho.photos_on_walls import (
     LayersOfPhotos,
@@ -39,7 +37,6 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     level_of_all,
     oriented_photos,
     pixels_of,
-    places_in_part,
 )
 
 if TYPE_CHECKING:
@@ -87,12 +84,15 @@ class DsmForward(Method):
 
     In = PhotosOnWalls
     Out = LayersOfPhotos
-    maps_over: ClassVar[str] = "cameras"
-    PartOut: ClassVar[type[Part]] = PaintedPart
 
-    def run_part(
-        self, inputs: PhotosOnWalls, items: range, params: Params, ctx: StepContext
-    ) -> PaintedPart:
+    def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
+        """Project the photos onto all walls, and put their layers in order."""
+        painted = self._painted(inputs, params, ctx)
+        out = layers_of_photos(inputs, painted, ctx)
+        _report(ctx, count_shown(inputs.walls, out.layers), painted)
+        return out
+
+    def _painted(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> PaintedPhotos:
         """Take photo by photo, and throw each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -107,10 +107,8 @@ class DsmForward(Method):
         seconds["occluders_s"] = ctx.clock_s() - started
         surfaces = surfaces_of(inputs.walls, params, ctx)
         stack = LayerStack(inputs.walls, ctx)
-        places = places_in_part(inputs.cameras, items)
-        for nth, place in enumerate(places):
-            (photo, camera), viewer = oriented[place], viewers[place]
-            ctx.progress(nth / len(places), photo.name)
+        for nth, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
+            ctx.progress(nth / len(oriented), photo.name)
             pixels = pixels_of(photo, camera, level)
             started = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer, photo)
@@ -123,17 +121,9 @@ class DsmForward(Method):
                         stack.add(layer)
             seconds["occluders_s"] += looked - started
             seconds["painting_s"] += ctx.clock_s() - looked
-        return PaintedPart(
+        return PaintedPhotos(
             layers=tuple(stack.painted), reached=stack.reached, seconds=dict(seconds)
         )
-
-    def join(
-        self, inputs: PhotosOnWalls, parts: Sequence[PaintedPart], params: Params, ctx: StepContext
-    ) -> LayersOfPhotos:
-        """Put the layers of all photos in order."""
-        out = layers_of_photos(inputs, parts, ctx)
-        _report(ctx, count_shown(inputs.walls, out.layers), parts)
-        return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,8 +306,8 @@ def _seen(
     return seen, np.maximum(quality, 0.0)
 
 
-def _report(ctx: StepContext, counts: CellCounts, parts: Sequence[PaintedPart]) -> None:
-    painted = [layer for part in parts for layer in part.layers]
+def _report(ctx: StepContext, counts: CellCounts, photos: PaintedPhotos) -> None:
+    painted = photos.layers
     n_filled = sum(
         int(np.count_nonzero(layer.filled)) for layer in painted if layer.filled is not None
     )
@@ -326,4 +316,4 @@ def _report(ctx: StepContext, counts: CellCounts, parts: Sequence[PaintedPart]) 
     ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
     for name in ("occluders_s", "painting_s"):
-        ctx.metric(name, total_seconds(parts, name), "s")
+        ctx.metric(name, photos.seconds.get(name, 0.0), "s")

@@ -15,7 +15,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, count_known, row_bands
 from orthoflow.geometry.levels import Level
 from orthoflow.products import Layer, LayerMask, Layers, Wall, Walls
-from orthoflow.sdk import Part, StepContext
+from orthoflow.sdk import StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
@@ -53,8 +53,8 @@ class ReachedWall:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaintedPart(Part):
-    """What some of the photos paint.
+class PaintedPhotos:
+    """What the photos paint.
 
     Attributes:
         layers: photo by photo.
@@ -135,13 +135,13 @@ class LayerStack:
         self._reached[wall][...] = mask
 
 
-def joined_layers(walls: Walls, parts: Sequence[PaintedPart], ctx: StepContext) -> Layers:
+def joined_layers(walls: Walls, photos: PaintedPhotos, ctx: StepContext) -> Layers:
     """Order the layers of all photos by wall, and add an empty one for each unpainted wall.
 
     Raises:
         MethodError: no photo paints any wall.
     """
-    layers = [layer for part in parts for layer in part.layers]
+    layers = list(photos.layers)
     if not layers:
         raise MethodError(UNSEEN_WALLS)
     level: Level = np.uint16 if layers[0].rgb.dtype == np.uint16 else np.uint8
@@ -151,7 +151,7 @@ def joined_layers(walls: Walls, parts: Sequence[PaintedPart], ctx: StepContext) 
         names = ", ".join(walls.walls[place].name for place in bare)
         ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
     for place in bare:
-        reached = [found.mask for part in parts for found in part.reached if found.wall == place]
+        reached = [found.mask for found in photos.reached if found.wall == place]
         layers.append(_bare_layer(walls.walls[place], place, reached, level, ctx))
     layers.sort(key=lambda layer: layer.wall)
     return Layers(
@@ -173,11 +173,6 @@ def count_shown(walls: Walls, layers: Layers) -> CellCounts:
             n_painted += int(np.count_nonzero(is_painted))
             n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
     return CellCounts(n_surface=n_surface, n_painted=n_painted, n_hidden=n_hidden)
-
-
-def total_seconds(parts: Sequence[PaintedPart], name: str) -> float:
-    """How long something took for all photos."""
-    return sum(part.seconds.get(name, 0.0) for part in parts)
 
 
 def _bare_layer(

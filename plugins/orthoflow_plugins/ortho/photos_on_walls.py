@@ -16,7 +16,7 @@ from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import MethodParams, Ports, StepContext
-from orthoflow_plugins.ortho.layers import PaintedPart, joined_layers
+from orthoflow_plugins.ortho.layers import PaintedPhotos, joined_layers
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
@@ -136,20 +136,14 @@ def warn_of_heads(
 
 
 def layers_of_photos(
-    inputs: PhotosOnWalls, parts: Sequence[PaintedPart], ctx: StepContext
+    inputs: PhotosOnWalls, painted: PaintedPhotos, ctx: StepContext
 ) -> LayersOfPhotos:
     """Put the layers of all photos in order, with the profile of their colours."""
     oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
     warn_of_heads(inputs.walls.up, oriented, ctx)
     profile = shared_profile([photo for photo, _ in oriented], ctx)
-    layers = joined_layers(inputs.walls, parts, ctx)
+    layers = joined_layers(inputs.walls, painted, ctx)
     return LayersOfPhotos(layers=replace(layers, icc_profile=profile))
-
-
-def places_in_part(cameras: Cameras, items: range) -> list[int]:
-    """Give the places among the oriented photos of those whose cameras belong to a part."""
-    posed = [index for index, camera in enumerate(cameras.cameras) if camera.status == "ok"]
-    return [place for place, index in enumerate(posed) if index in items]
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:

@@ -1,4 +1,4 @@
-"""Photos traced in parts lie on the walls again as they lay there in the end."""
+"""Traced photos lie on the walls again as they lay there in the end."""
 
 from __future__ import annotations
 
@@ -8,24 +8,21 @@ from typing import Any
 
 import numpy as np
 from orthoflow_plugins.match.guided import MatchGuided, _laid_out, _rule
-from orthoflow_plugins.match.traced_photos import TracedPhoto, TracedPhotos
+from orthoflow_plugins.match.traced_photos import TracedPhoto
 from orthoflow_plugins.match.tracing import trace_photo
 
-from orthoflow.engine.store import Store
 from orthoflow.products import Cameras
 from orthoflow.testing.examples import example_inputs
-from orthoflow.testing.trials import Trial, run_trial, run_trial_in_parts
+from orthoflow.testing.trials import Trial, run_trial
 
 
-def test_a_photo_is_laid_on_the_walls_again(tmp_path: Path) -> None:
+def test_a_photo_is_laid_on_the_walls_again() -> None:
     inputs: Any = MatchGuided.In(**example_inputs(MatchGuided))
     desk, walls = _laid_out(inputs), inputs.walls.walls
     photo, camera = inputs.photos.photos[0], inputs.cameras.cameras[0].viewing()
     found = trace_photo(0, photo, camera, desk.targets, _rule(MatchGuided.Params(), 1), desk.before)
     assert found.n_ties
-    store = Store(tmp_path)
-    stored = store.put_product(TracedPhotos(photos=(TracedPhoto.of(found, camera),)))
-    kept = store.get_product(stored.digest, TracedPhotos).photos[0]
+    kept = TracedPhoto.of(found, camera)
     again = kept.trace(photo, walls, desk.before)
     assert (again.n_ties, again.content, again.held_out_px) == (
         found.n_ties,
@@ -41,7 +38,7 @@ def test_a_photo_is_laid_on_the_walls_again(tmp_path: Path) -> None:
             np.testing.assert_array_equal(one.v, other.v)
 
 
-def test_a_photo_without_a_pose_is_found_whichever_parts_there_are(tmp_path: Path) -> None:
+def test_a_photo_without_a_pose_is_found_by_what_others_show(tmp_path: Path) -> None:
     inputs = example_inputs(MatchGuided)
     cameras: Any = inputs["cameras"]
     lost = dataclasses.replace(
@@ -54,4 +51,3 @@ def test_a_photo_without_a_pose_is_found_whichever_parts_there_are(tmp_path: Pat
     trial = Trial(method=MatchGuided, inputs={**inputs, "cameras": missing})
     whole = run_trial(trial, tmp_path / "whole", draws=False)
     assert any("found by what other photos show" in event.text for event in whole.events)
-    assert run_trial_in_parts(trial, tmp_path / "parts").digests == whole.digests
