@@ -101,9 +101,7 @@ def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
     assert said == "its methods cannot be loaded (JSONDecodeError)"
 
 
-@pytest.mark.parametrize(
-    ("name", "least"), [("jobs", 1), ("cores", 1), ("retries", 0), ("parts", 0)]
-)
+@pytest.mark.parametrize(("name", "least"), [("jobs", 1), ("cores", 1), ("retries", 0)])
 def test_the_least_of_an_option_is_taken_and_less_is_refused(name: str, least: int) -> None:
     taken: dict[str, Any] = {name: least}
     assert getattr(RunOptions(**taken), name) == least

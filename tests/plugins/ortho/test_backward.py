@@ -458,7 +458,7 @@ def test_half_of_the_weight_lies_below_the_median(
 
 
 def test_walls_without_a_surface_have_no_share_of_anything(tmp_path: Path) -> None:
-    part: Any = SimpleNamespace(
+    painted: Any = SimpleNamespace(
         layers=(),
         n_cells=np.array([3, 1]),
         photo_gsd_m=np.array([0.002, 0.003]),
@@ -468,11 +468,11 @@ def test_walls_without_a_surface_have_no_share_of_anything(tmp_path: Path) -> No
     for n_surface, share in ((0, 0.0), (8, 0.5)):
         ctx = context(tmp_path)
         counts = CellCounts(n_surface=n_surface, n_painted=n_surface // 2, n_hidden=n_surface // 4)
-        dsm_backward._report(ctx, counts, [part, part])
+        dsm_backward._report(ctx, counts, painted)
         told = {metric.name: metric.value for metric in ctx.metrics}
         assert (told["painted_share"], told["occluded_share"]) == (share, share / 2)
         assert (told["photo_gsd_mm"], told["obliquity_deg"]) == (2.0, 10.0)
-        assert (told["n_layers"], told["painting_s"], told["decoding_s"]) == (0, 4.0, 0.0)
+        assert (told["n_layers"], told["painting_s"], told["decoding_s"]) == (0, 2.0, 0.0)
 
 
 def refused(cameras: Cameras, folder: Path, **changes: object) -> str:

@@ -121,15 +121,13 @@ def test_a_projection_is_told_of_by_its_shares_and_times(tmp_path: Path) -> None
             filled = (np.arange(100).reshape(10, 10) < n_filled).astype(np.uint8)
         return SimpleNamespace(mask=mask, filled=filled)
 
-    def part(layers: list[Any], **seconds: float) -> Any:
+    def photos(layers: list[Any], **seconds: float) -> Any:
         return SimpleNamespace(layers=layers, seconds=seconds)
 
-    parts = [
-        part([layer(50, 5), layer(30, None)], occluders_s=1.0, painting_s=4.0),
-        part([layer(20, 15)], occluders_s=0.5, painting_s=2.0),
-    ]
+    layers = [layer(50, 5), layer(30, None), layer(20, 15)]
+    painted = photos(layers, occluders_s=1.5, painting_s=6.0)
     ctx = context(tmp_path)
-    dsm_forward._report(ctx, CellCounts(n_surface=160, n_painted=40, n_hidden=7), parts)
+    dsm_forward._report(ctx, CellCounts(n_surface=160, n_painted=40, n_hidden=7), painted)
     assert {metric.name: metric.value for metric in ctx.metrics} == {
         "n_layers": 3,
         "painted_share": 0.25,
@@ -138,5 +136,5 @@ def test_a_projection_is_told_of_by_its_shares_and_times(tmp_path: Path) -> None
         "painting_s": 6.0,
     }
     nothing = context(tmp_path)
-    dsm_forward._report(nothing, CellCounts(n_surface=0, n_painted=0, n_hidden=0), [])
+    dsm_forward._report(nothing, CellCounts(n_surface=0, n_painted=0, n_hidden=0), photos([]))
     assert {metric.name: metric.value for metric in nothing.metrics}["painted_share"] == 0.0

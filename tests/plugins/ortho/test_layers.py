@@ -1,4 +1,4 @@
-"""Layers of several parts of the photos: joined by wall, counted, and bare where none paints."""
+"""Layers of the photos: joined by wall, counted, and bare where none paints."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from orthoflow_plugins.ortho.layers import (
     NO_SOURCE,
     CellCounts,
     LayerStack,
-    PaintedPart,
+    PaintedPhotos,
     ReachedWall,
     count_shown,
     joined_layers,
-    total_seconds,
 )
 
 from orthoflow.errors import MethodError
@@ -62,16 +61,17 @@ def layer(wall: int, source: str, mask: np.ndarray, *, deep: bool = False) -> La
     )
 
 
-def part(*found: Layer, reached: tuple[ReachedWall, ...] = (), **seconds: float) -> PaintedPart:
-    return PaintedPart(layers=found, reached=reached, seconds=seconds)
+def painted(*found: Layer, reached: tuple[ReachedWall, ...] = ()) -> PaintedPhotos:
+    return PaintedPhotos(layers=found, reached=reached, seconds={})
 
 
 def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
     shown = mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)
-    first = part(layer(2, "a", shown), layer(0, "a", shown))
-    second = part(layer(1, "b", shown), layer(0, "b", shown))
+    photos = painted(
+        *(layer(wall, name, shown) for wall, name in ((2, "a"), (0, "a"), (1, "b"), (0, "b")))
+    )
     ctx = context(tmp_path)
-    found = joined_layers(walls(), [first, second], ctx)
+    found = joined_layers(walls(), photos, ctx)
     assert [(each.wall, each.source) for each in found.layers] == [
         (0, "a"), (0, "b"), (1, "b"), (2, "a"),
     ]  # fmt: skip
@@ -79,7 +79,7 @@ def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
     assert found.plane_indices == (4, 5, 6)
     assert ctx.warnings == []
     with pytest.raises(MethodError, match="no oriented photo sees a wall"):
-        joined_layers(walls(), [part(), part()], ctx)
+        joined_layers(walls(), painted(), ctx)
 
 
 @pytest.mark.parametrize("deep", [False, True])
@@ -91,9 +91,9 @@ def test_a_wall_that_no_photo_paints_is_bare_but_tells_what_is_hidden(
         ReachedWall(wall=1, mask=mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)),
         ReachedWall(wall=1, mask=mask_of(a=OUTSIDE, b=HIDDEN, c=OUTSIDE)),
     ]
-    parts = [part(shown, reached=(reached[0],)), part(reached=(reached[1],))]
+    photos = painted(shown, reached=tuple(reached))
     ctx = context(tmp_path)
-    found = joined_layers(walls(), parts, ctx)
+    found = joined_layers(walls(), photos, ctx)
     first, second, third = found.layers
     assert first is shown
     assert ctx.warnings == ["no photo shows wall 1, wall 2: the orthoimage stays empty"]
@@ -122,12 +122,6 @@ def test_cells_are_counted_once_however_many_photos_show_them() -> None:
     # the second one.
     expected = CellCounts(n_surface=3 * 18, n_painted=12, n_hidden=6 + 12)
     assert count_shown(walls(), layered) == expected
-
-
-def test_times_are_summed_over_the_parts() -> None:
-    parts = [part(painting_s=2.0, other_s=9.0), part(), part(painting_s=0.5)]
-    assert total_seconds(parts, "painting_s") == 2.5
-    assert total_seconds([], "painting_s") == 0.0
 
 
 def test_arrays_of_each_layer_have_names_of_their_own(tmp_path: Path) -> None:
