@@ -25,7 +25,7 @@ import pytest
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine import processes
-from orthoflow.engine.events import RunEvent
+from orthoflow.engine.journal import RunEvent
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store

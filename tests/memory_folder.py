@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.memory import available_memory
+from orthoflow.engine.measuring import available_memory
 
 _MEMORY: Final = Path("/dev/shm")
 _NAME: Final = "orthoflow-tests"

@@ -14,7 +14,7 @@ from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
 
 if TYPE_CHECKING:
-    from orthoflow.engine.soundness import Aside
+    from orthoflow.engine.cleaning import Aside
 
 _SUMMARIES: Final = {
     "list": "List the stored results with their size and age.",
@@ -41,9 +41,8 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 
     Equal products of several results are stored once, but count for each.
     """
-    from orthoflow.engine.soundness import lying_aside
-    from orthoflow.engine.store import Store
-    from orthoflow.engine.stored_results import list_results
+    from orthoflow.engine.cleaning import lying_aside
+    from orthoflow.engine.store import Store, list_results
 
     opened = Store(store)
     results = list_results(opened)
@@ -81,7 +80,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 @json_option
 def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: bool) -> int:
     """Remove incomplete results, products that no result needs, and what killed runs left."""
-    from orthoflow.engine.garbage import collect_garbage
+    from orthoflow.engine.cleaning import collect_garbage
     from orthoflow.engine.store import Store
 
     found = collect_garbage(Store(store), older_than_days=older_than, dry_run=dry_run)
@@ -106,7 +105,7 @@ def cache_verify(store: Path, *, as_json: bool) -> int:
     What is damaged is set aside: the next run that needs it computes it again. Ends with 3 when
     something was damaged. Runs may use the store meanwhile.
     """
-    from orthoflow.engine.soundness import check_store
+    from orthoflow.engine.cleaning import check_store
     from orthoflow.engine.store import Store
 
     found = check_store(Store(store))

@@ -242,7 +242,7 @@ def _diagnose_platform() -> Diagnosis:
 
 def _diagnose_memory() -> Diagnosis:
     try:
-        from orthoflow.engine.memory import available_memory
+        from orthoflow.engine.measuring import available_memory
 
         n_bytes = available_memory().available
     except (ImportError, OSError, KeyError, ValueError):

@@ -33,7 +33,7 @@ def explain(error: Exception, session: Session) -> int:
     Returns:
         The exit code of the process.
     """
-    from orthoflow.engine.memory import is_for_want_of_memory
+    from orthoflow.engine.measuring import is_for_want_of_memory
     from orthoflow.sdk.lines import one_line
 
     if session.debug:

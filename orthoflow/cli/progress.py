@@ -18,7 +18,7 @@ from orthoflow.cli.failures import say_error
 from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.tables import counted, duration
 from orthoflow.diagnostics import PLAIN_WARNING
-from orthoflow.engine.events import (
+from orthoflow.engine.journal import (
     CellFinished,
     CellProgress,
     CellReported,

@@ -73,8 +73,8 @@ def replay(
     with 2 where an input is not to be found, with 4 where methods are missing.
     """
     from orthoflow.catalog.discovery import discover_catalog
+    from orthoflow.engine.journal import new_run_folder, new_run_id
     from orthoflow.engine.plan import RunOptions
-    from orthoflow.engine.run_folder import new_run_folder, new_run_id
     from orthoflow.engine.store import Store
     from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay

@@ -33,7 +33,7 @@ from orthoflow.errors import ArgumentError, DamageError, DiskSpaceError, StoreEr
 from orthoflow.foreign_text import shown_json
 
 if TYPE_CHECKING:
-    from orthoflow.engine.events import RunEvent, RunListener
+    from orthoflow.engine.journal import RunEvent, RunListener
     from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
@@ -105,8 +105,8 @@ def prepared(
         # What takes a second to load is loaded in here.
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog.discovery import discover_catalog
+        from orthoflow.engine.journal import require_run_folder
         from orthoflow.engine.plan import RunOptions, plan_run
-        from orthoflow.engine.run_folder import require_run_folder
         from orthoflow.engine.store import Store
         from orthoflow.workflow.expand import expand_cells
 
@@ -137,7 +137,7 @@ class Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
-        from orthoflow.engine.run_folder import LOGS
+        from orthoflow.engine.journal import LOGS
         from orthoflow.records.runs import REPORT_FILE
 
         made = self.make()
@@ -156,7 +156,7 @@ class Call:
     def make(self) -> WrittenRun:
         """Execute, record and report."""
         from orthoflow.cli.progress import working_on
-        from orthoflow.engine.run_folder import new_run_folder, new_run_id
+        from orthoflow.engine.journal import new_run_folder, new_run_id
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.writing import executed_and_written, write_run
         from orthoflow.report import write_page
@@ -241,7 +241,7 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
     Raises:
         ArgumentError: the file cannot be written.
     """
-    from orthoflow.engine.events import CellFinished
+    from orthoflow.engine.journal import CellFinished
     from orthoflow.records.diagnostics import diagnostics_of
 
     if path is None:
@@ -264,7 +264,7 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
 
 def _print_tracebacks(cells: Iterable[RecordedCell], logs: Path) -> None:
     """Write to standard error where the tracebacks of bugs are; why cells failed stands there."""
-    from orthoflow.engine.run_folder import cell_file_name
+    from orthoflow.engine.journal import cell_file_name
 
     for cell in cells:
         if cell.status == "failed" and "Traceback (most recent call last)" in cell.log:

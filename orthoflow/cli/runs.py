@@ -137,7 +137,7 @@ def runs(
 def _write_table(folders: Sequence[Path], table: Path) -> int:
     """Join runs into one CSV table."""
     from orthoflow.engine.durability import write_whole, writing_to
-    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
     from orthoflow.records.joined import join_runs, joined_csv
     from orthoflow.records.unfinished import open_run

@@ -58,7 +58,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
     the record does not hold; large arrays, which are not read, are checked by `orthoflow verify`.
     """
-    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.records.unfinished import open_run
     from orthoflow.records.verification import broken_seal
 

@@ -1,9 +1,11 @@
-"""Writing that survives a kill: a file is whole under its name, or it is not there."""
+"""Writing that survives a kill, JSON that carries its own digest, and locks between processes."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -11,9 +13,10 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from orthoflow.errors import StoreError
-from orthoflow.system import flags
+from orthoflow.system import FileLock, file_lock, flags
 
 _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
@@ -196,3 +199,102 @@ def size_of(path: Path) -> int:
     if path.is_dir() and not path.is_symlink():
         return folder_size(path)
     return path.lstat().st_size
+
+
+_DIGEST: Final = re.compile(r'\{"sha256":"([0-9a-f]{64})",')
+
+
+def with_digest(text: str) -> str:
+    """Put the SHA-256 of a JSON object's text into it as its first entry.
+
+    >>> with_digest('{"a":1}')[:24]
+    '{"sha256":"015abd7f5cc57'
+    """
+    return f'{{"sha256":"{_sha256(text)}",{text[1:]}'
+
+
+def is_checked(text: str) -> bool:
+    """Whether a text has the digest that it begins with; one that begins with none has not."""
+    found = _DIGEST.match(text)
+    return found is not None and found[1] == _sha256(f"{{{text[found.end() :]}")
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@contextmanager
+def shared_lock(path: Path) -> Iterator[None]:
+    """Hold a lock that many may hold at once; waits while one holds it exclusively.
+
+    Raises:
+        StoreError: the lock file cannot be made, or the file system has no locks.
+    """
+    with _waited_for(path, is_shared=True):
+        yield
+
+
+@contextmanager
+def taking_turns(path: Path) -> Iterator[None]:
+    """Hold a lock alone; waits while somebody else holds it.
+
+    Raises:
+        StoreError: the lock file cannot be made, or the file system has no locks.
+    """
+    with _waited_for(path, is_shared=False):
+        yield
+
+
+@contextmanager
+def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
+    """Hold a lock alone; never waits.
+
+    Args:
+        path: lock file, made when missing.
+        busy: the sentence for the case that somebody holds it.
+
+    Raises:
+        StoreError: somebody holds it, or it cannot be made.
+    """
+    with _opened(path) as lock:
+        if not _taken(lock, path, is_shared=False, waits=False):
+            raise StoreError(busy)
+        yield
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a living process holds the lock file, shared or alone."""
+    if not path.exists():
+        return False
+    with _opened(path) as lock:
+        return not _taken(lock, path, is_shared=False, waits=False)
+
+
+@contextmanager
+def _waited_for(path: Path, *, is_shared: bool) -> Iterator[None]:
+    with _opened(path) as lock:
+        _taken(lock, path, is_shared=is_shared, waits=True)
+        yield
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[FileLock]:
+    with writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, flags("O_RDWR", "O_CREAT"), 0o666)
+    lock = file_lock(path, descriptor)
+    try:
+        yield lock
+    finally:
+        lock.close()
+        os.close(descriptor)
+
+
+def _taken(lock: FileLock, path: Path, *, is_shared: bool, waits: bool) -> bool:
+    try:
+        return lock.take(is_shared=is_shared, waits=waits)
+    except OSError as error:
+        raise StoreError(
+            f"cannot lock {path}: {error.strerror or error}; the store must lie on a file system "
+            "with locks"
+        ) from error

@@ -1,4 +1,4 @@
-"""Where cells run: versions, processor and commit; never a user, host or folder name."""
+"""Where and when cells run: versions, processor, time; never a user, host or folder name."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import platform
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.results import RecordedEnvironment
-from orthoflow.engine.store import canonical_json
+from orthoflow.engine.results import RecordedEnvironment, canonical_json
 
 _GIT_TIMEOUT_S: Final = 10.0
 
@@ -109,3 +109,22 @@ def _git(root: Path, *arguments: str) -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return finished.stdout.strip() if finished.returncode == 0 else ""
+
+
+def now() -> str:
+    """The time as ISO 8601 in UTC, to milliseconds."""
+    return _written(datetime.now(UTC), "milliseconds")
+
+
+def time_of_file(mtime_s: float) -> str:
+    """The time of a file, in seconds since 1970, as ISO 8601 in UTC, to seconds."""
+    return _written(datetime.fromtimestamp(mtime_s, tz=UTC), "seconds")
+
+
+def time_in_a_name() -> str:
+    """The time in UTC as names have it: digits that sort."""
+    return f"{datetime.now(UTC):%Y%m%d-%H%M%S}"
+
+
+def _written(time: datetime, to: str) -> str:
+    return time.isoformat(timespec=to).replace("+00:00", "Z")

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.checked_json import is_checked, with_digest
-from orthoflow.engine.durability import write_whole
+from orthoflow.engine.durability import is_checked, with_digest, write_whole
 from orthoflow.engine.results import RecordedFile, name_problem
 from orthoflow.errors import InputError
 from orthoflow.foreign_text import parse_json

@@ -23,8 +23,7 @@ from orthoflow.catalog.distributions import canonical_name, package_path, source
 from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.kernels import kernel_sources
-from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
-from orthoflow.engine.store import canonical_json
+from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue

@@ -18,10 +18,10 @@ from typing import Final, Protocol
 
 from pydantic import TypeAdapter
 
-from orthoflow.engine.clock import now
 from orthoflow.engine.durability import write_whole, writing_to
+from orthoflow.engine.environment import now
 from orthoflow.engine.kernels import kernel_folder, kernels_in
-from orthoflow.engine.memory import GIB, MIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.measuring import GIB, MIB, MemoryGuard, oom_kills, process_memory
 from orthoflow.engine.processes import ask_to_end, end_tree, start_step
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_task

@@ -18,8 +18,7 @@ from typing import Final, Literal
 
 from pydantic import TypeAdapter
 
-from orthoflow.engine.checked_json import is_checked, with_digest
-from orthoflow.engine.durability import write_whole
+from orthoflow.engine.durability import is_checked, with_digest, write_whole
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.results import name_problem
 from orthoflow.errors import ProductError

@@ -12,7 +12,6 @@ from typing import Final, Literal
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.keys import (
     CellKey,
@@ -24,7 +23,7 @@ from orthoflow.engine.keys import (
     read_preimage,
 )
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.store import Preimage, Store
+from orthoflow.engine.store import Failures, Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.system import usable_cores

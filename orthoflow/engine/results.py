@@ -18,12 +18,13 @@ from orthoflow_provenance.document import (
     ProductRef,
     RecordedEnvironment,
     RecordedFile,
+    canonical_json,
     shared_fields,
 )
 from orthoflow_provenance.paths import name_problem
 from pydantic import TypeAdapter, ValidationError
 
-from orthoflow.engine.checked_json import is_checked, with_digest
+from orthoflow.engine.durability import is_checked, with_digest
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import parse_json
 
@@ -40,6 +41,7 @@ __all__ = [
     "ProductRef",
     "RecordedEnvironment",
     "RecordedFile",
+    "canonical_json",
     "name_problem",
     "result_from_json",
     "result_to_json",

@@ -14,20 +14,25 @@ from types import FrameType
 from typing import Final, Literal
 
 from orthoflow.diagnostics import Diagnostic, DiagnosticSpec, placed, step_names, warning_texts
-from orthoflow.engine.clock import now
-from orthoflow.engine.durability import remove_tree, writing_to
-from orthoflow.engine.environment import environment
-from orthoflow.engine.events import (
+from orthoflow.engine.durability import exclusive_lock, is_locked, remove_tree, writing_to
+from orthoflow.engine.environment import environment, now
+from orthoflow.engine.journal import (
+    LOGS,
+    CellBegan,
+    CellDamaged,
+    CellEnded,
     CellFinished,
     CellLogged,
     CellProgress,
     CellReported,
     CellStarted,
+    Journal,
     RunListener,
     RunStarted,
+    RunWent,
+    cell_file_name,
     ignore,
 )
-from orthoflow.engine.failures import Failures
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.local import (
     Capacity,
@@ -37,7 +42,6 @@ from orthoflow.engine.local import (
     TaskEnd,
     Tell,
 )
-from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.plan import (
     PlannedInput,
     ProductTarget,
@@ -47,16 +51,7 @@ from orthoflow.engine.plan import (
     remember_places,
 )
 from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
-from orthoflow.engine.run_folder import (
-    LOGS,
-    CellBegan,
-    CellDamaged,
-    CellEnded,
-    Journal,
-    RunWent,
-    cell_file_name,
-)
-from orthoflow.engine.store import Store
+from orthoflow.engine.store import Failures, Store
 from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import (
     ArgumentError,
@@ -601,7 +596,7 @@ def _executor_of(
     capacity = Capacity.of_jobs(options.jobs, options.all_cores)
     if options.executor == "dask":
         try:
-            from orthoflow.engine.dask_executor import DaskExecutor  # noqa: PLC0415 - an extra
+            from orthoflow.engine.dask import DaskExecutor  # noqa: PLC0415 - an extra
         except ImportError as error:
             raise PluginError(
                 "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"

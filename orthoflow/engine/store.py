@@ -41,14 +41,19 @@ from orthoflow_provenance.document import (
 
 from orthoflow.engine.durability import (
     folder_size,
+    is_checked,
     place_folder,
+    read_whole,
     remove_tree,
+    shared_lock,
     sync_tree,
+    taking_turns,
+    with_digest,
     write_whole,
     writing_to,
 )
+from orthoflow.engine.environment import time_of_file
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.locks import shared_lock, taking_turns
 from orthoflow.engine.objects import (
     BLOB,
     PRODUCT,
@@ -64,10 +69,63 @@ from orthoflow.engine.objects import (
     require_plain_files,
 )
 from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
-from orthoflow.engine.store_folder import make_store
-from orthoflow.errors import DamageError, ProductError, StoreError
+from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue, Payload, Product
+from orthoflow.sdk.lines import one_line
+
+# Made together when a store is first used. The last one is what a store is known by: a git
+# repository has `objects`, and anybody's folder may have `results`.
+_MADE: Final = ("scratch", "results", "objects", "preimages")
+# What else may come first, as a lock does. A disk of its own has `lost+found`, and systems leave
+# hidden files everywhere.
+_OURS: Final = frozenset(
+    {*_MADE, "failures", "damaged", "digests.json", "lock"} | {"damaged.lock", "lost+found"}
+)
+
+
+def is_store(folder: Path) -> bool:
+    """Whether a run has made a store of a folder."""
+    return (folder / _MADE[-1]).is_dir()
+
+
+def require_store(folder: Path) -> None:
+    """Refuse a folder of something else, for a store is written to and cleaned up.
+
+    One that is not there, or has nothing but hidden files and what a store has, may become one.
+
+    Raises:
+        ArgumentError: other files lie there, and no store.
+        StoreError: the folder cannot be read.
+    """
+    if is_store(folder) or not folder.is_dir():
+        return
+    with writing_to(folder):
+        names = (path.name for path in folder.iterdir())
+        foreign = sorted(name for name in names if name[0] != "." and name not in _OURS)
+    if foreign:
+        raise ArgumentError(
+            f"{folder} is no store of orthoflow: it holds {foreign[0]}"
+            f"{f' and {len(foreign) - 1} more' if foreign[1:] else ''}; name a store, or a folder "
+            "that is empty or not there yet, with --store"
+        )
+
+
+def make_store(folder: Path) -> None:
+    """Make the folders of a store, where they are not there yet.
+
+    Raises:
+        ArgumentError: something else lies there.
+        StoreError: they cannot be made.
+    """
+    require_store(folder)
+    with writing_to(folder):
+        for name in _MADE:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        ignore = folder / ".gitignore"
+        if not ignore.exists():
+            ignore.write_text("*\n", encoding="utf-8")
+
 
 __all__ = [
     "Preimage",
@@ -536,3 +594,96 @@ def _read_preimage(path: Path) -> Preimage | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return found if sha256_text(found.text) == found.key else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredResult:
+    """A result in the store.
+
+    Attributes:
+        key: cache key.
+        method: method id.
+        run_id: the run that computed it.
+        ended: ISO 8601 UTC.
+        last_used: ISO 8601 UTC, when a run last took or made it.
+        size_bytes: of its products with their published files; equal products of several results
+            count for each.
+        is_complete: all its products and figures are there.
+    """
+
+    key: str
+    method: str
+    run_id: str
+    ended: str
+    last_used: str
+    size_bytes: int
+    is_complete: bool
+
+
+def list_results(store: Store) -> tuple[StoredResult, ...]:
+    """List the results of a store, last used first; unreadable ones are left out."""
+    found: list[StoredResult] = []
+    for path in store.results.glob("*.json"):
+        try:
+            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
+            used = time_of_file(path.stat().st_mtime)
+        except (StoreError, OSError, UnicodeDecodeError):
+            continue
+        found.append(
+            StoredResult(
+                key=path.stem,
+                method=result.method,
+                run_id=result.run_id,
+                ended=result.ended,
+                last_used=used,
+                size_bytes=store.size_bytes(result),
+                is_complete=store.result(path.stem) is not None,
+            )
+        )
+    return tuple(sorted(found, key=lambda item: (item.last_used, item.key), reverse=True))
+
+
+# A reason stands in one column of a table; the record of the run has the whole sentence.
+_LONGEST_SENTENCE: Final = 400
+_LARGEST_FILE: Final = 16 << 10
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The sentences with which cells failed.
+
+    Attributes:
+        folder: where they lie; made when something fails.
+    """
+
+    folder: Path
+
+    @classmethod
+    def of_store(cls, store_folder: Path) -> Failures:
+        """Give those that a store keeps."""
+        return cls(store_folder / "failures")
+
+    def remember(self, key: str, sentence: str) -> None:
+        """Keep the sentence of a cell that failed, if the disk lets us."""
+        text = with_digest(json.dumps({"error": one_line(sentence, _LONGEST_SENTENCE)}))
+        with contextlib.suppress(OSError, StoreError):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self._file(key), text.encode())
+
+    def forget(self, key: str) -> None:
+        """Take back what was remembered: the cell has a result now."""
+        with contextlib.suppress(OSError):
+            self._file(key).unlink()
+
+    def sentence(self, key: str) -> str:
+        """Say how the cell failed; empty when it did not, or when nobody knows any more."""
+        try:
+            text = read_whole(self._file(key), _LARGEST_FILE)
+            content = parse_json(text) if is_checked(text) else None
+        except (OSError, ValueError):
+            return ""
+        found = content.get("error") if isinstance(content, dict) else None
+        return one_line(found, 2 * _LONGEST_SENTENCE) if isinstance(found, str) else ""
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.json"

@@ -32,12 +32,11 @@ import threadpoolctl
 from pydantic import JsonValue, ValidationError
 
 from orthoflow.diagnostics import Diagnostic, warning_texts
-from orthoflow.engine.clock import now
 from orthoflow.engine.durability import is_broken, store_error, writing_to
+from orthoflow.engine.environment import now
 from orthoflow.engine.file_digests import file_identity, file_sha256
 from orthoflow.engine.kernels import reload_numba_config
-from orthoflow.engine.measuring import LoadingMeter, MemorySampler
-from orthoflow.engine.memory import MIB, is_for_want_of_memory
+from orthoflow.engine.measuring import MIB, LoadingMeter, MemorySampler, is_for_want_of_memory
 from orthoflow.engine.results import (
     CellResult,
     Costs,

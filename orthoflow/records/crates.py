@@ -14,7 +14,7 @@ from typing import Final
 from orthoflow_provenance.document import RecordedCell, RunRecord
 
 from orthoflow.engine.durability import writing_to
-from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
+from orthoflow.engine.journal import RECORD_FILE, cell_file_name
 from orthoflow.errors import RecordError
 from orthoflow.products.product import JsonValue
 from orthoflow.records import crate_entities as entities

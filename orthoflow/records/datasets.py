@@ -19,7 +19,7 @@ from orthoflow_provenance.record import write_record
 
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.engine.durability import writing_to
-from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
+from orthoflow.engine.journal import RECORD_FILE, cell_file_name
 from orthoflow.engine.store import Store
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import parse_json

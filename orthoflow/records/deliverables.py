@@ -10,7 +10,7 @@ from typing import Final
 
 from orthoflow_provenance.document import RecordedCell
 
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import InputError
 from orthoflow.files.sidecars import read_sidecar, write_json
 from orthoflow.products import JsonValue, OrthoMask

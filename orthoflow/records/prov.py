@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from orthoflow_provenance.document import RecordedCell, RecordedProduct, RunRecord, cost_metrics
 
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.products import JsonValue
 from orthoflow.records.published import PRODUCTS_FOLDER
 

@@ -15,7 +15,7 @@ from orthoflow_provenance.paths import colliding, files_below, path_below
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import StoreError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.deliverables import write_walls_json

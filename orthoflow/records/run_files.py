@@ -27,7 +27,7 @@ from orthoflow_provenance.paths import (
 )
 
 from orthoflow.engine.durability import writing_to
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import RecordError, StoreError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.runs import Run

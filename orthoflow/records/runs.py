@@ -24,7 +24,7 @@ from orthoflow_provenance.record import open_record
 
 from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
-from orthoflow.engine.run_folder import RECORD_FILE, is_running
+from orthoflow.engine.journal import RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError, PluginError, RecordError
 from orthoflow.foreign_text import shown
 from orthoflow.products.product import Payload, Product

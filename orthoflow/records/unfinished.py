@@ -33,7 +33,7 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.record import write_record
 
 from orthoflow.engine.durability import write_whole, writing_to
-from orthoflow.engine.run_folder import (
+from orthoflow.engine.journal import (
     RECORD_FILE,
     CellEnded,
     RunBegan,

@@ -23,7 +23,7 @@ from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.alike import first_few
-from orthoflow.engine.run_folder import JOURNAL, LOGS
+from orthoflow.engine.journal import JOURNAL, LOGS
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection

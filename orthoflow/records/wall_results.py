@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.files.drawings.words import Phrase, accuracy_phrase
 from orthoflow.files.geotiff import RasterParts

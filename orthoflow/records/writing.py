@@ -31,8 +31,8 @@ from orthoflow_provenance.record import write_record
 from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.engine.journal import RECORD_FILE, kept_from_others
 from orthoflow.engine.results import CellResult
-from orthoflow.engine.run_folder import RECORD_FILE, kept_from_others
 from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
@@ -227,7 +227,7 @@ def begin_run(
     Raises:
         StoreError: the disk refuses.
     """
-    from orthoflow.engine.clock import now  # noqa: PLC0415 - runs alone begin
+    from orthoflow.engine.environment import now  # noqa: PLC0415 - runs alone begin
     from orthoflow.engine.scheduler import RunOutcome  # noqa: PLC0415
 
     began = now()

@@ -12,7 +12,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from orthoflow.engine.run_folder import JOURNAL, RECORD_FILE, is_running
+from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products import JsonValue

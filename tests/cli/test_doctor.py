@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from orthoflow.cli import diagnosis, doctor, program
 from orthoflow.cli.diagnosis import Library, diagnose_library, diagnose_machine
-from orthoflow.engine import memory
+from orthoflow.engine import measuring
 from orthoflow.version import __version__
 
 GIB = 1 << 30
@@ -146,15 +146,15 @@ def test_a_store_where_nothing_can_be_written_is_named() -> None:
 def test_little_memory_is_told(
     monkeypatch: pytest.MonkeyPatch, n_bytes: int, verdict: str, found: str
 ) -> None:
-    here = memory.AvailableMemory(available=n_bytes, total=n_bytes)
-    monkeypatch.setattr(memory, "available_memory", lambda: here)
+    here = measuring.AvailableMemory(available=n_bytes, total=n_bytes)
+    monkeypatch.setattr(measuring, "available_memory", lambda: here)
     told = diagnosis._diagnose_memory()
     assert (told.verdict, told.found, bool(told.cost)) == (verdict, found, verdict != "ok")
 
     def fail() -> None:
         raise KeyError("MemTotal")
 
-    monkeypatch.setattr(memory, "available_memory", fail)
+    monkeypatch.setattr(measuring, "available_memory", fail)
     unknown = diagnosis._diagnose_memory()
     assert (unknown.verdict, unknown.found, unknown.cost) == (
         "limited",

@@ -23,7 +23,7 @@ from orthoflow.cli.progress import (
     working_on,
 )
 from orthoflow.diagnostics import PLAIN_WARNING, DiagnosticSpec
-from orthoflow.engine.events import (
+from orthoflow.engine.journal import (
     CellFinished,
     CellLogged,
     CellProgress,

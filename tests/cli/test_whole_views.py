@@ -13,8 +13,8 @@ from orthoflow_provenance.record import open_record
 
 from orthoflow.cli.plan import _as_json, _summary
 from orthoflow.cli.verify import _summary as verified
-from orthoflow.engine import garbage
-from orthoflow.engine.garbage import GarbageReport
+from orthoflow.engine import cleaning
+from orthoflow.engine.cleaning import GarbageReport
 from orthoflow.engine.store import Store
 from orthoflow.records.verification import Verification
 from tests.provenance_records import write_sample
@@ -136,7 +136,7 @@ def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
         asked.append((store.folder, older_than_days, dry_run))
         return GarbageReport(n_results=1, n_objects=2, n_damaged=0, freed_bytes=1536)
 
-    monkeypatch.setattr(garbage, "collect_garbage", collect)
+    monkeypatch.setattr(cleaning, "collect_garbage", collect)
     store = ("--store", tmp_path)
     assert said("cache", "gc", *store) == "removed 1 result and 2 objects, 1.5 KiB\n"
     dry = said("cache", "gc", *store, "--dry-run", "--older-than", "2.5")

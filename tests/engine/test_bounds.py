@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from orthoflow.engine import garbage, worker
+from orthoflow.engine import cleaning, worker
 from orthoflow.engine import plan as planning
-from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
+from orthoflow.engine.store import Failures
 
 
 def test_a_file_is_called_after_its_cell_in_two_hundred_bytes() -> None:
@@ -82,7 +82,7 @@ def test_results_are_old_after_so_many_days_of_24_hours(
     moment = time.time() - days * 86_400
     os.utime(tmp_path / "k.json", (moment, moment))
     store: Any = SimpleNamespace(results=tmp_path, result=lambda _key: "a result")
-    assert list(garbage._useless_results(store, 7.0)) == ([tmp_path / "k.json"] if is_old else [])
-    assert list(garbage._useless_results(store, None)) == []
+    assert list(cleaning._useless_results(store, 7.0)) == ([tmp_path / "k.json"] if is_old else [])
+    assert list(cleaning._useless_results(store, None)) == []
     lost: Any = SimpleNamespace(results=tmp_path, result=lambda _key: None)
-    assert list(garbage._useless_results(lost, None)) == [tmp_path / "k.json"]
+    assert list(cleaning._useless_results(lost, None)) == [tmp_path / "k.json"]

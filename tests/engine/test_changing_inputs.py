@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.events import CellStarted, RunEvent
+from orthoflow.engine.journal import CellStarted, RunEvent
 from orthoflow.engine.scheduler import execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, InputError

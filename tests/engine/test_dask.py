@@ -14,10 +14,10 @@ import dask
 import pytest
 from distributed import LocalCluster
 
-from orthoflow.engine import dask_executor, local, memory
-from orthoflow.engine.dask_executor import CORES, DaskExecutor
-from orthoflow.engine.dask_worker import look_around
-from orthoflow.engine.events import (
+from orthoflow.engine import dask as engine_dask
+from orthoflow.engine import local, measuring
+from orthoflow.engine.dask import CORES, DaskExecutor, look_around
+from orthoflow.engine.journal import (
     CellFinished,
     CellProgress,
     CellStarted,
@@ -25,7 +25,7 @@ from orthoflow.engine.events import (
     RunListener,
 )
 from orthoflow.engine.local import Capacity
-from orthoflow.engine.memory import AvailableMemory
+from orthoflow.engine.measuring import AvailableMemory
 from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.engine.plan import RunPlan
 from orthoflow.engine.scheduler import RunOutcome, execute
@@ -119,7 +119,7 @@ def is_under_way(event: RunEvent) -> bool:
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
-    start_fork_server("tests.asking_once", "orthoflow.engine.dask_worker")
+    start_fork_server("tests.asking_once", "orthoflow.engine.dask")
     with toy_world(tmp_path_factory.mktemp("office")) as world:
         quiet = digests(world.run(STEPS, executor="inline"))
         (world.folder / "answers").mkdir()
@@ -177,9 +177,9 @@ def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
     def left() -> AvailableMemory:
         return AvailableMemory(available=(len(running) < 2) << 33, total=1 << 34)
 
-    monkeypatch.setattr(memory, "available_memory", left)
+    monkeypatch.setattr(measuring, "available_memory", left)
     # Both are worth being stopped.
-    monkeypatch.setattr(memory, "tree_memory", lambda root: (1 << 33) + (root == min(running)))
+    monkeypatch.setattr(measuring, "tree_memory", lambda root: (1 << 33) + (root == min(running)))
     outcome = fresh.run(f"steps:\n{steps}", executor="dask", jobs=2, cores=2)
     said = [result.error_message for name, result in outcome.results.items() if name != "first"]
     assert sorted("needed more memory" in text for text in said) == [False, True]
@@ -300,7 +300,7 @@ def _target(link: Path) -> str:
 def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask_executor, "_PATIENCE_S", 3.0)
+    monkeypatch.setattr(engine_dask, "_PATIENCE_S", 3.0)
     world, folder = office.world, office.world.folder / "alone"
     with cluster(1, world.folder / "answers", **{CORES: 1}) as lost:
         plan = world.plan(
@@ -334,7 +334,7 @@ def test_workers_with_other_versions_are_refused_by_name(office: Office) -> None
 def test_workers_that_do_not_see_the_store_are_refused(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask_executor, "write_whole", lambda *_: None)
+    monkeypatch.setattr(engine_dask, "write_whole", lambda *_: None)
     with pytest.raises(ArgumentError, match=r"does not see the store .*No such file"):
         office.run()
 
@@ -348,7 +348,7 @@ def test_what_a_worker_says_of_itself(tmp_path: Path) -> None:
 
 
 def test_a_clock_that_is_off_is_refused(office: Office, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_executor, "_CLOCKS_APART_S", -1.0)
+    monkeypatch.setattr(engine_dask, "_CLOCKS_APART_S", -1.0)
     with pytest.raises(ArgumentError, match=r"the clock of worker .* is .\d+ s off this one"):
         office.run()
 
@@ -356,7 +356,7 @@ def test_a_clock_that_is_off_is_refused(office: Office, monkeypatch: pytest.Monk
 def test_an_address_without_scheduler_is_refused(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
+    monkeypatch.setattr(engine_dask, "_CONNECT_S", 1.0)
     for address in ("tcp://127.0.0.1:9", "nonsense"):
         plan = office.world.plan(STEPS, executor="dask", scheduler=address)
         with pytest.raises(ArgumentError, match=f"--scheduler {address}: no scheduler of dask"):
@@ -366,7 +366,7 @@ def test_an_address_without_scheduler_is_refused(
 def test_workers_that_do_not_say_their_cores_get_no_work(
     office: Office, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(dask_executor, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(engine_dask, "_PATIENCE_S", 1.0)
     with cluster(1) as silent:
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
         with pytest.raises(ArgumentError, match="no worker there says how many cores it has"):
@@ -390,5 +390,5 @@ def test_workers_have_room_for_as_many_tasks_as_threads_and_cores(
         str(number): {"nthreads": n_threads, "resources": {CORES: n_cores}}
         for number, (n_threads, n_cores) in enumerate(workers)
     }
-    capacity = dask_executor._capacity(known)
+    capacity = engine_dask._capacity(known)
     assert dataclasses.astuple(capacity) == expected

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 from distributed import KilledWorker
 
-from orthoflow.engine import dask_executor, dask_worker
-from orthoflow.engine.dask_executor import CORES, DaskExecutor
-from orthoflow.engine.dask_worker import CANCEL_FILE, Surroundings
+from orthoflow.engine import dask as engine_dask
+from orthoflow.engine.dask import CANCEL_FILE, CORES, DaskExecutor, Surroundings
 from orthoflow.engine.local import Capacity, TaskEnd
 from orthoflow.engine.results import CellResult, result_to_json
 from orthoflow.engine.worker import Task
@@ -73,7 +72,7 @@ def an_executor(folder: Path, *futures: Future, **more: Any) -> Any:
         "_address": "tcp://x:1",
         "_methods": "{}",
         "_running": {
-            str(n): dask_executor._Running(task=a_task(folder, str(n)), future=future)  # type: ignore[arg-type]
+            str(n): engine_dask._Running(task=a_task(folder, str(n)), future=future)  # type: ignore[arg-type]
             for n, future in enumerate(futures)
         },
         "_news": queue.SimpleQueue(),
@@ -270,7 +269,7 @@ def test_workers_are_looked_at_before_they_get_a_task(
     else:
         with pytest.raises(error, match=told):
             executor._look_at_workers(tmp_path)
-    assert asked == [(dask_worker.look_around, "{}", ["w1"])]
+    assert asked == [(engine_dask.look_around, "{}", ["w1"])]
 
 
 # A worker -----------------------------------------------------------------------------------------
@@ -281,7 +280,7 @@ def test_workers_are_looked_at_before_they_get_a_task(
     [(1, "its worker was lost;"), (3, "its workers were lost, 3 in a row; the logs of the work")],
 )
 def test_a_loss_is_told_with_how_often_it_happened(times: int, said: str) -> None:
-    told = dask_worker.describe_loss("method work.add", times)
+    told = engine_dask.describe_loss("method work.add", times)
     assert told.startswith("method work.add was given up: ")
     assert said in told
 
@@ -302,7 +301,7 @@ def test_a_task_is_given_up_where_nobody_waits_for_it(
 
     tasks = {} if state is None else {"name": SimpleNamespace(state=state)}
     worker: Any = SimpleNamespace(status=Status[status], state=SimpleNamespace(tasks=tasks))
-    assert dask_worker._is_given_up(worker, "name") is is_given_up
+    assert engine_dask._is_given_up(worker, "name") is is_given_up
 
 
 @pytest.mark.parametrize("why", ["asked", "given up"])
@@ -317,9 +316,9 @@ def test_a_worker_stops_its_task_once_and_waits_for_its_end(
 
     if why == "asked":
         (tmp_path / CANCEL_FILE).touch()
-    monkeypatch.setattr(dask_worker, "_is_given_up", lambda *_: why == "given up")
-    monkeypatch.setattr(dask_worker, "_LOOK_S", 0.0)
+    monkeypatch.setattr(engine_dask, "_is_given_up", lambda *_: why == "given up")
+    monkeypatch.setattr(engine_dask, "_LOOK_S", 0.0)
     executor: Any = SimpleNamespace(poll=poll, cancel=lambda: done.append("cancel"))
     nobody: Any = None
-    assert dask_worker._result(executor, tmp_path, nobody, "name") == GOOD
+    assert engine_dask._result(executor, tmp_path, nobody, "name") == GOOD
     assert done == ["poll", "cancel", "poll", "poll", "poll", "poll"]

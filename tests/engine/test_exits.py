@@ -13,7 +13,7 @@ from orthoflow.engine.local import (
     describe_timeout,
     duration,
 )
-from orthoflow.engine.memory import is_for_want_of_memory
+from orthoflow.engine.measuring import is_for_want_of_memory
 
 WHO = "method plane.mine of mine 1.0"
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import memory as machine_memory
+from orthoflow.engine import measuring as machine_memory
 from orthoflow.engine.local import describe_exit
-from orthoflow.engine.memory import (
+from orthoflow.engine.measuring import (
     AvailableMemory,
     MemoryGuard,
     Victim,

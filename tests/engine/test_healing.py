@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from orthoflow.engine.events import CellStarted, RunEvent
-from orthoflow.engine.garbage import collect_garbage
+from orthoflow.engine.cleaning import check_store, collect_garbage
+from orthoflow.engine.journal import CellStarted, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
-from orthoflow.engine.soundness import check_store
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
 from tests.engine_world import World, digests

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.garbage import collect_garbage
-from orthoflow.engine.run_folder import is_running
+from orthoflow.engine.cleaning import collect_garbage
+from orthoflow.engine.journal import is_running
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import find_record

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.dask_executor import CORES
-from orthoflow.engine.events import CellProgress, RunEvent
+from orthoflow.engine.dask import CORES
+from orthoflow.engine.journal import CellProgress, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import OrthoflowError
 from tests.engine_world import World, digests

@@ -15,11 +15,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthoflow.engine import clock, environment, file_digests, memory
+from orthoflow.engine import environment, file_digests, measuring
 from orthoflow.engine.durability import (
+    exclusive_lock,
     folder_size,
     is_broken,
+    is_locked,
     place_folder,
+    shared_lock,
     size_of,
     store_error,
     whole_folder,
@@ -27,8 +30,7 @@ from orthoflow.engine.durability import (
     writing_to,
 )
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.locks import exclusive_lock, is_locked, shared_lock
-from orthoflow.engine.memory import AvailableMemory, MemoryGuard
+from orthoflow.engine.measuring import AvailableMemory, MemoryGuard
 from orthoflow.errors import InputError, StoreError
 from tests.faulty_files import FaultyFiles
 
@@ -38,9 +40,9 @@ MIB = 1 << 20
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder whose files stand for those of the kernel."""
-    for module in (memory, environment):
+    for module in (measuring, environment):
         monkeypatch.setattr(module, "Path", lambda path: tmp_path / str(path).lstrip("/"))
-    monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "sys/fs/cgroup")
+    monkeypatch.setattr(measuring, "_CGROUPS", tmp_path / "sys/fs/cgroup")
     return tmp_path
 
 
@@ -52,42 +54,42 @@ def write(folder: Path, files: dict[str, str]) -> None:
 
 
 def test_memory_of_a_tree_is_that_of_a_process_and_all_that_it_started() -> None:
-    own = memory.tree_memory(os.getpid())
-    mine = memory.process_memory()
+    own = measuring.tree_memory(os.getpid())
+    mine = measuring.process_memory()
     assert own >= 0.9 * mine > 0
     # None has this number.
-    assert memory.tree_memory(1 << 30) == 0
+    assert measuring.tree_memory(1 << 30) == 0
 
 
 GROUP: dict[str, dict[str, str]] = {
     "none": {},
     "version 2": {
         "proc/self/cgroup": "0::/outer/inner\n",
-        "sys/fs/cgroup/outer/inner/memory.max": "max\n",
-        "sys/fs/cgroup/outer/inner/memory.current": f"{100 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.max": f"{1000 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.current": f"{700 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.stat": f"file 7\ninactive_file {200 * MIB}\n",
-        "sys/fs/memory.max": f"{1 * MIB}\n",
-        "sys/fs/memory.current": "0\n",
+        "sys/fs/cgroup/outer/inner/measuring.max": "max\n",
+        "sys/fs/cgroup/outer/inner/measuring.current": f"{100 * MIB}\n",
+        "sys/fs/cgroup/outer/measuring.max": f"{1000 * MIB}\n",
+        "sys/fs/cgroup/outer/measuring.current": f"{700 * MIB}\n",
+        "sys/fs/cgroup/outer/measuring.stat": f"file 7\ninactive_file {200 * MIB}\n",
+        "sys/fs/measuring.max": f"{1 * MIB}\n",
+        "sys/fs/measuring.current": "0\n",
     },
     "version 1": {
         "proc/self/cgroup": "12:cpu:/x\n4:blkio,memory:/outer\n",
-        "sys/fs/cgroup/memory/outer/memory.limit_in_bytes": f"{2000 * MIB}\n",
-        "sys/fs/cgroup/memory/outer/memory.usage_in_bytes": f"{500 * MIB}\n",
-        "sys/fs/cgroup/memory/outer/memory.stat": f"total_inactive_file {30 * MIB}\ncache 9\n",
-        "sys/fs/cgroup/memory/memory.limit_in_bytes": "9223372036854771712\n",
-        "sys/fs/cgroup/memory/memory.usage_in_bytes": f"{9000 * MIB}\n",
+        "sys/fs/cgroup/memory/outer/measuring.limit_in_bytes": f"{2000 * MIB}\n",
+        "sys/fs/cgroup/memory/outer/measuring.usage_in_bytes": f"{500 * MIB}\n",
+        "sys/fs/cgroup/memory/outer/measuring.stat": f"total_inactive_file {30 * MIB}\ncache 9\n",
+        "sys/fs/cgroup/memory/measuring.limit_in_bytes": "9223372036854771712\n",
+        "sys/fs/cgroup/memory/measuring.usage_in_bytes": f"{9000 * MIB}\n",
     },
     "a group of the host's": {
         "proc/self/cgroup": "0::/not/here\n",
-        "sys/fs/cgroup/memory.max": f"{600 * MIB}\n",
-        "sys/fs/cgroup/memory.current": f"{700 * MIB}\n",
+        "sys/fs/cgroup/measuring.max": f"{600 * MIB}\n",
+        "sys/fs/cgroup/measuring.current": f"{700 * MIB}\n",
     },
     "other controllers": {
         "proc/self/cgroup": "12:cpu:/x\n",
-        "sys/fs/cgroup/memory/x/memory.limit_in_bytes": "1\n",
-        "sys/fs/cgroup/memory/x/memory.usage_in_bytes": "1\n",
+        "sys/fs/cgroup/memory/x/measuring.limit_in_bytes": "1\n",
+        "sys/fs/cgroup/memory/x/measuring.usage_in_bytes": "1\n",
     },
 }
 
@@ -106,9 +108,9 @@ def test_the_tightest_group_says_how_much_is_left(
     machine: Path, monkeypatch: pytest.MonkeyPatch, group: str, available_mib: int, total_mib: int
 ) -> None:
     here = SimpleNamespace(total=8192 * MIB, available=4096 * MIB)
-    monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: here)
+    monkeypatch.setattr(measuring.psutil, "virtual_memory", lambda: here)
     write(machine, GROUP[group])
-    assert memory.available_memory() == AvailableMemory(
+    assert measuring.available_memory() == AvailableMemory(
         available=available_mib * MIB, total=total_mib * MIB
     )
 
@@ -123,7 +125,7 @@ def test_the_guard_looks_again_before_the_rest_can_be_eaten(
 ) -> None:
     here = AvailableMemory(available=0, total=64 << 30)
     left = AvailableMemory(available=here.floor + round(margin_mib * MIB), total=here.total)
-    monkeypatch.setattr(memory, "available_memory", lambda: left)
+    monkeypatch.setattr(measuring, "available_memory", lambda: left)
     guard = MemoryGuard()
     assert guard.interval_s == 0.25
     assert guard.check({}) is None
@@ -136,8 +138,8 @@ def test_a_step_is_stopped_at_the_floor_and_not_above(
 ) -> None:
     here = AvailableMemory(available=0, total=64 << 30)
     left = AvailableMemory(available=here.floor + over, total=here.total)
-    monkeypatch.setattr(memory, "available_memory", lambda: left)
-    monkeypatch.setattr(memory, "tree_memory", {1: here.floor, 2: here.floor - 1}.__getitem__)
+    monkeypatch.setattr(measuring, "available_memory", lambda: left)
+    monkeypatch.setattr(measuring, "tree_memory", {1: here.floor, 2: here.floor - 1}.__getitem__)
     found = MemoryGuard().check({"small": 2, "large": 1})
     assert (found is not None) == is_stopped
     if found is not None:
@@ -146,9 +148,9 @@ def test_a_step_is_stopped_at_the_floor_and_not_above(
 
 
 def test_kills_of_the_kernel_are_counted(machine: Path) -> None:
-    assert memory.oom_kills() == 0
+    assert measuring.oom_kills() == 0
     write(machine, {"proc/vmstat": "nr_free 4\noom_kill 3\noom_kill_other 9\n"})
-    assert memory.oom_kills() == 3
+    assert measuring.oom_kills() == 3
 
 
 # --- versions ---
@@ -271,9 +273,9 @@ def test_a_file_that_changes_while_it_is_read_is_refused(
 
 
 def test_hours_are_written_in_utc() -> None:
-    assert clock.time_of_file(1_000_000_000.75) == "2001-09-09T01:46:40Z"
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", clock.now())
-    assert re.fullmatch(r"\d{8}-\d{6}", clock.time_in_a_name())
+    assert environment.time_of_file(1_000_000_000.75) == "2001-09-09T01:46:40Z"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", environment.now())
+    assert re.fullmatch(r"\d{8}-\d{6}", environment.time_in_a_name())
 
 
 # --- locks ---

@@ -12,12 +12,11 @@ from typing import Any
 import pytest
 
 from orthoflow.engine import keys, method_versions
-from orthoflow.engine.failures import Failures
-from orthoflow.engine.garbage import collect_garbage
+from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef, RecordedFile
-from orthoflow.engine.store import Preimage, Store
+from orthoflow.engine.store import Failures, Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.system import usable_cores
 from orthoflow.workflow.expand import Cell, WorkflowInput

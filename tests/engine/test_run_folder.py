@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.run_folder import (
+from orthoflow.engine.journal import (
     JOURNAL,
     RECORD_FILE,
     CellDamaged,

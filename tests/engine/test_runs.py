@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.environment import environment
-from orthoflow.engine.events import (
+from orthoflow.engine.journal import (
     CellFinished,
     CellLogged,
     CellProgress,
     CellReported,
     CellStarted,
+    cell_file_name,
 )
 from orthoflow.engine.results import CellResult
-from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import ArgumentError, InputError, StoreError
 from tests.engine_world import World, digests

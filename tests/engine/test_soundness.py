@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from orthoflow.engine.cleaning import Aside, Damage, Soundness, check_store
 from orthoflow.engine.objects import PRODUCT
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.soundness import Aside, Damage, Soundness, check_store
 from orthoflow.engine.store import Store
 from orthoflow.products.product import Product
 

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.engine.checked_json import with_digest
+from orthoflow.engine.cleaning import collect_garbage
+from orthoflow.engine.durability import with_digest
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.garbage import collect_garbage
 from orthoflow.engine.objects import files_of
 from orthoflow.engine.results import (
     CellResult,
@@ -33,8 +33,7 @@ from orthoflow.engine.results import (
     result_from_json,
     result_to_json,
 )
-from orthoflow.engine.store import Publisher, Store, digest_of
-from orthoflow.engine.stored_results import list_results
+from orthoflow.engine.store import Publisher, Store, digest_of, list_results
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
 from tests.optional import skip

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.garbage import collect_garbage
-from orthoflow.engine.soundness import check_store
+from orthoflow.engine.cleaning import check_store, collect_garbage
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError
 

@@ -315,7 +315,7 @@ def test_a_clock_that_goes_back_changes_dates_alone(
         def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
             return datetime(2026, 11, 23, tzinfo=UTC) - timedelta(days=365 * next(looks))
 
-    monkeypatch.setattr("orthoflow.engine.clock.datetime", Clock)
+    monkeypatch.setattr("orthoflow.engine.environment.datetime", Clock)
     desk = desk_in(tmp_path / "desk")
     monkeypatch.chdir(desk.folder)
     with toy_world(desk.folder):

@@ -15,6 +15,7 @@ from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.engine.journal import JOURNAL, CellBegan, CellEnded, Journal
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,
@@ -22,9 +23,7 @@ from orthoflow.engine.results import (
     ProductRef,
     result_to_json,
 )
-from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
-from orthoflow.engine.store import Store
-from orthoflow.engine.stored_results import list_results
+from orthoflow.engine.store import Store, list_results
 from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp

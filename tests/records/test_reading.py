@@ -25,7 +25,7 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.record import write_record
 
 import orthoflow
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv

@@ -18,9 +18,9 @@ import pytest
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.engine.journal import is_running
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
-from orthoflow.engine.run_folder import is_running
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
@@ -319,7 +319,7 @@ def test_a_clock_that_goes_back_by_a_year_spoils_no_record(
             world.store,
             RunOptions(executor="inline"),
         )
-        monkeypatch.setattr("orthoflow.engine.clock.datetime", Back)
+        monkeypatch.setattr("orthoflow.engine.environment.datetime", Back)
         outcome = execute(plan, tmp_path / "run", world.store)
         run = write_run(outcome, plan, workflow, tmp_path / "run", world.store)
         monkeypatch.undo()

@@ -130,7 +130,7 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
     """Write a record with every product and input file in it; gives it opened."""
-    from orthoflow.engine.run_folder import RECORD_FILE
+    from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.engine.store import Store
     from orthoflow.records.writing import write_embedded
 

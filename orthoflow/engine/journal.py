@@ -1,4 +1,4 @@
-"""A run folder: names of what lies in it, and its journal, the truth while the run goes on."""
+"""A run folder: names of what lies in it, its journal, and what a run says while it goes on."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -17,12 +17,87 @@ from orthoflow_provenance.document import UnsafeFileError
 from orthoflow_provenance.paths import path_below
 from pydantic import TypeAdapter
 
-from orthoflow.engine.clock import now, time_in_a_name
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.engine.durability import sync_folder, writing_to
-from orthoflow.engine.results import CellStatus
+from orthoflow.engine.environment import now, time_in_a_name
+from orthoflow.engine.results import CellResult, CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
 from orthoflow.foreign_text import open_file
 from orthoflow.system import file_lock, flags
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunStarted:
+    """The run begins, or goes on after an interruption.
+
+    Attributes:
+        run_id: id of the run.
+        n_cells: cells in the plan.
+        is_resumed: the run folder held an unfinished run.
+    """
+
+    run_id: str
+    n_cells: int
+    is_resumed: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellStarted:
+    """A cell begins to run."""
+
+    address: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellProgress:
+    """A running cell is this far, 0..1."""
+
+    address: str
+    fraction: float
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellLogged:
+    """A running cell wrote a line to its log."""
+
+    address: str
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellReported:
+    """A running cell reports something that deserves attention."""
+
+    address: str
+    diagnostic: Diagnostic
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellFinished:
+    """A cell has its outcome.
+
+    Attributes:
+        address: of the cell.
+        result: ok, failed or skipped.
+        cached: the result was in the store, also when this run put it there before it was
+            interrupted.
+    """
+
+    address: str
+    result: CellResult
+    cached: bool
+
+
+RunEvent: TypeAlias = (
+    RunStarted | CellStarted | CellProgress | CellLogged | CellReported | CellFinished
+)
+RunListener: TypeAlias = Callable[[RunEvent], None]
+
+
+def ignore(event: RunEvent) -> None:
+    """Take an event and do nothing with it."""
+
 
 JOURNAL: Final = "journal.jsonl"
 RECORD_FILE: Final = "run.h5"

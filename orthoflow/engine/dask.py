@@ -1,9 +1,9 @@
-"""The executor for a cluster: dask carries tasks to workers that share the store's file system.
+"""The executor for a cluster: Dask carries tasks to workers that share the store's file system.
 
-A task is the same JSON as on one machine and runs in the same guarded child process there
-(`engine.dask_worker`); its products go into the store, and dask carries nothing but its result.
-Workers that this executor makes itself are threads of this process: all that they do is to wait for
-child processes, which so come from one server that has libraries loaded, not from one per worker.
+A worker runs a task in a process of its own as one machine does; its products go into the store,
+and Dask carries the task there and its result back. An attempt has a folder of its own in that of
+the task: a worker that was given up may still write into its own, and the number of folders says
+how often the task was tried. Workers that the executor makes itself are threads of this process.
 """
 
 from __future__ import annotations
@@ -13,27 +13,21 @@ import queue
 import time
 import uuid
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import dask
-from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed import Client, Future, KilledWorker, LocalCluster, Worker, get_worker
+from distributed.worker import WORKER_ANY_RUNNING
 
 from orthoflow.diagnostics import Diagnostic
-from orthoflow.engine.dask_worker import (
-    CANCEL_FILE,
-    Order,
-    Surroundings,
-    describe_loss,
-    look_around,
-    run_attempt,
-)
 from orthoflow.engine.durability import write_whole, writing_to
-from orthoflow.engine.local import Capacity, TaskEnd, Tell
-from orthoflow.engine.method_versions import methods_text
-from orthoflow.engine.results import CellResult, result_from_json
+from orthoflow.engine.environment import environment
+from orthoflow.engine.local import Capacity, LocalExecutor, TaskEnd, Tell
+from orthoflow.engine.method_versions import methods_text, misfit
+from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.worker import Task, failed_result
 from orthoflow.errors import (
     ArgumentError,
@@ -49,13 +43,121 @@ from orthoflow.sdk.lines import one_line
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
 
+
+# In the folder of a task: who finds it stops.
+CANCEL_FILE: Final = "cancel"
+_ATTEMPT: Final = "attempt-"
+_POLL_S: Final = 0.1
+_LOOK_S: Final = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a worker is told besides the task itself.
+
+    Attributes:
+        task: what to run.
+        name: what the scheduler calls it.
+        topic: where to say how it goes.
+        retries: so often it may be tried again after its worker was lost.
+        methods: what the plan says of its methods, see `methods_text`; empty for a worker in the
+            process that made the plan.
+    """
+
+    task: Task
+    name: str
+    topic: str
+    retries: int
+    methods: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """What a worker finds where it is.
+
+    Attributes:
+        seen: content of the file that it was asked to read, or why it cannot.
+        clock_s: its time, seconds since 1970.
+        misfit: in what its methods or libraries are others; empty when they are the same.
+    """
+
+    seen: str
+    clock_s: float
+    misfit: str
+
+
+def look_around(path: str, methods: str) -> Surroundings:
+    """Say what a worker sees: runs on each before it gets a task."""
+    try:
+        seen = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        seen = error.strerror or "it cannot be read"
+    return Surroundings(seen=seen, clock_s=time.time(), misfit=misfit(methods))
+
+
+def run_attempt(order: Order) -> str:
+    """Run a task in a child process of this worker; give its result as JSON."""
+    worker = get_worker()
+    task = order.task
+    home = Path(task.folder)
+    n_before = sum(1 for _ in home.glob(f"{_ATTEMPT}*"))
+    folder = home / f"{_ATTEMPT}{uuid.uuid4().hex[:12]}"
+    with writing_to(home):
+        folder.mkdir()
+    own = replace(
+        task, folder=str(folder), log=str(folder / "log"), environment=environment(task.cores)
+    )
+    if n_before > order.retries:
+        return _refused(own, StepFailedError(describe_loss(task.who, n_before)))
+    if wrong := order.methods and misfit(order.methods):
+        return _refused(own, PluginError(f"{task.who} cannot run on {worker.address}: {wrong}"))
+
+    def tell(_: str, event: StepEvent) -> None:
+        worker.log_event(order.topic, {"address": task.address, **asdict(event)})
+
+    executor = LocalExecutor(Capacity.of_jobs(1, task.cores), tell)
+    with closing(executor):
+        executor.start(own)
+        return result_to_json(_result(executor, home, worker, order.name))
+
+
+def describe_loss(who: str, times: int) -> str:
+    """Say that a task was given up because workers were lost under it."""
+    lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
+    return f"{who} was given up: {lost}; the logs of the workers may say why"
+
+
+def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> CellResult:
+    next_look_s, is_stopping = 0.0, False
+    while True:
+        for end in executor.poll(_POLL_S):
+            return end.result
+        if is_stopping or time.monotonic() < next_look_s:
+            continue
+        next_look_s = time.monotonic() + _LOOK_S
+        if (home / CANCEL_FILE).exists() or _is_given_up(worker, name):
+            is_stopping = True
+            executor.cancel()
+
+
+def _is_given_up(worker: Worker, name: str) -> bool:
+    """Whether nobody waits for a task any more: its run has ended, or gave it to another worker."""
+    state = worker.state.tasks.get(name)
+    is_closing = worker.status not in WORKER_ANY_RUNNING
+    return is_closing or state is None or state.state == "cancelled"
+
+
+def _refused(task: Task, error: StepFailedError | PluginError) -> str:
+    return result_to_json(failed_result(task, error))
+
+
 # The resource that workers state: cores that steps may use there.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
 # So long a run waits for a first worker, for a lost scheduler, and when all workers are gone.
 _PATIENCE_S: Final = 60.0
-_LOOK_S: Final = 2.0
+_WATCH_S: Final = 2.0
 # Steps have 5 s to stop by themselves, and their workers hear of it within one.
 _STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
@@ -231,7 +333,7 @@ class DaskExecutor:
     def _watch(self) -> None:
         """Look every two seconds who is there."""
         now = time.monotonic()
-        if now - self._looked < _LOOK_S:
+        if now - self._looked < _WATCH_S:
             return
         self._looked = now
         if self._client.status == "closed":
