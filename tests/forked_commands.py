@@ -105,7 +105,6 @@ def _close(server: subprocess.Popen[str]) -> None:
 def _serve() -> None:
     import orthoflow.cli
     import orthoflow.records.comparison
-    import orthoflow.records.distances
     import orthoflow.records.verification
     import orthoflow.records.writing
     import orthoflow.workflow.document

@@ -26,7 +26,7 @@ from PIL import Image
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.cli.options import Changes
+from orthoflow.cli.commands import Changes
 from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.calibration import lens_for, read_calibration

@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
-from orthoflow.cli.options import json_option, store_option
+from orthoflow.cli.commands import (
+    EXIT_GOOD,
+    EXIT_RECORD_DIFFERS,
+    Command,
+    LazyCommand,
+    LazyGroup,
+    json_option,
+    say_error,
+    store_option,
+)
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
 
 if TYPE_CHECKING:

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Changes, json_option, workflow_arguments
+from orthoflow.cli.commands import EXIT_GOOD, Changes, Command, json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 

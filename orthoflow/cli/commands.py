@@ -1,18 +1,37 @@
-"""What commands are made of: groups that load them on first use, `--debug`, one call's session."""
+"""What commands are made of: lazy groups, shared options, errors as sentences and exit codes."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shlex
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 from click.core import ParameterSource
 
+from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import GeometryError, OrthoflowError, ProductError, RecordError
+
+if TYPE_CHECKING:
+    from orthoflow.catalog.catalog import Catalog
+    from orthoflow.products.product import JsonValue
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
+
+
+if TYPE_CHECKING:
+    from orthoflow.workflow.model import (
+        Workflow,
+    )
+
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
 
@@ -181,3 +200,244 @@ def _keep_debug(ctx: click.Context, _param: click.Parameter, value: bool) -> Non
     session = ctx.find_object(Session)
     if session is not None and value:
         session.debug = True
+
+
+# Any: click decorates functions as well as commands.
+_Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
+
+DEFAULT_STORE: Final = Path(".orthoflow")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """What the command line puts in the place of what a workflow file says."""
+
+    sets: tuple[str, ...]
+    inputs: tuple[str, ...]
+    datasets: str | Mapping[str, JsonValue]
+    only_data: tuple[str, ...]
+    set_files: tuple[str, ...] = ()
+
+    def load(self, workflow: str, catalog: Catalog) -> Workflow:
+        """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
+        from orthoflow.workflow.document import load_workflow
+
+        return load_workflow(workflow, catalog, also_files=True, **vars(self))
+
+
+def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
+    """Add the workflow and `changes` to it: `WORKFLOW --set --set-file --input --datasets ...`."""
+
+    # Any: the command's parameters, whose types click has checked.
+    @wraps(run)
+    def command(**given: Any) -> int:
+        changes = Changes(**{item.name: given.pop(item.name) for item in fields(Changes)})
+        return run(changes=changes, **given)
+
+    command = click.option(
+        "--only-data",
+        "only_data",
+        multiple=True,
+        metavar="NAMES",
+        help="Run on these of the datasets, with commas between their names.",
+    )(command)
+    command = click.option(
+        "--datasets",
+        default="",
+        metavar="FILE",
+        help="Run on each dataset of a CSV file: the column name, and a column per input.",
+    )(command)
+    command = input_option(command)
+    command = click.option(
+        "--set-file",
+        "set_files",
+        multiple=True,
+        metavar="FILE",
+        help="Change the parameters that a YAML file names: step.parameter: value.",
+    )(command)
+    command = click.option(
+        "--set",
+        "sets",
+        multiple=True,
+        metavar="STEP.PARAM=VALUE",
+        help="Change a parameter, e.g. wall.gsd_m=0.002 or plane.ransac.tolerance_m=0.05.",
+    )(command)
+    return click.argument("workflow", metavar="WORKFLOW")(command)
+
+
+def input_option(command: _Decorated) -> _Decorated:
+    """Add `--input`."""
+    return click.option(
+        "--input",
+        "inputs",
+        multiple=True,
+        metavar="NAME=PATH",
+        help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
+    )(command)
+
+
+def selection_options(command: _Decorated) -> _Decorated:
+    """Add the options that choose steps: `--only --from --until --force`."""
+    for name, parameter, text in [
+        ("--force", "force", "Run this step although its result is stored."),
+        ("--until", "until", "Run this step and what it needs."),
+        ("--from", "from_", "Run this step and what follows; what it needs must be stored."),
+        ("--only", "only", "Run this step alone; what it needs must be stored."),
+    ]:
+        command = click.option(
+            name, parameter, metavar="STEP", multiple=True, help=f"{text} Repeatable."
+        )(command)
+    return command
+
+
+def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
+    """Add `-o`; `name` is the folder's name where none is given."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path, file_okay=False),
+        metavar="RUNDIR",
+        help=f"Folder of this run.  [default: runs/{name}]",
+    )
+
+
+def execution_options(command: _Decorated) -> _Decorated:
+    """Add how steps run: `--jobs --executor --scheduler --retries`."""
+    command = click.option(
+        "--retries",
+        type=int,
+        default=2,
+        show_default=True,
+        metavar="N",
+        help="With dask: try a step again so often whose worker was lost.",
+    )(command)
+    command = click.option(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="With dask: the cluster's scheduler, tcp://HOST:PORT; without it, N workers here.",
+    )(command)
+    command = click.option(
+        "--executor",
+        type=click.Choice(["local", "inline", "dask"]),
+        default="local",
+        help="A process per step, all in this one (for debugging; a step's memory then holds what "
+        "earlier ones left, too), or on the workers of dask.",
+    )(command)
+    return click.option(
+        "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
+    )(command)
+
+
+def store_option(command: _Decorated) -> _Decorated:
+    """Add `--store`."""
+    return click.option(
+        "--store",
+        type=click.Path(path_type=Path, file_okay=False),
+        default=DEFAULT_STORE,
+        show_default=True,
+        metavar="DIR",
+        help="Folder of stored results.",
+    )(command)
+
+
+def json_option(command: _Decorated) -> _Decorated:
+    """Add `--json`."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
+
+
+EXIT_GOOD: Final = 0
+EXIT_CELL_FAILED: Final = 1
+EXIT_INVALID: Final = 2
+EXIT_RECORD_DIFFERS: Final = 3
+EXIT_PLUGIN_MISSING: Final = 4
+EXIT_INTERRUPTED: Final = 130
+
+
+def explain(error: Exception, session: Session) -> int:
+    """Tell the user about an error that ended a command.
+
+    Returns:
+        The exit code of the process.
+    """
+    from orthoflow.engine.measuring import is_for_want_of_memory
+    from orthoflow.sdk.lines import one_line
+
+    if session.debug:
+        import traceback
+
+        say_error(*"".join(traceback.format_exception(error)).rstrip("\n").split("\n"))
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        say_error(session.resume_hint or "interrupted")
+        return EXIT_INTERRUPTED
+    if isinstance(error, OrthoflowError):
+        interrupted = error.exit_code == EXIT_INTERRUPTED
+        hint = session.resume_hint if interrupted else ""
+        say_error(*([hint] if hint else _sentences(error)))
+        return error.exit_code
+    if is_for_want_of_memory(error):
+        say_error("error: not enough memory to go on; free some, or raise the limit on memory")
+        return EXIT_CELL_FAILED
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        say_error(f"error: {where}{error.strerror.lower()}")
+        return EXIT_CELL_FAILED
+    if isinstance(error, ImportError):
+        say_error(
+            f"error: a library fails to import: {one_line(error)}; `orthoflow doctor` says what is "
+            f"missing"
+        )
+        return EXIT_PLUGIN_MISSING
+    say_error(
+        f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
+        "repeat the command with --debug and report what it prints"
+    )
+    return EXIT_CELL_FAILED
+
+
+def _sentences(error: OrthoflowError) -> list[str]:
+    n_problems = len(getattr(error, "problems", ()))
+    if not n_problems:
+        return [f"error: {error_text(error)}"]
+    # Lines that begin with file:line:column, as editors and other tools expect them.
+    return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
+
+
+def error_text(error: Exception) -> str:
+    """Give the sentence of an error; `str` of an OSError without arguments would be empty."""
+    return str(error) or type(error).__name__
+
+
+def say_error(*lines: str) -> None:
+    """Write lines to standard error; a closed one is no reason to fail."""
+    with contextlib.suppress(BrokenPipeError):
+        echo(*lines, err=True)
+
+
+def say_doubts(workflow: Workflow) -> None:
+    """Write to standard error what is allowed in a workflow and can hardly be meant."""
+    from orthoflow.workflow.checks import doubts_about
+
+    for doubt in doubts_about(workflow):
+        say_error(f"workflow: warning: {doubt}")
+
+
+def code_for(doubts: Iterable[str], consequence: str) -> int:
+    """Tell which records are not as they were written and what follows, and give the exit code."""
+    told = [f"error: {doubt}; {consequence}" for doubt in doubts if doubt]
+    if not told:
+        return EXIT_GOOD
+    say_error(*told)
+    return EXIT_RECORD_DIFFERS
+
+
+def silence_stdout() -> None:
+    """Send what is still to be printed nowhere, so that a closed pipe makes no noise at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _first_line(text: str) -> str:
+    return (text.splitlines() or [""])[0]

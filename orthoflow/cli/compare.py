@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 from orthoflow.alike import first_few
-from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import code_for
-from orthoflow.cli.options import json_option, store_option
+from orthoflow.cli.commands import RecordCommand, code_for, json_option, store_option
 from orthoflow.cli.tables import (
     ROWS_MOST,
     counted,

@@ -6,10 +6,14 @@ from pathlib import Path
 
 import click
 
-from orthoflow.cli.commands import Command
+from orthoflow.cli.commands import (
+    EXIT_GOOD,
+    EXIT_PLUGIN_MISSING,
+    Command,
+    json_option,
+    store_option,
+)
 from orthoflow.cli.diagnosis import Diagnosis, diagnose_libraries, diagnose_machine
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
-from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.version import __version__
 

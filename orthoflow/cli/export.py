@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from orthoflow.cli.commands import RecordCommand
+from orthoflow.cli.commands import RecordCommand, code_for, input_option, say_error, store_option
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import FORMATS, Format, check_choices
 from orthoflow.cli.exports.products import make_empty
-from orthoflow.cli.failures import code_for, say_error
-from orthoflow.cli.options import input_option, store_option
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError, RecordError
 
@@ -225,7 +223,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
-    from orthoflow.records.files_anew import with_files
+    from orthoflow.records.wall_results import with_files
 
     if not target.takes_rasters:
         return target.load()(run, folder, chosen)
@@ -253,8 +251,7 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
 def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.engine.store import Store
     from orthoflow.records.datasets import parts_of, write_part
-    from orthoflow.records.run_files import path_inside
-    from orthoflow.records.runs import REPORT_FILE
+    from orthoflow.records.runs import REPORT_FILE, path_inside
     from orthoflow.report import write_page
 
     parts = parts_of(run)

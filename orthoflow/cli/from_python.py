@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from orthoflow.catalog.wording import did_you_mean
-from orthoflow.cli.options import DEFAULT_STORE, Changes
+from orthoflow.cli.commands import DEFAULT_STORE, Changes
 from orthoflow.cli.run import prepared
 from orthoflow.errors import ArgumentError
 

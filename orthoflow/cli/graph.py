@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Changes, workflow_arguments
+from orthoflow.cli.commands import EXIT_GOOD, Changes, Command, workflow_arguments
 from orthoflow.cli.tables import echo
 
 

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import echo, echo_folded, echo_json
 from orthoflow.errors import ArgumentError
 

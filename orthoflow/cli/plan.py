@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD, say_doubts
-from orthoflow.cli.options import (
+from orthoflow.cli.commands import (
+    EXIT_GOOD,
     Changes,
+    Command,
     json_option,
+    say_doubts,
     selection_options,
     store_option,
     workflow_arguments,

@@ -20,9 +20,15 @@ import click
 from orthoflow.catalog.catalog import Announced, Catalog, MethodEntry
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import DistributionInfo
-from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
-from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISSING
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import (
+    EXIT_CELL_FAILED,
+    EXIT_GOOD,
+    EXIT_PLUGIN_MISSING,
+    Command,
+    LazyCommand,
+    LazyGroup,
+    json_option,
+)
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
 

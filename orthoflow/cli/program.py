@@ -12,8 +12,16 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from orthoflow.cli.commands import LazyCommand, LazyGroup, Session, debug_parameter
-from orthoflow.cli.failures import EXIT_CELL_FAILED, explain, say_error, silence_stdout
+from orthoflow.cli.commands import (
+    EXIT_CELL_FAILED,
+    LazyCommand,
+    LazyGroup,
+    Session,
+    debug_parameter,
+    explain,
+    say_error,
+    silence_stdout,
+)
 from orthoflow.cli.tables import echo
 from orthoflow.version import __version__
 

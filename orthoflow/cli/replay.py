@@ -14,14 +14,17 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from orthoflow.alike import first_few
-from orthoflow.cli.commands import RecordCommand, current_session
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
-from orthoflow.cli.options import (
+from orthoflow.cli.commands import (
     DEFAULT_STORE,
+    EXIT_GOOD,
+    EXIT_RECORD_DIFFERS,
+    RecordCommand,
+    current_session,
     execution_options,
     input_option,
     json_option,
     output_option,
+    say_error,
 )
 from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
@@ -29,8 +32,7 @@ from orthoflow.errors import CancelledStepError, ClusterError
 if TYPE_CHECKING:
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
-    from orthoflow.records.distances import ProductDistance
-    from orthoflow.records.replay_metrics import ReplayedMetric
+    from orthoflow.records.comparison import ProductDistance, ReplayedMetric
     from orthoflow.records.replaying import Replay
     from orthoflow.records.runs import Run
 
@@ -76,8 +78,8 @@ def replay(
     from orthoflow.engine.journal import new_run_folder, new_run_id
     from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.store import Store
-    from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
+    from orthoflow.records.runs import embedded_inputs
     from orthoflow.records.unfinished import open_run
 
     options = RunOptions(**choices)
@@ -155,7 +157,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare and say how far the products lie apart."""
-        from orthoflow.records.replay_metrics import DIFFERING, replayed_metrics
+        from orthoflow.records.comparison import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
 
         current_session().resume_hint = (
@@ -217,7 +219,7 @@ class _Call:
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog.discovery import discover_catalog
-        from orthoflow.records.distances import RunProducts, product_distances
+        from orthoflow.records.comparison import RunProducts, product_distances
 
         return product_distances(
             RunProducts(run=self.original, stores=_earlier_stores()),

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import click
 
-from orthoflow.cli.commands import RecordCommand
-from orthoflow.cli.failures import code_for
-from orthoflow.cli.options import store_option
+from orthoflow.cli.commands import RecordCommand, code_for, store_option
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError
 

@@ -12,13 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from orthoflow.cli.commands import Command, command_again, current_session
-from orthoflow.cli.failures import say_doubts, say_error, silence_stdout
-from orthoflow.cli.options import (
+from orthoflow.cli.commands import (
     Changes,
+    Command,
+    command_again,
+    current_session,
     execution_options,
     output_option,
+    say_doubts,
+    say_error,
     selection_options,
+    silence_stdout,
     store_option,
     workflow_arguments,
 )
@@ -242,7 +246,7 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
         ArgumentError: the file cannot be written.
     """
     from orthoflow.engine.journal import CellFinished
-    from orthoflow.records.diagnostics import diagnostics_of
+    from orthoflow.records.tables import diagnostics_of
 
     if path is None:
         yield lambda _: None

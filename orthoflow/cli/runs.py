@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from orthoflow.alike import first_few
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
 from orthoflow.foreign_text import csv_text
 
@@ -139,7 +137,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     from orthoflow.engine.durability import write_whole, writing_to
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
-    from orthoflow.records.joined import join_runs, joined_csv
+    from orthoflow.records.tables import join_runs, joined_csv
     from orthoflow.records.unfinished import open_run
     from orthoflow.report.browsing import run_folders
 

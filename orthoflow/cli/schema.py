@@ -6,9 +6,7 @@ import json
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import echo
 
 

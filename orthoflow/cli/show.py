@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.commands import RecordCommand
+from orthoflow.cli.commands import EXIT_GOOD, RecordCommand, code_for, json_option
 from orthoflow.cli.diagnosis import LIBRARIES
-from orthoflow.cli.failures import EXIT_GOOD, code_for
-from orthoflow.cli.options import json_option
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
     ROWS_MOST,
@@ -239,7 +237,7 @@ def _print_files(run: Run) -> None:
 
 
 def _as_json(run: Run) -> dict[str, object]:
-    from orthoflow.records.diagnostics import diagnostics_of
+    from orthoflow.records.tables import diagnostics_of
 
     record = run.record
     values = dataclasses.asdict(dataclasses.replace(record, cells=()))

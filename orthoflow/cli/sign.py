@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.commands import EXIT_GOOD, Command
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.foreign_text import shown
@@ -29,8 +28,7 @@ def sign(run: Path, key: Path) -> int:
     The signature lies beside the record as run.h5.sig and changes nothing in it. Only a record that
     verifies is signed. `orthoflow verify RUN --signer FILE` checks it with your public key.
     """
-    from orthoflow.records.signatures import SIGNATURE_SUFFIX, sign_record
-    from orthoflow.records.verification import verify_run
+    from orthoflow.records.verification import SIGNATURE_SUFFIX, sign_record, verify_run
 
     verification = verify_run(run)
     if verification.findings:

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import EXIT_GOOD, EXIT_RECORD_DIFFERS, Command, json_option, say_error
 from orthoflow.cli.tables import counted, echo, echo_json
 
 if TYPE_CHECKING:

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.commands import Command
-from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD
-from orthoflow.cli.options import json_option
+from orthoflow.cli.commands import EXIT_CELL_FAILED, EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, duration, echo, echo_json, size
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Two runs side by side: what is the same in both, and what differs is named."""
+"""Two runs side by side: how far products lie apart, and what else differs."""
 
 from __future__ import annotations
 
@@ -6,29 +6,237 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeVar
 
+import numpy as np
+from orthoflow_provenance.arrays import ArrayDifference, measure_payloads
 from orthoflow_provenance.document import (
     COSTS,
     MethodIdentity,
     RecordedCell,
     RecordedFile,
+    RecordedProduct,
     RunRecord,
     canonical_json,
     shared_fields,
 )
 
 from orthoflow.engine.keys import read_preimage, stated_versions
-from orthoflow.products.product import JsonValue
-from orthoflow.records.distances import ProductDistance, RunProducts, product_distances
-from orthoflow.records.metrics import cell_metrics, is_rounding
+from orthoflow.errors import OrthoflowError
+from orthoflow.geometry.levels import DEEPER
+from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
+from orthoflow.records.published import cell_metrics, is_rounding
 from orthoflow.records.runs import Run
 from orthoflow.workflow.model import DATA, SEED
+
+if TYPE_CHECKING:
+    from orthoflow.catalog.catalog import Catalog
+    from orthoflow.engine.store import Store
+
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from orthoflow.engine.store import Store
+
+
+Verdict = Literal["identical", "within tolerance", "different", "not measured"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distance:
+    """The largest difference among all fields of one unit.
+
+    Attributes:
+        unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
+        largest: largest absolute difference in that unit; None where values cannot be subtracted
+            (another shape or type, missing, NaN against a number).
+        limit: what the type allows in the field that lies farthest apart.
+        field: that field, e.g. `walls/0/depth_m`.
+        n_values: how many values of the unit lie beyond their limit.
+    """
+
+    unit: str
+    largest: float | None
+    limit: float
+    field: str
+    n_values: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductDistance:
+    """Two products that ought to be one.
+
+    Attributes:
+        cell: address of the cell that gave them.
+        port: its output port.
+        type_name: product type.
+        verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` where
+            the digests differ and the arrays of one of them are nowhere to be found.
+        left: digest of the first, empty when it has none.
+        right: digest of the second, empty when it has none.
+        distances: one per unit in which they differ.
+        reason: one sentence for `different` and `not measured`, else empty.
+    """
+
+    cell: str
+    port: str
+    type_name: str
+    verdict: Verdict
+    left: str
+    right: str
+    distances: tuple[Distance, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunProducts:
+    """The products of a run, from its record or a store.
+
+    Attributes:
+        run: the run.
+        stores: where arrays may lie that the record names by digest only.
+        own: address by which a cell is asked for -> its own one, where the two differ.
+    """
+
+    run: Run
+    stores: tuple[Store, ...] = ()
+    own: Mapping[str, str] = field(default_factory=dict)
+
+    def outputs(self, address: str) -> Mapping[str, RecordedProduct]:
+        """Outputs of a cell by port; empty where the run has no such cell."""
+        cell = self.run.cells.get(self.own.get(address, address))
+        return {} if cell is None else cell.outputs
+
+    def digest(self, address: str, port: str) -> str:
+        """Digest of an output, empty when the run has no such output."""
+        output = self.outputs(address).get(port)
+        return "" if output is None else output.digest
+
+    def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
+        """Return arrays and metadata of an output; None when they are nowhere to be found."""
+        output = self.outputs(address)[port]
+        if output.embedded:
+            return self.run.payload(self.own.get(address, address), port)
+        for store in self.stores:
+            if store.product_file(output.digest) is not None:
+                return store.get_product(output.digest, cls).to_payload()
+        return None
+
+
+def product_distances(
+    left: RunProducts, right: RunProducts, addresses: Sequence[str], catalog: Catalog
+) -> tuple[ProductDistance, ...]:
+    """Compare the outputs of cells that both runs have.
+
+    Args:
+        left: one run.
+        right: the other.
+        addresses: the cells, each in both runs.
+        catalog: knows the product types and with them the tolerances.
+    """
+    found = []
+    for address in addresses:
+        ours, theirs = left.outputs(address), right.outputs(address)
+        for port in dict.fromkeys((*ours, *theirs)):
+            type_name = (ours.get(port) or theirs[port]).type_name
+            found.append(_distance(left, right, (address, port, type_name), catalog))
+    return tuple(found)
+
+
+def _distance(
+    left: RunProducts, right: RunProducts, what: tuple[str, str, str], catalog: Catalog
+) -> ProductDistance:
+    address, port, type_name = what
+    digests = left.digest(address, port), right.digest(address, port)
+
+    def verdict(
+        said: Verdict, reason: str = "", distances: tuple[Distance, ...] = ()
+    ) -> ProductDistance:
+        return ProductDistance(
+            cell=address,
+            port=port,
+            type_name=type_name,
+            verdict=said,
+            left=digests[0],
+            right=digests[1],
+            distances=distances,
+            reason=reason,
+        )
+
+    if not all(digests):
+        return verdict("different", "only one of the runs has it")
+    if digests[0] == digests[1]:
+        return verdict("identical")
+    try:
+        cls = catalog.product_class(type_name)
+        payloads = [side.payload(address, port, cls) for side in (left, right)]
+    except OrthoflowError as error:
+        return verdict("not measured", f"the digests differ, and {error}")
+    ours, theirs = payloads
+    if ours is None or theirs is None:
+        return verdict(
+            "not measured",
+            "the digests differ, and its arrays are in no record and no store at hand; run with "
+            "--embed to keep them",
+        )
+    limits = {
+        name: (_limit(name, tolerance, ours), tolerance.unit)
+        for name, tolerance in cls.tolerances.items()
+    }
+    differences = [_named(found, ours) for found in measure_payloads(ours, theirs, limits)]
+    beyond = [difference for difference in differences if difference.n_values]
+    if not beyond:
+        return verdict(
+            "within tolerance" if differences else "identical", "", _by_unit(differences)
+        )
+    others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
+    reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
+    return verdict("different", reason, _by_unit(differences))
+
+
+def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
+    """Tell a value that lies in a list by the name and the unit that stand beside it."""
+    way = difference.name.split("/")
+    beside: JsonValue = dict(payload.metadata)
+    for part in way[:-1]:
+        if isinstance(beside, dict):
+            beside = beside.get(part)
+        elif isinstance(beside, list) and part.isdecimal() and int(part) < len(beside):
+            beside = beside[int(part)]
+    if way[-1] != "value" or not isinstance(beside, dict) or "name" not in beside:
+        return difference
+    unit = beside.get("unit", difference.unit)
+    return replace(difference, name=f"{beside['name']}, {difference.name}", unit=str(unit))
+
+
+def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
+    """How far values of a field may lie apart; grey levels of 16 bits count in steps of 257."""
+    is_deep = tolerance.unit == "grey" and any(
+        array.dtype == np.uint16 and path.rpartition("/")[2] == name
+        for path, array in payload.arrays.items()
+    )
+    return tolerance.limit * (DEEPER if is_deep else 1)
+
+
+def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
+    units = dict.fromkeys(difference.unit for difference in differences)
+    return tuple(
+        _farthest([difference for difference in differences if difference.unit == unit])
+        for unit in units
+    )
+
+
+def _farthest(differences: Sequence[ArrayDifference]) -> Distance:
+    worst = max(differences, key=lambda difference: difference.largest)
+    return Distance(
+        unit=worst.unit,
+        largest=worst.largest if math.isfinite(worst.largest) else None,
+        limit=worst.limit,
+        field=worst.name,
+        n_values=sum(difference.n_values for difference in differences),
+    )
+
 
 Side = TypeVar("Side")
 # Seconds and memory that methods measured themselves hang on the machine, too.
@@ -550,3 +758,87 @@ def _environment(record: RunRecord) -> dict[str, str]:
 
 def _joined(values: Iterable[str]) -> str:
     return ", ".join(sorted(values))
+
+
+MetricVerdict = Literal[
+    "same", "rounding", "products", "not in the record", "code changed", "different"
+]
+# Verdicts that make a replay differ.
+DIFFERING: Final = frozenset({"code changed", "different"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayedMetric:
+    """One number that a record states or a replay computed.
+
+    Attributes:
+        cell: address of its cell.
+        metric: its name.
+        recorded: what the record states, None when nothing.
+        recorded_unit: in which unit.
+        replayed: what the replay computed, None when nothing.
+        replayed_unit: in which unit.
+        verdict: `same` bits; within `rounding`; moved with `products` of its step that are not the
+            same bits, though within their tolerance or not measured; `not in the record`; of a
+            step behind which a method's `code changed`; else `different`.
+    """
+
+    cell: str
+    metric: str
+    recorded: float | None
+    recorded_unit: str
+    replayed: float | None
+    replayed_unit: str
+    verdict: MetricVerdict
+
+
+def replayed_metrics(
+    original: Run,
+    made: Run,
+    distances: Sequence[ProductDistance],
+    changed_methods: Collection[str] = (),
+) -> tuple[ReplayedMetric, ...]:
+    """Compare the numbers of a record with those of its replay, times and memory left out.
+
+    Args:
+        original: the run that was replayed.
+        made: the replay.
+        distances: of all their products.
+        changed_methods: ids of the methods whose code is not that of the record.
+    """
+    identical = {f"{item.cell}.{item.port}" for item in distances if item.verdict == "identical"}
+    is_changed = {
+        address: any(cell.method in changed_methods for cell in original.upstream(address))
+        for address in original.cells
+    }
+
+    def verdict(pair: Pair[ComparedMetric]) -> MetricVerdict:
+        if pair.is_same:
+            return "same"
+        if pair.left is None:
+            return "not in the record"
+        if pair.left.is_near(pair.right):
+            return "rounding"
+        if is_changed[pair.cell]:
+            return "code changed"
+        return "different" if _is_of_identical(original.cells[pair.cell], identical) else "products"
+
+    return tuple(
+        ReplayedMetric(
+            cell=pair.cell,
+            metric=pair.name,
+            recorded=pair.left.value if pair.left else None,
+            recorded_unit=pair.left.unit if pair.left else "",
+            replayed=pair.right.value if pair.right else None,
+            replayed_unit=pair.right.unit if pair.right else "",
+            verdict=verdict(pair),
+        )
+        for pair in compare_metrics(original, made)
+    )
+
+
+def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:
+    """Whether a step took and gave the same bits in both runs; input files always are the same."""
+    taken = {given.source for given in cell.inputs.values()}
+    given = {f"{cell.address}.{port}" for port in cell.outputs}
+    return all(one in identical or one.startswith("inputs.") for one in taken | given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import mimetypes
 import re
@@ -9,30 +10,274 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
-from orthoflow_provenance.document import RecordedCell, RunRecord
+from orthoflow_provenance.document import (
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFile,
+    RecordedProduct,
+    RunRecord,
+    cost_metrics,
+)
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name
 from orthoflow.errors import RecordError
 from orthoflow.products.product import JsonValue
-from orthoflow.records import crate_entities as entities
-from orthoflow.records.crate_entities import (
-    RESOLVED_FILE,
-    WORKFLOW_FILE,
-    Entity,
-    environment_file,
-    ref,
-    refs,
-)
 from orthoflow.records.datasets import pages_of
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.run_files import copy_files, creating, figure_files, path_inside
-from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, REPORT_FILE, Run
-from orthoflow.records.signatures import SIGNATURE_SUFFIX
-from orthoflow.records.verification import page_of
+from orthoflow.records.runs import (
+    FIGURES_FOLDER,
+    GRAPH_FILE,
+    REPORT_FILE,
+    Run,
+    copy_files,
+    creating,
+    figure_files,
+    path_inside,
+)
+from orthoflow.records.verification import SIGNATURE_SUFFIX, page_of
 from orthoflow.version import DISTRIBUTION
+
+Entity: TypeAlias = dict[str, JsonValue]
+
+WORKFLOW_FILE: Final = "workflow.yaml"
+RESOLVED_FILE: Final = "workflow-resolved.json"
+_DONE: Final = "http://schema.org/CompletedActionStatus"
+_FAILED: Final = "http://schema.org/FailedActionStatus"
+_UNIT_CODES: Final = {
+    "s": "https://qudt.org/vocab/unit/SEC",
+    "MiB": "https://qudt.org/vocab/unit/MebiBYTE",
+    "1": "https://qudt.org/vocab/unit/UNITLESS",
+}
+
+
+def ref(identifier: str) -> dict[str, JsonValue]:
+    """Point at an entity."""
+    return {"@id": identifier}
+
+
+def refs(identifiers: Iterator[str] | tuple[str, ...]) -> list[JsonValue]:
+    """Point at entities, each once."""
+    return [ref(identifier) for identifier in dict.fromkeys(identifiers)]
+
+
+def file_id(file: RecordedFile) -> str:
+    """Name a file that is not in the crate by its content (RFC 6920).
+
+    >>> file_id(RecordedFile(name="a", size_bytes=0, sha256="00" * 32))[:20]
+    'ni:///sha-256;AAAAAA'
+    """
+    digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
+    return f"ni:///sha-256;{digest}"
+
+
+def product_id(product: RecordedProduct) -> str:
+    """Name a product by its digest."""
+    return f"#product-{product.digest.removeprefix('sha256:')}"
+
+
+def environment_file(environment: RecordedEnvironment) -> str:
+    """Name of the list of packages of an environment."""
+    return f"requirements-{environment.id.removeprefix('sha256:')[:12]}.txt"
+
+
+def ran(record: RunRecord) -> tuple[RecordedCell, ...]:
+    """Cells that were executed; skipped ones are no actions."""
+    return tuple(cell for cell in record.cells if cell.status != "skipped")
+
+
+def tool_id(cell: RecordedCell) -> str:
+    """Name the method of a cell."""
+    return f"#method-{cell.method}"
+
+
+def step_id(cell: RecordedCell) -> str:
+    """Name the step of a cell, one per variant."""
+    variant = cell.assignment.get(cell.step, "")
+    return f"{WORKFLOW_FILE}#{cell.step}{f'.{variant}' if variant else ''}"
+
+
+def action_id(cell: RecordedCell) -> str:
+    """Name the execution of a cell."""
+    return f"#run-of-{cell.address}"
+
+
+def formal_id(owner: str, name: str) -> str:
+    """Name a formal parameter: an input, output or setting of a method or of the workflow."""
+    return f"{owner}/{name}" if "#" in owner else f"{owner}#{name}"
+
+
+def status_of(*, is_ok: bool) -> str:
+    """Name of the status of an action."""
+    return _DONE if is_ok else _FAILED
+
+
+def value_type(value: JsonValue) -> str:
+    """Schema.org's name for the type of a setting; what is no scalar is written as JSON text."""
+    names = {bool: "Boolean", int: "Integer", float: "Float"}
+    return names.get(type(value), "Text")
+
+
+def port_type(product: RecordedProduct) -> str:
+    """Schema.org's name for what a port takes: files of the user, or products of the record."""
+    return "File" if product.type_name == "files" else "CreativeWork"
+
+
+def value_text(value: JsonValue) -> JsonValue:
+    """Give a setting as a scalar."""
+    if isinstance(value, bool | int | float | str):
+        return value
+    return json.dumps(value, ensure_ascii=False)
+
+
+def formal(identifier: str, name: str, additional_type: str) -> Entity:
+    """A formal parameter."""
+    return {
+        "@id": identifier,
+        "@type": "FormalParameter",
+        "additionalType": additional_type,
+        "name": name,
+    }
+
+
+def method_entities(record: RunRecord) -> Iterator[Entity]:
+    """Methods with their ports and settings, and the distributions that brought them."""
+    by_tool: dict[str, list[RecordedCell]] = {}
+    for cell in ran(record):
+        by_tool.setdefault(tool_id(cell), []).append(cell)
+    brought: dict[str, Entity] = {}
+    for tool, cells in by_tool.items():
+        first = cells[0]
+        origin = f"#distribution-{first.distribution}"
+        brought[origin] = {
+            "@id": origin,
+            "@type": "SoftwareApplication",
+            "name": first.distribution,
+            "version": first.distribution_version,
+        }
+        settings = {name: value for cell in cells for name, value in cell.params.items()}
+        ports = {port: product for cell in cells for port, product in cell.inputs.items()}
+        outputs = {port: product for cell in cells for port, product in cell.outputs.items()}
+        yield {
+            "@id": tool,
+            "@type": "SoftwareApplication",
+            "name": first.method,
+            "softwareVersion": f"{first.distribution_version}, result version "
+            f"{first.result_version}",
+            "description": f"{first.determinism} method of {first.distribution}",
+            "input": refs(formal_id(tool, name) for name in (*ports, *settings)),
+            "output": refs(formal_id(tool, f"out/{name}") for name in outputs),
+            "softwareRequirements": ref(origin),
+            "mainEntity": ref(origin),
+            "citation": list(first.citations),
+        }
+        for port, product in ports.items():
+            yield formal(formal_id(tool, port), port, port_type(product))
+        for name, value in settings.items():
+            yield formal(formal_id(tool, name), name, value_type(value))
+        for port, product in outputs.items():
+            yield formal(formal_id(tool, f"out/{port}"), port, port_type(product))
+    yield from brought.values()
+
+
+def cell_entities(record: RunRecord) -> Iterator[Entity]:
+    """What happened: an action per cell, its control, its settings, costs and metrics."""
+    files = {entry.name: entry.files for entry in record.inputs}
+    for cell in ran(record):
+        action = action_id(cell)
+        settings = list(_settings(cell))
+        costs = list(_costs(cell))
+        metrics = list(_metrics(cell))
+        taken = [
+            identifier
+            for product in cell.inputs.values()
+            for identifier in _sources(product, files)
+        ]
+        content: Entity = {
+            "@id": action,
+            "@type": "CreateAction",
+            "name": f"{cell.method} as {cell.address}",
+            "description": _history(cell),
+            "instrument": ref(tool_id(cell)),
+            "startTime": cell.started,
+            "endTime": cell.ended,
+            "actionStatus": status_of(is_ok=cell.status == "ok"),
+            "object": refs((*taken, *(str(entity["@id"]) for entity in settings))),
+            "result": refs(
+                (
+                    *(product_id(product) for product in cell.outputs.values()),
+                    *(str(entity["@id"]) for entity in metrics),
+                )
+            ),
+            "resourceUsage": refs(tuple(str(entity["@id"]) for entity in costs)),
+        }
+        if cell.status == "failed":
+            content["error"] = cell.error_message
+        yield content
+        yield {
+            "@id": f"#control-of-{cell.address}",
+            "@type": "ControlAction",
+            "name": f"orchestrate {cell.address}",
+            "instrument": ref(step_id(cell)),
+            "object": ref(action),
+        }
+        yield from (*settings, *costs, *metrics)
+
+
+def _sources(
+    product: RecordedProduct, files: Mapping[str, tuple[RecordedFile, ...]]
+) -> Iterator[str]:
+    owner, _, name = product.source.rpartition(".")
+    if owner == "inputs":
+        yield from (file_id(file) for file in files.get(name, ()))
+    else:
+        yield product_id(product)
+
+
+def _history(cell: RecordedCell) -> str:
+    if cell.cached_from:
+        return f"computed by the earlier run {cell.cached_from} and taken from the store"
+    return "computed in this run" if cell.status == "ok" else "failed in this run"
+
+
+def _settings(cell: RecordedCell) -> Iterator[Entity]:
+    for name, value in cell.params.items():
+        example = [ref(formal_id(tool_id(cell), name))]
+        if name in cell.params_set:
+            example.append(ref(formal_id(step_id(cell), name)))
+        yield {
+            "@id": f"#setting-{cell.address}/{name}",
+            "@type": "PropertyValue",
+            "name": name,
+            "value": value_text(value),
+            "exampleOfWork": list(example),
+        }
+
+
+def _costs(cell: RecordedCell) -> Iterator[Entity]:
+    for cost in cost_metrics(cell):
+        yield {
+            "@id": f"#cost-{cell.address}/{cost.name}",
+            "@type": "PropertyValue",
+            "name": cost.name,
+            "propertyID": cost.name,
+            "unitCode": _UNIT_CODES[cost.unit],
+            "value": str(cost.value),
+        }
+
+
+def _metrics(cell: RecordedCell) -> Iterator[Entity]:
+    for metric in cell.metrics:
+        yield {
+            "@id": f"#metric-{cell.address}/{metric.name}",
+            "@type": "PropertyValue",
+            "name": metric.name,
+            "unitText": metric.unit,
+            "value": metric.value,
+        }
+
 
 NO_LICENSE: Final = "not stated: ask who made these results"
 METADATA_FILE: Final = "ro-crate-metadata.json"
@@ -192,12 +437,12 @@ class _Crate:
         yield from self._input_files()
         yield from self._products()
         yield from self._run()
-        yield from entities.method_entities(self.record)
-        yield from entities.cell_entities(self.record)
+        yield from method_entities(self.record)
+        yield from cell_entities(self.record)
 
     @property
     def _cells(self) -> tuple[RecordedCell, ...]:
-        return entities.ran(self.record)
+        return ran(self.record)
 
     def _root(self) -> Entity:
         record = self.record
@@ -213,7 +458,7 @@ class _Crate:
             "conformsTo": refs(tuple(_PROFILES)),
             "hasPart": refs((*self.files, *self._input_ids())),
             "mainEntity": ref(WORKFLOW_FILE),
-            "mentions": refs((_RUN, *(entities.action_id(cell) for cell in self._cells))),
+            "mentions": refs((_RUN, *(action_id(cell) for cell in self._cells))),
         }
         if self.author:
             root["author"] = root["creator"] = ref(self._author_id)
@@ -229,7 +474,7 @@ class _Crate:
         return found[0] if found else ""
 
     def _input_ids(self) -> tuple[str, ...]:
-        return tuple(entities.file_id(file) for entry in self.record.inputs for file in entry.files)
+        return tuple(file_id(file) for entry in self.record.inputs for file in entry.files)
 
     def _workflow(self) -> Entity:
         options = " ".join(self.record.overrides)
@@ -244,8 +489,8 @@ class _Crate:
             "encodingFormat": "text/yaml",
             "conformsTo": ref(_BIOSCHEMAS),
             "programmingLanguage": ref(_LANGUAGE),
-            "hasPart": refs(tuple(entities.tool_id(cell) for cell in self._cells)),
-            "step": refs(tuple(entities.step_id(cell) for cell in self._cells)),
+            "hasPart": refs(tuple(tool_id(cell) for cell in self._cells)),
+            "step": refs(tuple(step_id(cell) for cell in self._cells)),
             "input": refs(tuple(str(entity["@id"]) for entity in self._workflow_inputs())),
             "output": refs(tuple(_output_id(source) for source in self._final)),
             "connection": refs(tuple(f"#to-{_output_id(source)}" for source in self._final)),
@@ -264,48 +509,46 @@ class _Crate:
         }
 
     def _environment_files(self) -> tuple[str, ...]:
-        return tuple(entities.environment_file(item) for item in self.record.environments)
+        return tuple(environment_file(item) for item in self.record.environments)
 
     def _workflow_inputs(self) -> Iterator[Entity]:
         for entry in self.record.inputs:
             if entry.files:
-                yield entities.formal(_input_id(entry.name), entry.name, "File")
+                yield formal(_input_id(entry.name), entry.name, "File")
         seen: set[str] = set()
         for cell in self._cells:
-            step = entities.step_id(cell)
+            step = step_id(cell)
             for name in cell.params_set:
-                identifier = entities.formal_id(step, name)
+                identifier = formal_id(step, name)
                 if identifier not in seen and name in cell.params:
                     seen.add(identifier)
-                    kind = entities.value_type(cell.params[name])
-                    yield entities.formal(identifier, f"{cell.step}.{name}", kind)
+                    kind = value_type(cell.params[name])
+                    yield formal(identifier, f"{cell.step}.{name}", kind)
 
     def _formals(self) -> Iterator[Entity]:
         yield from self._workflow_inputs()
         for source, (cell, port) in self._final.items():
-            yield entities.formal(_output_id(source), source, "CreativeWork")
-            tool = entities.formal_id(entities.tool_id(cell), f"out/{port}")
+            yield formal(_output_id(source), source, "CreativeWork")
+            tool = formal_id(tool_id(cell), f"out/{port}")
             yield _connection(f"#to-{_output_id(source)}", tool, _output_id(source))
 
     def _steps(self) -> Iterator[Entity]:
-        environments = {
-            item.id: entities.environment_file(item) for item in self.record.environments
-        }
+        environments = {item.id: environment_file(item) for item in self.record.environments}
         outputs = {
-            f"{cell.address}.{port}": entities.formal_id(entities.tool_id(cell), f"out/{port}")
+            f"{cell.address}.{port}": formal_id(tool_id(cell), f"out/{port}")
             for cell in self._cells
             for port in cell.outputs
         }
         steps: dict[str, Entity] = {}
         connections: dict[str, Entity] = {}
         for position, cell in enumerate(self._cells):
-            step, tool = entities.step_id(cell), entities.tool_id(cell)
+            step, tool = step_id(cell), tool_id(cell)
             targets = {
-                _source_id(product.source, outputs): entities.formal_id(tool, port)
+                _source_id(product.source, outputs): formal_id(tool, port)
                 for port, product in cell.inputs.items()
             }
             targets |= {
-                entities.formal_id(step, name): entities.formal_id(tool, name)
+                formal_id(step, name): formal_id(tool, name)
                 for name in cell.params_set
                 if name in cell.params
             }
@@ -357,16 +600,16 @@ class _Crate:
             for port, product in cell.inputs.items():
                 owner, _, name = product.source.rpartition(".")
                 if owner == "inputs":
-                    target = entities.formal_id(entities.tool_id(cell), port)
+                    target = formal_id(tool_id(cell), port)
                     ports.setdefault(name, []).append(target)
         found: dict[str, Entity] = {}
         for entry in self.record.inputs:
             examples = (_input_id(entry.name), *ports.get(entry.name, ()))
             for file in entry.files:
                 entity = found.setdefault(
-                    entities.file_id(file),
+                    file_id(file),
                     {
-                        "@id": entities.file_id(file),
+                        "@id": file_id(file),
                         "@type": "File",
                         "name": file.name,
                         "contentSize": str(file.size_bytes),
@@ -385,15 +628,13 @@ class _Crate:
         examples: dict[str, list[str]] = {}
         final = self._final
         for cell in self._cells:
-            tool = entities.tool_id(cell)
+            tool = tool_id(cell)
             for port, product in cell.inputs.items():
-                examples.setdefault(entities.product_id(product), []).append(
-                    entities.formal_id(tool, port)
-                )
+                examples.setdefault(product_id(product), []).append(formal_id(tool, port))
             for port, product in cell.outputs.items():
-                identifier = entities.product_id(product)
+                identifier = product_id(product)
                 source = f"{cell.address}.{port}"
-                named = [entities.formal_id(tool, f"out/{port}")]
+                named = [formal_id(tool, f"out/{port}")]
                 named += [_output_id(source)] if source in final else []
                 examples.setdefault(identifier, []).extend(named)
                 entity = found.setdefault(
@@ -420,7 +661,7 @@ class _Crate:
             for name in cell.params_set
             if name in cell.params
         )
-        results = [entities.product_id(cell.outputs[port]) for cell, port in self._final.values()]
+        results = [product_id(cell.outputs[port]) for cell, port in self._final.values()]
         published = [name for name in self.files if name.startswith(f"{PRODUCTS_FOLDER}/")]
         content: Entity = {
             "@id": _RUN,
@@ -430,7 +671,7 @@ class _Crate:
             "instrument": ref(WORKFLOW_FILE),
             "startTime": record.started,
             "endTime": record.ended,
-            "actionStatus": entities.status_of(is_ok=record.status == "ok"),
+            "actionStatus": status_of(is_ok=record.status == "ok"),
             "object": refs((*self._input_ids(), *settings, RESOLVED_FILE)),
             "result": refs((RECORD_FILE, *results, *published)),
         }

@@ -17,8 +17,7 @@ from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.records.input_files import LaidOutInputs, find_inputs
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import LaidOutInputs, Run, find_inputs
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError

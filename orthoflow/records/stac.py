@@ -17,8 +17,7 @@ from orthoflow.files.sidecars import read_sidecar
 from orthoflow.foreign_text import json_bytes, shown
 from orthoflow.products import JsonValue
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.run_files import copy_files, creating
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, copy_files, creating
 
 COLLECTION_FILE: Final = "collection.json"
 _VERSION: Final = "1.1.0"

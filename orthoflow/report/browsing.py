@@ -18,7 +18,7 @@ from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
-from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.published import MetricRow, cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import broken_seal

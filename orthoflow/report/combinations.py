@@ -17,7 +17,7 @@ from orthoflow.foreign_text import parse_json
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.published import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report.rankings import Sense, sense_of

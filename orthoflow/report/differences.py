@@ -12,10 +12,10 @@ from orthoflow.records.comparison import (
     ComparedMetric,
     Pair,
     ParameterValue,
+    ProductDistance,
     RunComparison,
 )
 from orthoflow.records.comparison import Difference as DifferenceCounts
-from orthoflow.records.distances import ProductDistance
 from orthoflow.report.moved import alike_texts, moved_first, repeats_as_one, without_seeds
 from orthoflow.report.numbers import number, number_with_unit
 

@@ -13,8 +13,7 @@ from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.foreign_text import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
-from orthoflow.records.run_files import figure_files, write_files
-from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run
+from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri

@@ -27,9 +27,9 @@ from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product
 from orthoflow.records import RecordedFigure
 from orthoflow.records.comparison import Difference, RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
-from orthoflow.records.joined import RunSet, join_runs
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.published import cell_metrics
 from orthoflow.records.runs import Run
+from orthoflow.records.tables import RunSet, join_runs
 from orthoflow.records.unfinished import open_run as open_plain_run
 from orthoflow.records.verification import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls

@@ -29,8 +29,7 @@ from orthoflow.records import COSTS, RecordedCell
 from orthoflow.records.comparison import compare_runs
 from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
-from orthoflow.records.run_files import figure_files
-from orthoflow.records.runs import FIGURES_FOLDER, Run
+from orthoflow.records.runs import FIGURES_FOLDER, Run, figure_files
 from orthoflow.records.verification import sealed_page
 from orthoflow.records.wall_results import UncountedPoints, uncounted_points
 from orthoflow.report.combinations import baseline_cells

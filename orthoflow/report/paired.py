@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.alike import first_few
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
-from orthoflow.records.metrics import is_rounding
+from orthoflow.records.published import is_rounding
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns

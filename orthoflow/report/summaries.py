@@ -10,7 +10,7 @@ from typing import Final
 from orthoflow.diagnostics import DiagnosticGroup, grouped, standing
 from orthoflow.products import Cameras, Orthoimages, Walls
 from orthoflow.records import RecordedCell
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.published import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import (
     baseline_cells,

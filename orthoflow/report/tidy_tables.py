@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from orthoflow.foreign_text import Value
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
-from orthoflow.records.metrics import cell_metrics
+from orthoflow.records.published import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
+from orthoflow.cli.progress import CellState, about, left_of_cell, left_of_run
 
 
 def running(*, fraction: float = 0.0, took_s: float | None = None) -> CellState:

@@ -15,8 +15,7 @@ from click.testing import CliRunner, Result
 
 from orthoflow import __version__
 from orthoflow.cli import program
-from orthoflow.cli.commands import LazyCommand, Session, current_session
-from orthoflow.cli.failures import explain
+from orthoflow.cli.commands import LazyCommand, Session, current_session, explain
 from orthoflow.cli.program import Program
 from orthoflow.errors import (
     ArgumentError,

@@ -12,12 +12,15 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.progress import (
+    CellState,
     LiveProgress,
     NotebookProgress,
     PlainProgress,
     _Clock,
+    about,
+    left_of_cell,
+    left_of_run,
     make_progress,
     visible_cells,
     working_on,

@@ -22,8 +22,7 @@ from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.products import PointCloud
-from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
-from orthoflow.records.distances import Distance
+from orthoflow.records.comparison import CellFacts, Distance, Pair, ParameterValue, RunComparison
 from orthoflow.sdk import MethodParams, Ports
 from orthoflow.sdk.units import unit_of
 from tests.laboratories import laboratory_catalog

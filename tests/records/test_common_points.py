@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthoflow.products import Inspection
-from orthoflow.records.common_points import over_common_points
+from orthoflow.records.tables import over_common_points
 
 
 def inspection(

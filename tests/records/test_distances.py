@@ -13,8 +13,8 @@ from orthoflow_provenance.arrays import ArrayDifference
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
-from orthoflow.records import distances as module
-from orthoflow.records.distances import RunProducts, product_distances
+from orthoflow.records import comparison as module
+from orthoflow.records.comparison import RunProducts, product_distances
 
 
 def payload(version: int = 1, metadata: dict[str, Any] | None = None, **arrays: Any) -> Payload:

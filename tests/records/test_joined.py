@@ -11,8 +11,8 @@ from orthoflow_provenance.document import Metric, RecordedCell
 
 import orthoflow
 from orthoflow.errors import ArgumentError
-from orthoflow.records.joined import RunSet, join_runs
 from orthoflow.records.runs import Run
+from orthoflow.records.tables import RunSet, join_runs
 from tests.report_runs import cell, given, record
 from tests.studios import Studio, open_studio
 

@@ -28,8 +28,7 @@ import orthoflow
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
-from orthoflow.records.metrics import cell_metrics, write_metrics_csv
-from orthoflow.records.published import publish_products
+from orthoflow.records.published import cell_metrics, publish_products, write_metrics_csv
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run

@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from orthoflow.cli import sign
-from orthoflow.records import signatures
+from orthoflow.records import verification
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 
@@ -241,10 +241,10 @@ def test_on_a_terminal_the_password_is_asked_for_out_of_sight(
 
 def test_a_public_key_of_no_form_has_no_fingerprint() -> None:
     for key in ("", "alone", "ssh-ed25519 no*base64"):
-        assert signatures._fingerprint(key) == "of no known form"
+        assert verification._fingerprint(key) == "of no known form"
     digest = base64.b64encode(hashlib.sha256(b"key").digest()).decode().rstrip("=")
     text = base64.b64encode(b"key").decode()
-    assert signatures._fingerprint(f"ssh-ed25519 {text} jane") == f"SHA256:{digest}"
+    assert verification._fingerprint(f"ssh-ed25519 {text} jane") == f"SHA256:{digest}"
 
 
 def test_without_the_library_the_commands_say_so_and_others_do_without(

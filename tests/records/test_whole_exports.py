@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.records.crates import NO_LICENSE, write_crate
-from orthoflow.records.metrics import cell_metrics
-from orthoflow.records.published import _by_number, publish_products, published_files
+from orthoflow.records.published import _by_number, cell_metrics, publish_products, published_files
 from orthoflow.records.runs import Run
-from orthoflow.records.spreadsheets import write_csv_tables
+from orthoflow.records.tables import write_csv_tables
 from orthoflow.records.unfinished import open_run
 from tests.provenance_records import sample_record, write_sample
 

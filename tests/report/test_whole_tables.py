@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from orthoflow_provenance.document import RecordedFile
 
-from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
-from orthoflow.records.distances import Distance
+from orthoflow.records.comparison import CellFacts, Distance, Pair, ParameterValue, RunComparison
 from orthoflow.report import numbers
 from orthoflow.report.combinations import (
     baseline_cells,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from orthoflow.alike import first_few
-from orthoflow.cli.failures import say_error
+from orthoflow.cli.commands import say_error
 from orthoflow.errors import ArgumentError, StoreError
 
 if TYPE_CHECKING:

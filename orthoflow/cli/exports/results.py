@@ -31,7 +31,7 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
-    from orthoflow.records.spreadsheets import write_csv_tables
+    from orthoflow.records.tables import write_csv_tables
     from orthoflow.report.tidy_tables import combination_rows, dataset_rows
 
     make_empty(folder)
@@ -51,7 +51,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     """Write the figures of all cells and the curves of sweeps, or the figures of one cell."""
     from functools import partial
 
-    from orthoflow.records.run_files import figure_files, write_files
+    from orthoflow.records.runs import figure_files, write_files
     from orthoflow.report import write_figures
     from orthoflow.report.curves import curve_files
 
@@ -109,7 +109,7 @@ def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write `prov.json`."""
     from orthoflow.foreign_text import json_bytes
     from orthoflow.records.prov import count_things, prov_document
-    from orthoflow.records.run_files import creating
+    from orthoflow.records.runs import creating
 
     document = prov_document(run.record)
     make_empty(folder)

@@ -39,7 +39,7 @@ def test_figures_that_could_not_be_written_are_counted(
         asked.append((folder.is_dir(), tuple(addresses)))
         return n_written
 
-    monkeypatch.setattr("orthoflow.records.run_files.figure_files", lambda _, addresses: addresses)
+    monkeypatch.setattr("orthoflow.records.runs.figure_files", lambda _, addresses: addresses)
     monkeypatch.setattr("orthoflow.report.write_figures", write_figures)
     curves = {"01_a.svg": b"<svg/>"}
     monkeypatch.setattr("orthoflow.report.curves.curve_files", lambda _: curves)

@@ -1,26 +1,214 @@
-"""Records of one comparison, of several people or days, as one table with statistics over all."""
+"""Records as tables: CSV, several records joined, diagnostics as JSON, points that all found."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import statistics
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from orthoflow_provenance.document import RecordedCell, sha256_text
+import numpy as np
+from orthoflow_provenance.document import COSTS, CellOutcome, RecordedCell, RunRecord, sha256_text
 
 from orthoflow.errors import ArgumentError
 from orthoflow.foreign_text import Value, csv_text
+from orthoflow.products import Inspection
 from orthoflow.products.product import JsonValue
-from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.published import METRICS_FILE, MetricRow, cell_metrics, write_metrics_csv
 from orthoflow.records.runs import Run
 from orthoflow.workflow.model import DATA, SEED
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonPoints:
+    """What one cell's inspection gives over the points that all cells beside it found.
+
+    Attributes:
+        cell: address of the inspection.
+        step: of the inspection.
+        kind: class of the points; empty for all together.
+        n_found: points that this cell found.
+        n_common: points that every cell found.
+        rms_u_mm: root mean square of displacements along u over the common points.
+        rms_v_mm: the same along v.
+        rms_mm: the same of their lengths.
+    """
+
+    cell: str
+    step: str
+    kind: str
+    n_found: int
+    n_common: int
+    rms_u_mm: float
+    rms_v_mm: float
+    rms_mm: float
+
+    @property
+    def n_lost(self) -> int:
+        """Points of this cell that do not count, because another cell did not find them."""
+        return self.n_found - self.n_common
+
+
+def common_points(run: Run) -> tuple[CommonPoints, ...]:
+    """Compare the inspections of each step over common points, per dataset, seed and repeat.
+
+    Inspections that share no point, such as those that match features, give no rows; neither do
+    those whose products are not in the record.
+
+    Raises:
+        RecordError: the record is damaged.
+    """
+    groups: dict[tuple[str, ...], dict[str, Inspection]] = defaultdict(dict)
+    for cell in run.record.cells:
+        for port, output in cell.outputs.items():
+            if output.type_name == Inspection.type_name and output.embedded:
+                conditions = (cell.assignment.get(DATA, ""), cell.assignment.get(SEED, ""))
+                key = (cell.step, port, *conditions, str(cell.repeat))
+                found = Inspection.from_payload(run.payload(cell.address, port))
+                groups[key][cell.address] = found
+    return tuple(
+        row
+        for key, inspections in groups.items()
+        if len(inspections) > 1
+        for row in over_common_points(inspections, step=key[0])
+    )
+
+
+def over_common_points(
+    inspections: Mapping[str, Inspection], *, step: str = ""
+) -> Iterator[CommonPoints]:
+    """Yield rows of all inspections over the points that each of them found, class by class.
+
+    Args:
+        inspections: address of the cell -> what it found; points are the same where their
+            coordinates and their class are.
+        step: of the cells.
+    """
+    places = {cell: _rows_of_points(found) for cell, found in inspections.items()}
+    common = set.intersection(*(set(rows) for rows in places.values()))
+    if not common:
+        return
+    kinds = sorted({kind for kind, _ in common})
+    for kind in ["", *(kinds if len(kinds) > 1 else ())]:
+        for cell, inspection in inspections.items():
+            rows = places[cell]
+            mine = [point for point in rows if kind in ("", point[0])]
+            shared = [rows[point] for point in mine if point in common]
+            squares = (1e3 * inspection.displacement_m[shared]) ** 2
+            along_u, along_v = squares.mean(axis=0).tolist()
+            yield CommonPoints(
+                cell=cell,
+                step=step,
+                kind=kind,
+                n_found=len(mine),
+                n_common=len(shared),
+                rms_u_mm=math.sqrt(along_u),
+                rms_v_mm=math.sqrt(along_v),
+                rms_mm=math.sqrt(along_u + along_v),
+            )
+
+
+def _rows_of_points(inspection: Inspection) -> dict[tuple[str, bytes], int]:
+    kinds = [inspection.kinds[index] for index in inspection.kind]
+    points = np.ascontiguousarray(inspection.points_world)
+    return {
+        (kind, point.tobytes()): row
+        for row, (kind, point) in enumerate(zip(kinds, points, strict=True))
+    }
+
+
+Row: TypeAlias = Sequence[Value]
+
+
+def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
+    """Write the tables of a run, each with a header; numbers with every digit that they have.
+
+    Args:
+        run: the run.
+        folder: existing folder.
+
+    Returns:
+        The files: cells, metrics, parameters, inputs, products, environments, and where cells of a
+        comparison found the same check points, what each gives over those that all found.
+    """
+    tables = {
+        "cells.csv": _cells(run.record),
+        "parameters.csv": _parameters(run.record),
+        "inputs.csv": _inputs(run.record),
+        "products.csv": _products(run.record),
+        "environments.csv": _environments(run.record),
+    }
+    if shared := common_points(run):
+        tables["common_points.csv"] = _common_points(shared)
+    write_metrics_csv(folder / METRICS_FILE, run.metric_rows())
+    for name, rows in tables.items():
+        (folder / name).write_text(
+            csv_text(rows), encoding="utf-8", errors="backslashreplace", newline=""
+        )
+    return tuple(folder / name for name in (METRICS_FILE, *tables))
+
+
+def _cells(record: RunRecord) -> Iterator[Row]:
+    plain = (
+        *("status", "method", "distribution", "distribution_version", "result_version"),
+        *("determinism", "seed", "started", "ended", *COSTS),
+        *("environment", "cached_from", "key", "error_type", "error_message"),
+    )
+    yield ("cell", "step", "variants", "repeat", *plain, "warnings")
+    for cell in record.cells:
+        variants = ",".join(f"{step}={variant}" for step, variant in cell.assignment.items())
+        values = [getattr(cell, name) for name in plain]
+        yield (cell.address, cell.step, variants, cell.repeat, *values, "; ".join(cell.warnings))
+
+
+def _parameters(record: RunRecord) -> Iterator[Row]:
+    yield ("cell", "method", "parameter", "value", "is_set")
+    for cell in record.cells:
+        for name, value in cell.params.items():
+            text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+            yield (cell.address, cell.method, name, text, int(name in cell.params_set))
+
+
+def _inputs(record: RunRecord) -> Iterator[Row]:
+    yield ("input", "file", "size_bytes", "sha256")
+    for entry in record.inputs:
+        for file in entry.files:
+            yield (entry.name, file.name, file.size_bytes, file.sha256)
+
+
+def _products(record: RunRecord) -> Iterator[Row]:
+    yield ("cell", "direction", "port", "type", "encoding_version", "digest", "source")
+    for cell in record.cells:
+        for direction, products in (("in", cell.inputs), ("out", cell.outputs)):
+            for port, product in products.items():
+                what = (product.type_name, product.encoding_version, product.digest)
+                yield (cell.address, direction, port, *what, product.source)
+
+
+def _common_points(found: Sequence[CommonPoints]) -> Iterator[Row]:
+    numbers = ("n_found", "n_common", "n_lost", "rms_u_mm", "rms_v_mm", "rms_mm")
+    yield ("cell", "step", "class", *numbers)
+    for row in found:
+        yield (row.cell, row.step, row.kind, *(getattr(row, name) for name in numbers))
+
+
+def _environments(record: RunRecord) -> Iterator[Row]:
+    yield ("environment", "name", "version")
+    for entry in record.environments:
+        for name in ("python", "os", "cpu", "cores", "threads", "git_commit"):
+            yield (entry.id, name, getattr(entry, name))
+        for package, version in entry.packages.items():
+            yield (entry.id, package, version)
+
 
 # What a step calls: its method and, as JSON, the parameters.
 Choice: TypeAlias = tuple[str, str]
@@ -247,3 +435,35 @@ def _summary(values: Sequence[float]) -> tuple[float, ...]:
     spread = statistics.stdev(values) if len(values) > 1 else float("nan")
     middle = statistics.median(values), statistics.fmean(values)
     return (len(values), *middle, spread, min(values), max(values))
+
+
+_WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
+
+
+def diagnostics_of(cell: CellOutcome, step: str, address: str) -> Iterator[dict[str, JsonValue]]:
+    """Return what a cell reported, and why it failed where it did.
+
+    The code of a failure is the class of its error in lower case: `InputError` is `input-error`.
+    """
+    if cell.status == "failed":
+        yield {
+            "code": _WORD.sub("-", cell.error_type).lower() or "failed",
+            "severity": "error",
+            "step": step,
+            "cell": address,
+            "subject": address,
+            "values": {},
+            "text": cell.error_message,
+            "remedy": "",
+        }
+    for one in cell.diagnostics:
+        yield {
+            "code": one.code,
+            "severity": one.severity,
+            "step": step,
+            "cell": address,
+            "subject": one.subject,
+            "values": dict(one.values),
+            "text": one.text,
+            "remedy": one.remedy,
+        }
