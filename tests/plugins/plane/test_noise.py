@@ -115,3 +115,25 @@ def test_every_wall_of_a_noisy_room_is_found_at_defaults(
 def test_a_clean_cloud_has_the_tolerances_of_before(tmp_path: Path) -> None:
     planes = detected(Hough2d, room(np.random.default_rng(2), 0.002, 0.0), tmp_path)
     assert planes.tolerance_m == 0.05
+
+
+@pytest.mark.parametrize("noise_m", [0.005, 0.02, 0.03])
+@pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
+def test_a_wall_of_four_square_metres_is_found_in_a_noisy_room_at_defaults(
+    method: type, noise_m: float, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(17)
+    box = room(rng, noise_m, 0.0)
+    # A partition of 2 x 2 m across the middle, turned by another angle; a search ends
+    # where less than 5 % of the points are left.
+    along = np.array([np.cos(0.7), np.sin(0.7), 0.0])
+    across = np.array([-along[1], along[0], 0.0])
+    middle = box.mean(axis=0)
+    places = rng.uniform(-1.0, 1.0, (9_000, 2))
+    partition = middle + places[:, :1] * along + places[:, 1:] * (0.0, 0.0, 1.0)
+    partition += rng.normal(0.0, noise_m, (9_000, 1)) * across
+    planes = detected(method, np.concatenate([box, partition]), tmp_path)
+    turned_deg = np.degrees(np.arccos(np.clip(np.abs(planes.normal @ across), 0.0, 1.0)))
+    miss_m = np.abs(planes.normal @ middle - planes.offset)
+    assert ((turned_deg < 0.5) & (miss_m < 0.005)).any()
+    assert np.count_nonzero(planes.n_points > 0.05 * planes.n_points.sum()) >= 6
