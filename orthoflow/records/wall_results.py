@@ -248,12 +248,8 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
     return RoomResults(
         address=address,
         walls=tuple(
-            replace(result, accuracy=(*result.accuracy, *(measured or unmeasured)))
+            _with_inspections(run, result, tuple(_accuracy(inspections, number)))
             for number in ([wall] if wall in files else sorted(files))
-            for measured in [tuple(_accuracy(inspections, number))]
-            for unmeasured in [
-                (_unmeasured(run),) if "ortho" in files[number] and not measured else ()
-            ]
             for result in [_wall_result(run, number, files[number], kept, colours)]
         ),
         planes=kept,
@@ -404,6 +400,16 @@ def _check_kind(kind: str, path: Path) -> None:
             f"{path} must have {wanted[0][0]} bands of {' or '.join(name for _, name in wanted)}, "
             f"got {found[0]} of {found[1]}"
         )
+
+
+def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
+    """Add what inspections found, or that nothing says how exact an orthoimage is."""
+    if not measured and "ortho" in wall.rasters:
+        unmeasured = _unmeasured(run)
+        is_stated = {"expected_error", "not_checked"} & {said.key for said in wall.accuracy}
+        if not is_stated or unmeasured.key == "unmeasured_given":
+            measured = (unmeasured,)
+    return replace(wall, accuracy=(*wall.accuracy, *measured))
 
 
 def _unmeasured(run: Run) -> Phrase:

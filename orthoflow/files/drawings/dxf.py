@@ -164,6 +164,7 @@ def add_dimension_style(document: Drawing, text_m: float) -> None:
         "dimexo": 0.4 * text_m,
         "dimgap": 0.3 * text_m,
         "dimdec": 3,
+        "dimdsep": ord("."),
         "dimzin": 0,
         "dimlfac": 1.0,
         "dimtad": 1,

@@ -165,14 +165,17 @@ def _add_solid(space: Modelspace, line: CutLine, drawing: SectionDrawing) -> Non
 
 def _add_dimension(space: Modelspace, line: CutLine, drawing: SectionDrawing) -> None:
     begin, end = line.ends_m
+    # From the left, or upwards: text along it is never upside down.
+    if (end[0] - begin[0], end[1] - begin[1]) < (-1e-9 * line.length_m, 0.0):
+        begin, end = end, begin
     direction = (end - begin) / line.length_m
     left = np.array([-direction[1], direction[0]])
-    if left @ line.behind < 0.0:  # dimensions stand outside, behind what is cut
-        begin, end = end, begin
+    # Dimensions stand outside, behind what is cut.
+    side = 1.0 if left @ line.behind >= 0.0 else -1.0
     space.add_aligned_dim(
         p1=tuple(begin),
         p2=tuple(end),
-        distance=drawing.mm(8.0),
+        distance=side * drawing.mm(8.0),
         dimstyle=DIMENSION_STYLE,
         dxfattribs={"layer": "A-ANNO-DIMS"},
     ).render()

@@ -195,7 +195,8 @@ def test_the_accuracy_of_a_wall_is_by_evidence_on_that_wall(
         "deviation, by orientation, depth and parallax; check points on this wall: 12)"
     )
     assert wall.accuracy[0].text() == (expected if has_ties else "accuracy not checked")
-    # Numbers of the photos are of all walls together.
+    # What is stated is not said to be unknown; numbers of the photos are of all walls together.
+    assert sum("not checked" in said.text() for said in wall.accuracy) == int(not has_ties)
     assert not any("worst photo" in said.text() for said in wall.accuracy)
 
 

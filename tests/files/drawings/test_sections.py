@@ -133,6 +133,15 @@ def test_the_three_files_show_the_same_lines_in_scale(tmp_path: Path) -> None:
     assert lengths[-1] == pytest.approx(SIZE_M[0], abs=1e-6)
     texts = " ".join(entity.dxf.text for entity in document.modelspace().query("TEXT"))
     assert "Rzut" in texts
+    # Dimensions run to the right or upwards, so that none stands on its head, beyond what is cut.
+    middle = np.mean([(*line.dxf.start, *line.dxf.end) for line in drawn], axis=0)
+    middle = 0.5 * (middle[:3] + middle[3:])
+    for dimension in document.modelspace().query("DIMENSION"):
+        begin, end = (np.array(dimension.dxf.get(key)) for key in ("defpoint2", "defpoint3"))
+        assert tuple(np.round((end - begin)[:2], 6)) > (0.0, 0.0)
+        across = np.array([begin[1] - end[1], end[0] - begin[0], 0.0])
+        outside = (np.array(dimension.dxf.defpoint) - begin) @ across
+        assert outside * ((0.5 * (begin + end) - middle) @ across) > 0.0
     with pdfplumber.open(tmp_path / "plan_1.pdf") as pdf:
         (page,) = pdf.pages
         assert float(page.width) == pytest.approx(paper.width_mm * POINTS_PER_MM, abs=0.1)
