@@ -32,8 +32,8 @@ from orthoflow.errors import CancelledStepError, ClusterError
 if TYPE_CHECKING:
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
-    from orthoflow.records.comparison import ProductDistance, ReplayedMetric
-    from orthoflow.records.replaying import Replay
+    from orthoflow.records.comparison import ProductDistance
+    from orthoflow.records.replaying import Replay, ReplayedMetric
     from orthoflow.records.runs import Run
 
 _METRICS_MOST: Final = 5
@@ -78,8 +78,8 @@ def replay(
     from orthoflow.engine.journal import new_run_folder, new_run_id
     from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.store import Store
+    from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
-    from orthoflow.records.runs import embedded_inputs
     from orthoflow.records.unfinished import open_run
 
     options = RunOptions(**choices)
@@ -157,7 +157,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare and say how far the products lie apart."""
-        from orthoflow.records.comparison import DIFFERING, replayed_metrics
+        from orthoflow.records.replaying import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
 
         current_session().resume_hint = (

@@ -34,8 +34,9 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.journal import RECORD_FILE, kept_from_others
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
+from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import ChangedInputsError, Run, embedded_inputs, find_inputs, read_run
+from orthoflow.records.runs import Run, read_run
 from orthoflow.records.unfinished import OUTLINE_FILE, write_outline
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError

@@ -11,12 +11,7 @@ import pytest
 
 from orthoflow.engine.store import Store
 from orthoflow.records import comparison as module
-from orthoflow.records.comparison import (
-    Difference,
-    Pair,
-    ParameterValue,
-    compare_runs,
-)
+from orthoflow.records.comparison import Difference, Pair, ParameterValue, compare_runs
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.report.pages import write_report

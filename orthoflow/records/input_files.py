@@ -1,0 +1,363 @@
+"""The input files of a record, found again: by content wherever they lie now, or in the record."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import chain, islice
+from pathlib import Path
+from typing import Final
+
+from orthoflow_provenance.document import (
+    RecordedFile,
+    RecordedInput,
+)
+from orthoflow_provenance.paths import (
+    name_problem,
+)
+from orthoflow_provenance.record import extract_files
+
+from orthoflow.alike import first_few
+from orthoflow.engine.durability import writing_to
+from orthoflow.engine.file_digests import FileDigests
+from orthoflow.errors import (
+    InputError,
+    RecordError,
+)
+from orthoflow.records.runs import Run, record_errors
+from orthoflow.workflow.inputs import (
+    InputOption,
+    override_inputs,
+    read_input_options,
+    resolve_input_files,
+    written_files,
+)
+from orthoflow.workflow.model import (
+    Workflow,
+    WorkflowInputSpec,
+)
+from orthoflow.workflow.problems import (
+    ProblemLog,
+)
+
+# Of a folder that files may lie in; what lies in a larger one is found by its name alone.
+_MOST_LISTED: Final = 10_000
+
+
+# A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
+_FOLDERS_ABOVE: Final = 3
+
+
+class ChangedInputsError(RecordError):
+    """Input files are not what a record says; `problems` names them, and those that are missing."""
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSearch:
+    """What a search found.
+
+    Attributes:
+        paths: input -> its files in the order of the record; inputs that were not given have none.
+        problems: one sentence per file that is missing or was changed.
+        is_changed: one of them lies there with other content.
+    """
+
+    paths: Mapping[str, tuple[Path, ...]]
+    problems: tuple[str, ...]
+    is_changed: bool
+
+
+def find_inputs(
+    workflow: Workflow,
+    recorded: Sequence[RecordedInput],
+    run_folder: Path,
+    digests: FileDigests,
+    *,
+    given: Sequence[str] = (),
+    extracted: Mapping[str, tuple[Path, ...]] | None = None,
+    noted: Sequence[FileDigests] = (),
+) -> InputSearch:
+    """Look for files with the content that a record states; their names may be others.
+
+    Looks where `given` says; else among the `extracted`; else at the places that the workflow
+    names, below the working directory, the run's folder and the folders above it, and in these
+    folders themselves; and where a store remembers that a run found them.
+
+    Args:
+        workflow: of the record.
+        recorded: the record's inputs.
+        run_folder: the folder of the record.
+        digests: remembers digests, so that each file is read once.
+        given: `NAME=PATH`, each as behind `--input`.
+        extracted: input -> files that lay in the record itself.
+        noted: of stores that may remember where files lay, besides `digests`.
+
+    Raises:
+        InvalidArgumentsError: `given` names no input of the workflow.
+        InputError: there is nothing at a given path.
+    """
+    places = _places(workflow, run_folder, given, extracted or {})
+    paths: dict[str, tuple[Path, ...]] = {}
+    lost: list[_Lost] = []
+    for entry in recorded:
+        found = []
+        for file in entry.files:
+            where = _find(entry.name, file, places[entry.name], (digests, *noted))
+            if isinstance(where, Path):
+                found.append(where)
+            else:
+                lost.append(where)
+        paths[entry.name] = tuple(found)
+    return InputSearch(
+        paths=paths,
+        problems=tuple(one.problem for one in lost),
+        is_changed=any(one.is_changed for one in lost),
+    )
+
+
+class LaidOutInputs:
+    """Input files of a record under its names, in a folder that vanishes with the context.
+
+    Attributes:
+        extracted: input -> files that lay in the record itself.
+    """
+
+    def __init__(self, beside: Path, stack: ExitStack) -> None:
+        self.extracted: Mapping[str, tuple[Path, ...]] = {}
+        self._beside = beside
+        self._stack = stack
+        self._folders: list[Path] = []
+
+    def folder(self) -> Path:
+        """Make a new folder.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        with writing_to(self._beside):
+            if not self._folders:
+                self._beside.mkdir(parents=True, exist_ok=True)
+                made = tempfile.TemporaryDirectory(prefix=".inputs-", dir=self._beside)
+                self._folders.append(Path(self._stack.enter_context(made)))
+            self._folders.append(self._folders[0] / f"{len(self._folders):06}")
+            self._folders[-1].mkdir()
+        return self._folders[-1]
+
+    def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
+        """Give the found files of an input under their recorded names, in the recorded order.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        names = [file.name for file in entry.files]
+        # Files of one name are sorted by their folders.
+        if [path.name for path in paths] == names and len(set(names)) == len(names):
+            return paths
+        return tuple(self._link(path, name) for path, name in zip(paths, names, strict=True))
+
+    def _link(self, path: Path, name: str) -> Path:
+        link = self.folder() / name
+        try:
+            link.symlink_to(path)
+        except OSError:
+            # Windows lets few people make links.
+            with writing_to(link.parent):
+                shutil.copyfile(path, link)
+        return link
+
+
+@contextmanager
+def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
+    """Give the input files that lie in a record as files, as long as the context lasts.
+
+    Args:
+        run: the run.
+        beside: folder on a disk with room for them, made when missing.
+
+    Raises:
+        RecordError: the record is damaged.
+        StoreError: the disk refuses.
+    """
+    with ExitStack() as stack:
+        laid_out = LaidOutInputs(beside, stack)
+        if any(entry.embedded for entry in run.record.inputs):
+            folder = laid_out.folder()
+            with record_errors(run.path), writing_to(folder):
+                laid_out.extracted = extract_files(run.path, run.record.inputs, folder)
+        yield laid_out
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lost:
+    """A file that was not found: the sentence that says so, and whether another has its place."""
+
+    problem: str
+    is_changed: bool = False
+
+
+def _find(
+    name: str, file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
+) -> Path | _Lost:
+    """The file, or why there is none."""
+    same_name: list[Path] = []
+    seen: set[Path] = set()
+    expected = f"{file.size_bytes} bytes with the SHA-256 {file.sha256[:12]}..."
+    for path in chain(places.candidates(file.name), places.others(file, memories)):
+        size_bytes = _size_of_file(path)
+        if path in seen or size_bytes is None:
+            continue
+        seen.add(path)
+        try:
+            is_same = (
+                size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256
+            )
+        except InputError:
+            # Nobody said that this would be it.
+            if path.name == file.name or places.files:
+                raise
+            continue
+        if is_same:
+            return path.absolute()
+        if path.name == file.name:
+            same_name.append(path)
+    if same_name:
+        return _Lost(
+            problem=f"input {name}: {same_name[0]} is not the {file.name} of the record: it was "
+            f"changed (expected {expected})",
+            is_changed=True,
+        )
+    if places.files:
+        given = first_few([str(path) for path in places.files])
+        return _Lost(
+            problem=f"input {name}: {file.name} of the record is not among what was given, {given} "
+            f"(expected {expected}, under any name)"
+        )
+    return _Lost(
+        problem=f"input {name}: {file.name} ({file.size_bytes} bytes, SHA-256 "
+        f"{file.sha256[:12]}...) is not to be found; give it with --input {name}=PATH"
+    )
+
+
+def _size_of_file(path: Path) -> int | None:
+    """Size of what is a regular file and can be reached, else None."""
+    try:
+        state = path.stat()
+    except (OSError, ValueError):
+        return None
+    return state.st_size if stat.S_ISREG(state.st_mode) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Places:
+    """Where the files of one input may lie: in folders, or exactly here when a user says so."""
+
+    folders: tuple[Path, ...] = ()
+    files: tuple[Path, ...] = ()
+    listings: _Listings
+
+    def candidates(self, name: str) -> Iterator[Path]:
+        """Paths at which a file of that name may be, the likeliest first."""
+        if name_problem(name):
+            return
+        yield from (path for path in self.files if path.name == name)
+        yield from (folder / name for folder in self.folders)
+
+    def others(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
+        """Paths at which a file may be that has another name, or lies elsewhere."""
+        if name_problem(file.name):
+            return
+        yield from self.files
+        if self.files:
+            return
+        noted = [memory.place(file.sha256) for memory in memories]
+        seen_last = [path for path in noted if path is not None]
+        yield from seen_last
+        for folder in dict.fromkeys((*self.folders, *(path.parent for path in seen_last))):
+            yield from self.listings.of_size(folder, file.size_bytes)
+
+
+@dataclass(kw_only=True)
+class _Listings:
+    """Files directly in folders by their sizes, each folder looked into once."""
+
+    _known: dict[Path, Mapping[int, list[Path]]] = field(default_factory=dict)
+
+    def of_size(self, folder: Path, size_bytes: int) -> Sequence[Path]:
+        """The files of a size, as far as the folder can be read."""
+        place = folder.absolute()
+        if place not in self._known:
+            self._known[place] = self._listed(folder)
+        return self._known[place].get(size_bytes, ())
+
+    def _listed(self, folder: Path) -> Mapping[int, list[Path]]:
+        found: dict[int, list[Path]] = {}
+        try:
+            with os.scandir(folder) as entries:
+                for entry in islice(entries, _MOST_LISTED):
+                    if entry.is_file() and not name_problem(entry.name):
+                        found.setdefault(entry.stat().st_size, []).append(folder / entry.name)
+        except OSError:
+            return {}
+        return {size: sorted(paths) for size, paths in found.items()}
+
+
+def _places(
+    workflow: Workflow,
+    run_folder: Path,
+    given: Sequence[str],
+    extracted: Mapping[str, tuple[Path, ...]],
+) -> dict[str, _Places]:
+    log = ProblemLog(file="")
+    specs = workflow.input_specs
+    options = _of_all_datasets(read_input_options(given, log), specs)
+    overridden = override_inputs(specs, options, log)
+    log.raise_any()
+    found = {name: spec for name, spec in overridden.items() if spec.is_given}
+    by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=found, datasets={}))
+    roots = dict.fromkeys(
+        (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
+    )
+    # The resolved form has options in the place of what the file names, and no folders.
+    written = written_files(workflow.source)
+    places: dict[str, _Places] = {}
+    listings = _Listings()
+    for name, spec in specs.items():
+        by_name = by_hand.get(name)
+        files = by_name.paths if by_name is not None else extracted.get(name)
+        if files is not None:
+            places[name] = _Places(files=files, listings=listings)
+            continue
+        texts = (*spec.files, *written.get(name, ()))
+        named = [
+            root / folder
+            for root in roots
+            for pattern in map(Path, dict.fromkeys(texts))
+            for folder in (pattern.parent, pattern)
+        ]
+        folders = tuple(dict.fromkeys((*named, *roots)))
+        places[name] = _Places(folders=folders, listings=listings)
+    return places
+
+
+def _of_all_datasets(
+    options: Sequence[InputOption], specs: Mapping[str, WorkflowInputSpec]
+) -> tuple[InputOption, ...]:
+    """Let `scan=FOLDER` stand for the `scan@...` of every dataset, where there is no other scan."""
+
+    def meant(name: str) -> Sequence[str]:
+        own = [found for found in specs if found.partition("@")[0] == name]
+        return own if name not in specs and own else [name]
+
+    return tuple(
+        dataclasses.replace(option, name=name) for option in options for name in meant(option.name)
+    )
