@@ -106,6 +106,7 @@ LIBRARIES: Final = (
         distribution="simplejpeg", module="simplejpeg", use="damage in JPEG files: read.photos"
     ),
     Library(distribution="psutil", module="psutil", use="free memory: methods of raster"),
+    Library(distribution="threadpoolctl", module="threadpoolctl", use="cores of each step"),
     Library(
         distribution="matplotlib",
         module="matplotlib",
