@@ -101,7 +101,7 @@ def match(folder: Path, longest_side_px: int) -> None:
     )
     ctx = StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
     started = time.perf_counter()
-    params = MatchSift.Params(longest_side_max_px=longest_side_px)
+    params = MatchSift.Params(max_side_px=longest_side_px)
     ties = MatchSift().run(inputs, params, ctx).ties
     seconds = time.perf_counter() - started
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Correlation lengths that are tried, and ends of the classes of distances between points, as shares
-# of the extent of what a photo sees.
-_LENGTHS: Final = (0.03, 0.08, 0.2, 0.5)
-_DISTANCES: Final = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
+# Parts that are tried, each a sum of errors with these correlation lengths, as shares of the extent
+# of what a photo sees. What reaches far is taken up by the pose and leaves hardly a trace, but an
+# error of registration, of a path or of stereo does not end where residuals cease to show it.
+_PARTS: Final = ((0.03,), (0.1,), (0.25, 0.6, 1.2))
 # The products of all pairs of more points tell nothing new.
-_MAX_POINTS: Final = 180
+_MAX_POINTS: Final = 280
 _MIN_POINTS: Final = 30
-# An error is taken as shared where that explains the products so many times better; of independent
-# errors it does for one photo in twenty (measured on 16 drawn photos of each kind: 1.0 to 1.4
-# for independent errors, 2.0 to 5.7 for those that reach 1 to 4 m of 8 m).
-_LEAST_GAIN: Final = 1.5
+# An error is shared where it is so many times as large as chance makes it of independent ones.
+_MIN_SIGNIFICANCE: Final = 5.0
+# Kinds of errors that explain the same but for so much are not told apart.
+_MIN_OWN_SHARE: Final = 0.02
 
 
 def honest_covariance(
@@ -63,21 +63,27 @@ def honest_covariance(
 
 @dataclass(frozen=True, kw_only=True)
 class AdjustedPoints:
-    """Points of one photo after its adjustment, whose places in the world may err together.
+    """Points of photos after their adjustment, whose places in the world may err together.
 
     Attributes:
+        photo: (n,) which of the photos sees each.
         places: (n, 3) metres.
         residuals: (n, 2) observed - computed, in standard deviations.
         jacobian: (n, 2, p) derivatives by the unknowns, in standard deviations.
         by_place: (n, 2, 3) derivatives by the place, standard deviations per metre.
-        cofactors: (p, p) of these unknowns in the inverse of the whole normal matrix.
+        pulls: (n, p, 3) of an error of the place on the normal equations, per metre.
+        towards: (n, 3) unit vectors out of the surface: what measures a cloud errs most in depth.
+        cofactors: (p, p) inverse of the normal matrix.
         weight: for how many points of the adjustment each stands.
     """
 
+    photo: NDArray[np.intp]
     places: NDArray[np.float64]
     residuals: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     by_place: NDArray[np.float64]
+    pulls: NDArray[np.float64]
+    towards: NDArray[np.float64]
     cofactors: NDArray[np.float64]
     weight: float = 1.0
 
@@ -86,143 +92,173 @@ class AdjustedPoints:
         n_points = len(self.places)
         chosen = np.unique(np.linspace(0, n_points - 1, min(n_points, _MAX_POINTS)).astype(int))
         return AdjustedPoints(
+            photo=self.photo[chosen],
             places=self.places[chosen],
             residuals=self.residuals[chosen],
             jacobian=self.jacobian[chosen],
             by_place=self.by_place[chosen],
+            pulls=self.pulls[chosen],
+            towards=self.towards[chosen],
             cofactors=self.cofactors,
             weight=n_points / len(chosen),
         )
 
+    @property
+    def extent_m(self) -> float:
+        """How far the points of a photo reach, median over the photos."""
+        reaches = []
+        for photo in np.unique(self.photo):
+            mine = self.places[self.photo == photo]
+            reach = np.linalg.norm(mine - mine.mean(axis=0), axis=1)
+            reaches.append(float(np.percentile(reach, 90)))
+        return 2.0 * float(np.median(reaches))
+
 
 @dataclass(frozen=True, kw_only=True)
 class CommonError:
-    """An error of places that neighbours share: a sum of parts that reach differently far.
+    """An error that neighbouring points share: a sum of parts that reach differently far.
 
     Attributes:
-        sigmas_m: of each coordinate, of each part; none where points err independently.
-        lengths_m: of each part, whose correlation is exp(-distance / length).
+        of_places_m: standard deviation of each coordinate of places, in whichever photo, of each
+            part; none where points err independently.
+        of_depths_m: of their depth besides.
+        of_photos_m: of what the points of one photo alone share, as by its lens or how it matches.
+        lengths_m: of each part, whose correlation is the sum of exp(-distance / length).
         sigma_alone: what is left to each observation alone, in its standard deviations.
     """
 
-    sigmas_m: tuple[float, ...] = ()
-    lengths_m: tuple[float, ...] = ()
+    of_places_m: tuple[float, ...] = ()
+    of_depths_m: tuple[float, ...] = ()
+    of_photos_m: tuple[float, ...] = ()
+    lengths_m: tuple[tuple[float, ...], ...] = ()
     sigma_alone: float
 
     @property
-    def sigma_m(self) -> float:
-        """Standard deviation of each coordinate of all parts together."""
-        return math.hypot(*self.sigmas_m)
-
-    def covariance(
-        self, places: NDArray[np.float64], others: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the covariance (n, m) in square metres of the errors at two sets of places."""
-        distances_m = _distances(places, others)
-        total = np.zeros_like(distances_m)
-        for sigma_m, length_m in zip(self.sigmas_m, self.lengths_m, strict=True):
-            if sigma_m:
-                total += sigma_m**2 * np.exp(-distances_m / length_m)
-        return total
+    def is_any(self) -> bool:
+        """Whether points share an error at all."""
+        return any(self.of_places_m + self.of_depths_m + self.of_photos_m)
 
 
-def common_error(photos: Sequence[AdjustedPoints]) -> CommonError:
+def common_error(points: AdjustedPoints) -> CommonError:
     """Estimate the error that neighbouring points share from the products of their residuals.
 
-    An adjustment takes up a part of such an error, the more the longer it reaches; expected
-    products are those of residuals after that. Sums of products of pairs within classes of
-    distances are explained by those of independent errors and of shared ones of each length (a
-    variogram by moments; Cressie 1993, Statistics for spatial data, 2.6).
+    An adjustment takes up a part of such an error, the more the longer it reaches, and the more
+    photos see the same places; expected products are those of residuals after that. The products of
+    all pairs, also of points of different photos, are explained by independent errors and by shared
+    ones of each kind and length (least squares of variance components, MINQUE: Rao 1971,
+    doi:10.1016/0047-259X(71)90001-7).
     """
-    parts = [part.thinned() for part in photos if len(part.places) >= _MIN_POINTS]
-    if not parts:
-        return CommonError(sigma_alone=1.0)
-    extents = [np.linalg.norm(part.places - part.places.mean(axis=0), axis=1) for part in parts]
-    extent_m = 2.0 * float(np.median([np.percentile(each, 90) for each in extents]))
-    n_classes = len(_DISTANCES) + 1
-    counts, found, alone = (np.zeros(n_classes) for _ in range(3))
-    shared = np.zeros((len(_LENGTHS), n_classes))
-    for part in parts:
-        n_points, n_free = len(part.places), part.cofactors.shape[0]
-        flat = part.jacobian.reshape(-1, n_free)
-        taken_up = flat @ part.cofactors @ flat.T
-        # Of an error of its own, each point takes up what it does alone; of a shared one, as much
-        # as all the points for which it stands.
-        left_alone = np.eye(2 * n_points) - taken_up
-        left = np.eye(2 * n_points) - part.weight * taken_up
-        distance_m = _distances(part.places, part.places)
-        # The first class is each point with itself.
-        kind = np.digitize(distance_m / extent_m, _DISTANCES)
-        kind += 1
-        np.fill_diagonal(kind, 0)
-        kind = np.where(kind >= n_classes, -1, kind)
-
-        counts += _by_class(kind, np.ones_like(distance_m))
-        found += _by_class(kind, part.residuals @ part.residuals.T)
-        alone += _by_class(kind, _traces(left_alone))
-        same = np.einsum("iad,jbd->iajb", part.by_place, part.by_place)
-        for nth, share in enumerate(_LENGTHS):
-            correlation = np.exp(-distance_m / (share * extent_m))
-            errors = (same * correlation[:, None, :, None]).reshape(2 * n_points, 2 * n_points)
-            shared[nth] += _by_class(kind, _traces(left @ errors @ left))
-    weights = 1.0 / np.sqrt(np.maximum(counts, 1.0))
-    # Each point with itself says as much as all the others.
-    weights[0] *= math.sqrt(n_classes)
-    return _fitted_error(found * weights, alone * weights, shared * weights, extent_m)
-
-
-def _by_class(kind: NDArray[np.intp], products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums of products of pairs by their class; -1 is none."""
-    known = kind >= 0
-    sums = np.bincount(kind[known], weights=products[known], minlength=len(_DISTANCES) + 1)
-    return np.asarray(sums, dtype=np.float64)
-
-
-def _fitted_error(
-    found: NDArray[np.float64],
-    alone: NDArray[np.float64],
-    shared: NDArray[np.float64],
-    extent_m: float,
-) -> CommonError:
     from scipy.optimize import nnls  # noqa: PLC0415 - most who load this module adjust nothing
 
-    own = max(0.0, float(found @ alone) / max(float(alone @ alone), 1e-300))
-    off = float(np.linalg.norm(found - own * alone))
-    scales = np.maximum(np.linalg.norm(shared, axis=1), 1e-300) / np.linalg.norm(alone)
-    (rest, *common), left = nnls(np.column_stack([alone, (shared / scales[:, None]).T]), found)
-    variances = np.array(common) / scales
-    if left * _LEAST_GAIN > off or not variances.any():
-        return CommonError(sigma_alone=math.sqrt(own))
+    if len(points.places) < _MIN_POINTS:
+        return CommonError(sigma_alone=1.0)
+    some, extent_m = points.thinned(), points.extent_m
+    flat = some.jacobian.reshape(-1, some.jacobian.shape[2])
+    moved = flat @ some.cofactors
+    # Of an error of its own, each point takes up what it does alone; of a shared one, as much as
+    # all the points for which it stands.
+    expected = [np.eye(len(flat)) - moved @ flat.T]
+    moved *= some.weight
+    for directions, correlations in _kinds(some, [np.multiply(part, extent_m) for part in _PARTS]):
+        products = sum(np.outer(by, by) for by, _ in directions)
+        for correlation in correlations:
+            errors = products * np.repeat(np.repeat(correlation, 2, 0), 2, 1)
+            taken_up = (
+                sum(by[:, None] * np.repeat(correlation @ pulls, 2, 0) for by, pulls in directions)
+                @ moved.T
+            )
+            errors += moved @ _sum_over(directions, correlation) @ moved.T
+            expected.append(errors - taken_up - taken_up.T)
+    layers = np.array([layer.ravel() for layer in expected])
+    scales = np.maximum(np.linalg.norm(layers, axis=1), 1e-300)
+    layers /= scales[:, None]
+    residuals = some.residuals.ravel()
+    normal, right = layers @ layers.T, layers @ np.outer(residuals, residuals).ravel()
+    # Of an error that is none, what is found has this deviation at most.
+    chance = math.sqrt(2.0) * float(residuals @ residuals) / len(residuals)
+    taken = [0]
+    while True:
+        # One after the other, as long as one explains more than chance does: all at once, those
+        # that are none would share out what is left.
+        solved = np.linalg.solve(normal[np.ix_(taken, taken)], normal[taken])
+        left = np.maximum(1.0 - (normal[taken] * solved).sum(axis=0), 1e-9)
+        found = (right - right[taken] @ solved) / np.sqrt(left)
+        found[[*taken, *np.flatnonzero(left < _MIN_OWN_SHARE)]] = 0.0
+        best = int(found.argmax())
+        if found[best] <= _MIN_SIGNIFICANCE * chance:
+            break
+        taken.append(best)
+    root = np.linalg.cholesky(normal[np.ix_(taken, taken)])
+    variances = np.zeros(len(layers))
+    variances[taken] = nnls(root.T, np.linalg.solve(root, right[taken]))[0]
+    variances /= scales
+    if not variances[1:].any():
+        return CommonError(sigma_alone=math.sqrt(variances[0]))
     # Rounded: what comes behind must not hang on the order of sums.
+    alone, *sigmas = (float(f"{sigma:.4g}") for sigma in np.sqrt(variances))
+    n = len(_PARTS)
     return CommonError(
-        sigmas_m=tuple(float(f"{math.sqrt(variance):.4g}") for variance in variances),
-        lengths_m=tuple(float(f"{share * extent_m:.4g}") for share in _LENGTHS),
-        sigma_alone=float(f"{math.sqrt(rest):.4g}"),
+        of_places_m=tuple(sigmas[:n]),
+        of_depths_m=tuple(sigmas[n : 2 * n]),
+        of_photos_m=tuple(sigmas[2 * n :]) or (0.0,) * n,
+        lengths_m=tuple(tuple(length * extent_m for length in lengths) for lengths in _PARTS),
+        sigma_alone=alone,
     )
 
 
-def _distances(places: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.norm(places[:, None] - others[None], axis=2), dtype=np.float64)
-
-
-def _traces(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Traces (n, n) of the 2 x 2 blocks of a matrix (2 n, 2 n)."""
-    return np.asarray(matrix[::2, ::2] + matrix[1::2, 1::2], dtype=np.float64)
+def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector (3,) across the plane that fits places best, towards a camera."""
+    middle = places.mean(axis=0)
+    across = np.linalg.svd(places - middle, full_matrices=False)[2][2]
+    return np.asarray(across if (centre - middle) @ across > 0.0 else -across)
 
 
 def with_common_error(
-    covariance: NDArray[np.float64], points: AdjustedPoints, error: CommonError
+    covariance: NDArray[np.float64], points: AdjustedPoints
 ) -> NDArray[np.float64]:
-    """Widen the covariance (p, p) of one photo by the error that its points share."""
-    if not error.sigma_m:
+    """Widen the covariance (p, p) of an adjustment by the error that its points share."""
+    error = common_error(points)
+    if not error.is_any:
         return covariance
-    some = points.thinned()
-    pulls = np.einsum("nip,nid->npd", some.jacobian, some.by_place)
-    together = error.covariance(some.places, some.places)
-    shared = np.einsum("npd,nqd->pq", pulls, np.einsum("nm,mqd->nqd", together, pulls))
+    some, shared = points.thinned(), np.zeros_like(covariance)
+    sigmas_m = (error.of_places_m, error.of_depths_m, error.of_photos_m)
+    for of_kind_m, (directions, correlations) in zip(
+        sigmas_m, _kinds(some, error.lengths_m), strict=False
+    ):
+        for sigma_m, correlation in zip(of_kind_m, correlations, strict=True):
+            if sigma_m:
+                shared += sigma_m**2 * _sum_over(directions, correlation)
     move = some.weight * points.cofactors
     spread = error.sigma_alone**2 * points.cofactors + move @ stable(shared) @ move.T
     return widened(covariance, spread)
+
+
+_Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Derivatives (2 n,) of observations by errors along it, and their pulls (n, p)."""
+
+
+def _kinds(
+    some: AdjustedPoints, lengths_m: Sequence[Sequence[float] | NDArray[np.float64]]
+) -> Iterator[tuple[list[_Direction], list[NDArray[np.float64]]]]:
+    """Give the directions of each kind of shared error, and its correlations (n, n) by part."""
+    apart_m = np.linalg.norm(some.places[:, None] - some.places, axis=2)
+    correlations = [
+        np.sum([np.exp(-apart_m / length_m) for length_m in part], axis=0) for part in lengths_m
+    ]
+    axes = [(some.by_place[:, :, axis].ravel(), some.pulls[:, :, axis]) for axis in range(3)]
+    along = np.einsum("nid,nd->ni", some.by_place, some.towards).ravel()
+    yield axes, correlations
+    yield [(along, np.einsum("npd,nd->np", some.pulls, some.towards))], correlations
+    is_one = some.photo[:, None] == some.photo
+    if not is_one.all():
+        yield axes, [correlation * is_one for correlation in correlations]
+
+
+def _sum_over(
+    directions: Sequence[_Direction], correlation: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Covariance (p, p) of the sum of all pulls, each times an error of one metre."""
+    return np.asarray(sum(pulls.T @ correlation @ pulls for _, pulls in directions))
 
 
 def stable(sums: NDArray[np.float64]) -> NDArray[np.float64]:

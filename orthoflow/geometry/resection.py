@@ -18,8 +18,8 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
-    common_error,
     honest_covariance,
+    outwards,
     with_common_error,
 )
 from orthoflow.geometry.lenses import (
@@ -158,7 +158,7 @@ def stated(
     )
     points = problem.adjusted_points(camera.shifted(middle), errors, cofactors)
     if groups is not None:
-        covariance = with_common_error(covariance, points, common_error([points]))
+        covariance = with_common_error(covariance, points)
     factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
     to_world = moved_origin(camera, middle, n_free)
     return Resection(
@@ -334,10 +334,15 @@ class _Problem:
             _pixel_covariances(linear, self._seen), linear.by_camera_point @ camera.rotation
         )
         return AdjustedPoints(
+            photo=np.zeros(len(self._seen), dtype=np.intp),
             places=self._seen.points_world,
             residuals=errors.residuals,
             jacobian=errors.jacobian,
             by_place=by_place,
+            pulls=np.einsum("nip,nid->npd", errors.jacobian, by_place),
+            towards=np.tile(
+                outwards(self._seen.points_world, camera.centre_world), (len(self._seen), 1)
+            ),
             cofactors=cofactors,
         )
 

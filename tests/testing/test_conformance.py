@@ -24,8 +24,8 @@ from tests.undrawn_charts import build_orient_charts_once, build_plane_charts_on
 QUICK: dict[str, dict[str, object]] = {
     "simulate.room": {"scan_step_m": 0.1},
     "raster.grid": {"gsd_m": 0.05},
-    "match.sift": {"n_features_max": 1000},
-    "match.guided": {"n_ties_max": 400},
+    "match.sift": {"max_features": 1000},
+    "match.guided": {"max_ties": 400},
     "orient.colmap-bundle": {"max_features": 1000},
 }
 

@@ -37,6 +37,8 @@ _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
 # Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
 _APART_CELLS: Final = 5
+HALF_PATCH_CELLS: Final = 10
+"""Patches of a wall and a photo that are compared are (2 h + 1) cells wide."""
 _GRID: Final = 16
 
 
@@ -112,26 +114,26 @@ class WallTarget:
         grey: its intensity, NaN where it has no depth; None where it shows nothing.
         channels: of its intensity, by content, as far as they were needed.
         textures: of these channels, likewise.
-        grains: as `grain_of` gives them, by half the width of a patch.
+        grain: as `grain_of` gives it, as soon as it was needed.
     """
 
     wall: Wall
     grey: NDArray[np.float32] | None
     channels: dict[str, Channels] = field(default_factory=dict)
     textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    grains: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    grain: list[NDArray[np.float32]] = field(default_factory=list)
     lock: Lock = field(default_factory=Lock)
 
-    def prepare(self, content: str, half_patch_cells: int) -> None:
+    def prepare(self, content: str) -> None:
         """Compute channels and texture unless that was done before, maybe by another thread."""
         with self.lock:
             if self.grey is None or content in self.channels:
                 return
             channels = CHANNELS[content](self.grey)
-            self.textures[content] = texture(channels, half_patch_cells=half_patch_cells)
+            self.textures[content] = texture(channels)
             self.channels[content] = channels
-            if half_patch_cells not in self.grains:
-                self.grains[half_patch_cells] = grain_of(self.wall, half_patch_cells)
+            if not self.grain:
+                self.grain.append(grain_of(self.wall))
 
 
 def target_of(wall: Wall) -> WallTarget:
@@ -176,7 +178,7 @@ def least_step_m(wall: Wall) -> float:
     return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
 
 
-def grain_of(wall: Wall, half_patch_cells: int) -> NDArray[np.float32]:
+def grain_of(wall: Wall) -> NDArray[np.float32]:
     """How many cells share one measured cell around each cell (rows, cols), at least 1.
 
     What fills a gap follows from the cells about it and errs with them: a patch tells no more than
@@ -184,13 +186,13 @@ def grain_of(wall: Wall, half_patch_cells: int) -> NDArray[np.float32]:
     """
     import cv2
 
-    side = (2 * half_patch_cells + 1,) * 2
+    side = (2 * HALF_PATCH_CELLS + 1,) * 2
     known = cv2.blur(np.isfinite(wall.depth_m).astype(np.float32), side)
     measured = cv2.blur((wall.count > 0).astype(np.float32), side)
     return np.asarray(np.maximum(1.0, known / np.maximum(measured, 1e-3)), dtype=np.float32)
 
 
-def texture(channels: Channels, *, half_patch_cells: int) -> NDArray[np.float32]:
+def texture(channels: Channels) -> NDArray[np.float32]:
     """How well the surroundings of each cell fix a displacement in both directions.
 
     The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994),
@@ -204,7 +206,7 @@ def texture(channels: Channels, *, half_patch_cells: int) -> NDArray[np.float32]
         across = cv2.Scharr(layer, cv2.CV_32F, 1, 0)
         down = cv2.Scharr(layer, cv2.CV_32F, 0, 1)
         second += np.stack([across * across, across * down, down * down], axis=-1)
-    second = np.asarray(cv2.GaussianBlur(second, (0, 0), 0.4 * half_patch_cells), dtype=np.float32)
+    second = np.asarray(cv2.GaussianBlur(second, (0, 0), 0.4 * HALF_PATCH_CELLS), dtype=np.float32)
     a, b, c = second[:, :, 0], second[:, :, 1], second[:, :, 2]
     return np.asarray(0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b), dtype=np.float32)
 

@@ -17,21 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.products import Photos, Wall
-from orthoflow_plugins.match.features import FeatureRule, Features, find_features
-from orthoflow_plugins.match.opencv import one_by_one
-from orthoflow_plugins.match.pairing import PairingRule, PhotoPairs, mapped, pair_photo
-from orthoflow_plugins.match.pictures import equalised, photo_grey, shrunk
+from orthoflow_plugins.match.features import Features, find_features
+from orthoflow_plugins.match.pairing import PairingParams, PhotoPairs, mapped, pair_photo
+from orthoflow_plugins.match.pictures import (
+    CLIP_LIMIT,
+    equalised,
+    one_by_one,
+    photo_grey,
+    shrunk,
+)
 from orthoflow_plugins.match.placing import Placed, PlacedWalls
 from orthoflow_plugins.match.warping import project_walls
 
 _LONGEST_SIDE_PX: Final = 1600
-_RULE: Final = PairingRule(
-    features=FeatureRule(n_most=4000, contrast_threshold=0.02, edge_threshold=10.0),
-    ratio_most=0.8,
-    n_verified_least=8,
-    longest_side_px=_LONGEST_SIDE_PX,
-    clip_limit=3.0,
-)
+_PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
 # So many key points, in parts that both places show, tell whether the places agree; fewer may be a
 # repeated motif.
 _SHARED_LEAST: Final = 24
@@ -183,7 +182,7 @@ def _shared(
 
     def shared(pair: tuple[int, int]) -> NDArray[np.float64]:
         one, other = (small[index] for index in pair)
-        pairs = pair_photo(one.grey, [other.features], _RULE)
+        pairs = pair_photo(one.grey, [other.features], _PARAMS)
         pixels = [
             np.stack(
                 [
@@ -215,7 +214,7 @@ def _small(photos: Photos, index: int) -> _Small:
     small = shrunk(grey, scale)
     return _Small(
         grey=small,
-        features=find_features(equalised(small, _RULE.clip_limit), _RULE.features),
+        features=find_features(equalised(small, CLIP_LIMIT), _PARAMS.max_features),
         scale=scale,
     )
 

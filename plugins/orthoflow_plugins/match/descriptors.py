@@ -1,7 +1,4 @@
-"""Descriptors that are each other's nearest, and clearly so.
-
-The nearest ones are found exactly, by matrix products, or roughly, among those that are alike.
-"""
+"""Descriptors that are each other's nearest, and clearly so, found by matrix products."""
 
 from __future__ import annotations
 
@@ -17,10 +14,6 @@ from orthoflow.geometry.rows import Rows
 _PAIRS_AT_ONCE: Final = 65_536
 # Entries of a block of distances: 12 MB, which a processor's cache holds while they are searched.
 _BLOCK_ENTRIES: Final = 3_000_000
-# Of the nearest lists, so many are searched; a list holds some hundred descriptors.
-_LISTS_PROBED: Final = 6
-_LIST_SIZE: Final = 120
-_LISTS_LEAST: Final = 2 * _LISTS_PROBED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,48 +74,42 @@ class Window:
 
 
 def mutual_matches(
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    *,
-    ratio_most: float,
-    is_exact: bool,
+    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
     """Pair descriptors that are each other's nearest and clearly nearer than the next.
 
     Args:
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise.
-        ratio_most: largest distance of the best over the distance of the second best (Lowe 2004).
-        is_exact: whether all pairs are compared, or only those that are roughly alike.
+        ratio: largest distance of the best over the distance of the second best (Lowe 2004).
     """
     if not (len(first) and len(second)):
         return _no_matches()
-    search = two_nearest if is_exact else two_nearest_roughly
-    found = search(first, second)
-    ratio = _ratio(found.best, found.next_best)
+    found = two_nearest(first, second)
+    ratios = _ratio(found.best, found.next_best)
     # Few are distinct, so that only they are looked up backwards.
-    distinct = np.flatnonzero(ratio <= ratio_most)
+    distinct = np.flatnonzero(ratios <= ratio)
     asked, place = np.unique(found.index[distinct], return_inverse=True)
     back = nearest(second[asked], first)[place]
     kept = distinct[back == distinct]
-    return Matches(first=kept, second=found.index[kept], ratio=ratio[kept])
+    return Matches(first=kept, second=found.index[kept], ratio=ratios[kept])
 
 
 def best_matches(
-    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio_most: float
+    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
     """Pair each descriptor of the first set with its nearest in the second, in one direction.
 
     Args:
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise, at least one.
-        ratio_most: largest distance of the best over the distance of the second best (Lowe 2004);
+        ratio: largest distance of the best over the distance of the second best (Lowe 2004);
             1 for any.
     """
     found = two_nearest(first, second)
-    ratio = _ratio(found.best, found.next_best)
-    kept = np.flatnonzero(ratio <= ratio_most)
-    return Matches(first=kept, second=found.index[kept], ratio=ratio[kept])
+    ratios = _ratio(found.best, found.next_best)
+    kept = np.flatnonzero(ratios <= ratio)
+    return Matches(first=kept, second=found.index[kept], ratio=ratios[kept])
 
 
 def mutual_matches_within(
@@ -130,7 +117,7 @@ def mutual_matches_within(
     second: NDArray[np.float32],
     window: Window,
     *,
-    ratio_most: float,
+    ratio: float,
 ) -> Matches:
     """Pair descriptors as `mutual_matches` does, as if there were no pairs but the possible ones.
 
@@ -138,7 +125,7 @@ def mutual_matches_within(
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise.
         window: only pairs inside it count, also as second best.
-        ratio_most: largest distance of the best over the distance of the second best.
+        ratio: largest distance of the best over the distance of the second best.
     """
     if not (len(first) and len(second)):
         return _no_matches()
@@ -150,13 +137,13 @@ def mutual_matches_within(
     has_next = np.append(starts[1:], len(order)) > following
     next_best = np.full(len(best), np.inf, dtype=np.float32)
     next_best[has_next] = distances[order[following[has_next]]]
-    ratio = _ratio(distances[best], next_best)
+    ratios = _ratio(distances[best], next_best)
     backwards = np.lexsort((i, distances, j))
     back = backwards[np.flatnonzero(np.diff(j[backwards], prepend=-1))]
     is_back = np.zeros(len(i), dtype=np.bool_)
     is_back[back] = True
-    kept = is_back[best] & (ratio <= ratio_most)
-    return Matches(first=i[best[kept]], second=j[best[kept]], ratio=ratio[kept])
+    kept = is_back[best] & (ratios <= ratio)
+    return Matches(first=i[best[kept]], second=j[best[kept]], ratio=ratios[kept])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,35 +167,15 @@ def two_nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNe
     Both are whole numbers, small enough that products are exact in float32.
     """
     left, right = _left(asked), _right(among)
-    found = _none_found(len(asked))
+    index = np.zeros(len(asked), dtype=np.intp)
+    best, next_best = np.empty((2, len(asked)), dtype=np.float32)
     for rows in _blocks(len(asked), len(among)):
-        _keep_nearer(found, np.arange(rows.start, rows.stop), left[rows] @ right, None)
-    return found
-
-
-def two_nearest_roughly(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNearest:
-    """Find the two nearest among those that are alike; now and then a nearer one is missed.
-
-    An inverted file (Sivic & Zisserman 2003; Jegou et al. 2011): `among` is sorted into lists about
-    some of its own members, and only the lists next to what is asked for are searched. Small sets
-    are searched as `two_nearest` does.
-    """
-    n_lists = len(among) // _LIST_SIZE
-    if n_lists < _LISTS_LEAST:
-        return two_nearest(asked, among)
-    middles = _middles(among, n_lists)
-    list_of = nearest(among, middles)
-    members = np.argsort(list_of, kind="stable")
-    ends = np.cumsum(np.bincount(list_of, minlength=n_lists))
-    left, right = _left(asked), _right(among)
-    probed = _probed(left, middles)
-    found = _none_found(len(asked))
-    for number in range(n_lists):
-        inside = members[ends[number - 1] if number else 0 : ends[number]]
-        rows = np.flatnonzero((probed == number).any(axis=1))
-        if inside.size and rows.size:
-            _keep_nearer(found, rows, left[rows] @ right[:, inside], inside)
-    return found
+        distances = left[rows] @ right
+        own, column = np.arange(len(distances)), distances.argmin(axis=1)
+        index[rows], best[rows] = column, distances[own, column]
+        distances[own, column] = np.inf
+        next_best[rows] = distances.min(axis=1)
+    return TwoNearest(index=index, best=best, next_best=next_best)
 
 
 def nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -243,59 +210,6 @@ def _ratio(best: NDArray[np.float32], next_best: NDArray[np.float32]) -> NDArray
 def _no_matches() -> Matches:
     nothing = np.empty(0, dtype=np.intp)
     return Matches(first=nothing, second=nothing, ratio=np.empty(0))
-
-
-def _none_found(count: int) -> TwoNearest:
-    far = np.full(count, np.inf, dtype=np.float32)
-    return TwoNearest(index=np.zeros(count, dtype=np.intp), best=far, next_best=far.copy())
-
-
-def _keep_nearer(
-    found: TwoNearest,
-    rows: NDArray[np.intp],
-    distances: NDArray[np.float32],
-    names: NDArray[np.intp] | None,
-) -> None:
-    """Enter distances (rows, columns) into what was found; `names` are the columns' indices."""
-    own = np.arange(len(rows))
-    column = distances.argmin(axis=1)
-    best = distances[own, column]
-    distances[own, column] = np.inf
-    next_best = distances.min(axis=1)
-    is_nearer = best < found.best[rows]
-    found.next_best[rows] = np.where(
-        is_nearer,
-        np.minimum(found.best[rows], next_best),
-        np.minimum(found.next_best[rows], best),
-    )
-    nearer = rows[is_nearer]
-    found.best[nearer] = best[is_nearer]
-    found.index[nearer] = (column if names is None else names[column])[is_nearer]
-
-
-def _middles(among: NDArray[np.float32], n_lists: int) -> NDArray[np.float32]:
-    """Members spread over the set, moved once to the mean of what is nearest to them."""
-    chosen = among[np.floor(np.arange(n_lists) * len(among) / n_lists).astype(np.intp)]
-    list_of = nearest(among, chosen)
-    order = np.argsort(list_of, kind="stable")
-    # Every member is nearest to itself or to its equal: lists of equals may stay empty.
-    names, starts = np.unique(list_of[order], return_index=True)
-    sums = np.add.reduceat(among[order].astype(np.float64), starts)
-    counts = np.diff(np.append(starts, len(order)))[:, None]
-    middles = chosen.copy()
-    # Whole numbers again, so that products stay exact.
-    middles[names] = np.rint(sums / counts)
-    return middles
-
-
-def _probed(left: NDArray[np.float32], middles: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Lists (n, p) nearest to each descriptor."""
-    right = _right(middles)
-    parts = [
-        np.argpartition(left[rows] @ right, _LISTS_PROBED, axis=1)[:, :_LISTS_PROBED]
-        for rows in _blocks(len(left), len(middles))
-    ]
-    return np.concatenate(parts)
 
 
 def _left(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import even_parts, in_threads
-from orthoflow_plugins.match.channels import Channels
+from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
 from orthoflow_plugins.match.patch_kernels import (
     Picture,
     match_patches,
@@ -35,21 +35,20 @@ _CUT_MARGIN_CELLS: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchRule:
-    """How displacements are measured.
+class Search:
+    """How displacements are looked for.
 
     Attributes:
-        radius_cells: how far to search.
-        half_patch_cells: patches are (2 h + 1)^2 cells.
-        score_least: smallest correlation.
-        distinct_least: by how much the best correlation must exceed the next peak.
+        radius_cells: how far.
+        min_score: smallest correlation; half of what patches of right places have (0.35), less
+            where patches are many and judged by their neighbours.
+        min_distinct: by how much the best correlation must exceed the next peak.
         threads: patches are shared between so many.
     """
 
     radius_cells: int
-    half_patch_cells: int
-    score_least: float
-    distinct_least: float
+    min_score: float = 0.35
+    min_distinct: float = 0.05
     threads: int = 1
 
 
@@ -71,47 +70,47 @@ class Displacements(Rows):
 
 
 def measure(
-    first: Channels, second: Channels, places: NDArray[np.intp], rule: SearchRule
+    first: Channels, second: Channels, places: NDArray[np.intp], search: Search
 ) -> Displacements:
     """Measure displacements from the first picture to the second at cells (n, 2) of the first.
 
     Where the first has one channel and the second three, each patch of the first is compared with
     the mixture of the second's channels that fits it best.
     """
-    places = _well_known(first, second, places, rule)
+    places = _well_known(first, second, places, search)
     is_mixed = (first.values.shape[2], second.values.shape[2]) == (1, 3)
-    search = search_mixtures if is_mixed else search_shifts
+    kernel = search_mixtures if is_mixed else search_shifts
     found = np.zeros((len(places), 7 if is_mixed else 4))
-    reach = (rule.half_patch_cells, rule.radius_cells)
+    reach = (HALF_PATCH_CELLS, search.radius_cells)
     in_threads(
         [
-            partial(search, first.values, second.values, places[part], reach, found[part])
-            for part in even_parts(len(places), rule.threads)
+            partial(kernel, first.values, second.values, places[part], reach, found[part])
+            for part in even_parts(len(places), search.threads)
         ]
     )
-    kept = (found[:, 2] >= rule.score_least) & (found[:, 3] >= rule.distinct_least)
+    kept = (found[:, 2] >= search.min_score) & (found[:, 3] >= search.min_distinct)
     if is_mixed:
-        return _mixed_and_refined(first, second, (places[kept], found[kept]), rule)
-    return _refined(first, second, (places[kept], found[kept, :2]), rule)
+        return _mixed_and_refined(first, second, (places[kept], found[kept]), search)
+    return _refined(first, second, (places[kept], found[kept, :2]), search)
 
 
 def _mixed_and_refined(
     first: Channels,
     second: Channels,
     start: tuple[NDArray[np.intp], NDArray[np.float64]],
-    rule: SearchRule,
+    search: Search,
 ) -> Displacements:
     """Refine each patch in a mixture of its own: all patches, cut out, one below the other."""
     places, found = start
     begun = found[:, :2].astype(np.intp)
-    reach = rule.half_patch_cells + _CUT_MARGIN_CELLS
+    reach = HALF_PATCH_CELLS + _CUT_MARGIN_CELLS
     one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
     other = _cut_out(second, places + begun, reach, found[:, 4:].astype(np.float32))
     side = 2 * reach + 1
     centres = np.column_stack(
         [np.full(len(places), reach), reach + side * np.arange(len(places))]
     ).astype(np.intp)
-    refined = _refined(one, other, (centres, np.zeros((len(places), 2))), rule)
+    refined = _refined(one, other, (centres, np.zeros((len(places), 2))), search)
     nth = refined.places[:, 1] // side
     return replace(refined, places=places[nth], shift_cells=refined.shift_cells + begun[nth])
 
@@ -139,12 +138,12 @@ def _cut_out(
 
 
 def _well_known(
-    first: Channels, second: Channels, places: NDArray[np.intp], rule: SearchRule
+    first: Channels, second: Channels, places: NDArray[np.intp], search: Search
 ) -> NDArray[np.intp]:
     """Places whose search stays inside the pictures and whose patches are mostly known."""
     import cv2
 
-    reach = rule.radius_cells + rule.half_patch_cells + 2
+    reach = search.radius_cells + HALF_PATCH_CELLS + 2
     rows, columns = first.known.shape
     inside = (
         (places[:, 0] >= reach)
@@ -153,7 +152,7 @@ def _well_known(
         & (places[:, 1] < rows - reach)
     )
     places = places[inside]
-    side = 2 * rule.half_patch_cells + 1
+    side = 2 * HALF_PATCH_CELLS + 1
     share = cv2.blur(first.known * second.known, (side, side))
     known = share[places[:, 1], places[:, 0]] >= _KNOWN_LEAST
     return np.ascontiguousarray(places[known])
@@ -163,21 +162,21 @@ def _refined(
     first: Channels,
     second: Channels,
     start: tuple[NDArray[np.intp], NDArray[np.float64]],
-    rule: SearchRule,
+    search: Search,
 ) -> Displacements:
     places, begun = start
-    window = _window(rule.half_patch_cells)
-    forward = _matched((first, second), (places, begun), window, rule.threads)
+    window = _window(HALF_PATCH_CELLS)
+    forward = _matched((first, second), (places, begun), window, search.threads)
     # Both ways, halved: what interpolation does to one of the pictures then cancels.
     middle = np.rint(forward.shifts).astype(np.intp)
-    back = _matched((second, first), (places + middle, -forward.shifts), window, rule.threads)
+    back = _matched((second, first), (places + middle, -forward.shifts), window, search.threads)
     shifts = 0.5 * (forward.shifts - back.shifts)
     disagreement = np.abs(forward.shifts + back.shifts).max(axis=1, initial=0.0)
     sigma = np.sqrt(0.5 * (forward.sigma**2 + back.sigma**2) + (0.5 * disagreement) ** 2)
     good = (
         (np.abs(shifts - begun).max(axis=1, initial=0.0) < _DRIFT_MOST_CELLS)
         & (disagreement < _DISAGREEMENT_MOST_CELLS)
-        & (forward.score >= rule.score_least)
+        & (forward.score >= search.min_score)
         & np.isfinite(sigma)
     )
     return Displacements(

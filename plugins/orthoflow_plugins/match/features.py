@@ -17,6 +17,10 @@ from orthoflow.geometry.key_points import in_turns, root_sift
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.geometry.rows import Rows
 
+# OpenCV's own contrast, half of which still brings right matches, and its ratio of curvatures.
+_OPENCV_CONTRAST: Final = 0.04
+_MIN_CONTRAST: Final = 0.02
+_MAX_EDGE_RATIO: Final = 10.0
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
 _TILE_PX: Final = 2048
@@ -80,45 +84,29 @@ class Features(Rows):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FeatureRule:
-    """How key points are found.
-
-    Attributes:
-        n_most: at most so many.
-        contrast_threshold: of the difference of Gaussians, as OpenCV counts it.
-        edge_threshold: largest ratio of curvatures, as OpenCV counts it.
-        upscales_precisely: whether the image is doubled without a shift, which OpenCV leaves off.
-        is_rooted: whether descriptors are RootSIFT, or SIFT.
-    """
-
-    n_most: int
-    contrast_threshold: float
-    edge_threshold: float
-    upscales_precisely: bool = True
-    is_rooted: bool = True
-
-
 def find_features(
-    picture: NDArray[np.uint8], rule: FeatureRule, usable: NDArray[np.bool_] | None = None
+    picture: NDArray[np.uint8],
+    max_features: int,
+    usable: NDArray[np.bool_] | None = None,
+    *,
+    as_opencv: bool = False,
 ) -> Features:
     """Find key points, tile by tile, in an order that depends on the image only.
 
     Args:
         picture: (rows, cols) grey.
-        rule: how.
+        max_features: at most so many.
         usable: (rows, cols), False where no key point may lie; None allows all.
+        as_opencv: SIFT as OpenCV sets it (markiewicz2015): other contrast, descriptors as they are.
     """
     import cv2
 
     sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
-        contrastThreshold=rule.contrast_threshold,
-        edgeThreshold=rule.edge_threshold,
-        enable_precise_upscale=rule.upscales_precisely,
+        contrastThreshold=_OPENCV_CONTRAST if as_opencv else _MIN_CONTRAST,
+        edgeThreshold=_MAX_EDGE_RATIO,
+        enable_precise_upscale=not as_opencv,
     )
-    shift_px = HALF_PIXEL
-    if not rule.upscales_precisely:
-        shift_px -= _SHIFT_BY_UPSCALING_PX
+    shift_px = HALF_PIXEL - (_SHIFT_BY_UPSCALING_PX if as_opencv else 0.0)
     parts = [_in_tile(sift, picture, corner, shift_px) for corner in _tiles(picture.shape)]
     points = np.vstack([part.points for part in parts])
     pixels = points[:, :2]
@@ -126,13 +114,13 @@ def find_features(
     chosen = np.lexsort(points[:, :4].T)
     if usable is not None:
         chosen = chosen[usable[_cell_of(pixels[chosen], usable.shape)]]
-    chosen = chosen[_spread(pixels[chosen], points[chosen, 4], picture.shape, rule.n_most)]
+    chosen = chosen[_spread(pixels[chosen], points[chosen, 4], picture.shape, max_features)]
     raw = _described(sift, picture, parts, chosen)
     return Features(
         pixels=pixels[chosen],
         sizes_px=points[chosen, 2],
         angles_deg=points[chosen, 3],
-        descriptors=root_sift(raw) if rule.is_rooted else raw,
+        descriptors=raw if as_opencv else root_sift(raw),
     )
 
 

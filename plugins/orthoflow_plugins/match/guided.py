@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -13,27 +11,22 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.hand_ties import (
-    is_by_hand_alone,
-    ties_by_hand_alone,
-    with_ties_by_hand,
-)
-from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.paper import (
     footprints,
-    largest_ratio,
     paper_pieces,
     paper_wall_features,
     with_paper_ratio,
 )
-from orthoflow_plugins.match.pictures import require_photos
-from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
-from orthoflow_plugins.match.traced_photos import TracedPhoto, TracedPhotos
-from orthoflow_plugins.match.warping import Before
+from orthoflow_plugins.match.pictures import one_by_one, opencv_version, require_photos
+from orthoflow_plugins.match.ties import (
+    TiePiece,
+    Trace,
+    ties_by_hand_alone,
+    ties_of,
+    with_ties_by_hand,
+)
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.match.channels import WallTarget
-    from orthoflow_plugins.match.tracing import Trace, TracingRule
     from orthoflow_plugins.match.warping import Before
 
 # Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
@@ -88,7 +81,7 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """Search radius, patches, and how many ties."""
+        """What is compared, and how many ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
@@ -103,15 +96,6 @@ class MatchGuided(Method):
             description="With preset: paper alone: largest distance of the best match over the "
             "second best, 0.8 unless given, as its openMVG has it; null for any.",
         )
-        search_radius_cells: int = Field(
-            default=8,
-            ge=2,
-            le=64,
-            description="How far a place is searched in the first round; halved in every next.",
-        )
-        half_patch_cells: int = Field(
-            default=10, ge=4, le=40, description="Patches are (2 h + 1) cells wide."
-        )
         channels: Literal["auto", "gradients", "grey", "colours"] = Field(
             default="auto",
             description="What is compared: oriented gradients; the grey itself, which is sharper "
@@ -120,20 +104,8 @@ class MatchGuided(Method):
             "better one; each photo keeps what has the smallest error of held-out ties over the "
             "root of their number and over how far apart they lie.",
         )
-        score_min_share: float = Field(
-            default=0.35, ge=0, lt=1, description="Smallest correlation of two patches."
-        )
-        distinct_min_share: float = Field(
-            default=0.05,
-            ge=0,
-            lt=1,
-            description="By how much the best correlation must exceed that of another place.",
-        )
-        n_ties_max: int = Field(
+        max_ties: int = Field(
             default=1200, ge=50, description="Places measured per photo, spread evenly."
-        )
-        n_rounds_max: int = Field(
-            default=4, ge=1, le=10, description="Photos are warped and measured at most so often."
         )
         finds_missing: bool = Field(
             default=True,
@@ -160,98 +132,27 @@ class MatchGuided(Method):
 
         ties: Ties
 
-    # What this very object laid out, if it traced photos.
-    _desk: _Desk | None = None
-
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Trace the photos on the walls, find those without a pose, and make ties."""
-        return self._ties(inputs, self._traced(inputs, params, ctx), params, ctx)
-
-    def _traced(self, inputs: In, params: Params, ctx: StepContext) -> TracedPhotos:
-        """Trace oriented photos on the walls."""
-        from orthoflow_plugins.match.tracing import estimated_lens, trace_photo
-
-        photos, walls = inputs.photos.photos, inputs.walls
-        require_photos(inputs.photos)
+        """Trace the oriented photos on the walls, find those without a pose, and make ties."""
+        photos, walls = inputs.photos, inputs.walls
+        require_photos(photos)
         if inputs.cloud is not None:
             inputs.cloud.require_points(3)
-        if is_by_hand_alone(inputs.hand, walls):
-            return TracedPhotos()
-        oriented = _oriented(inputs.cameras)
-        indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
-        if params.preset == "paper":
-            ratio = largest_ratio(params.ratio)
-            return _masked(inputs.photos, walls, (oriented, indices), ratio, ctx)
-        ctx.progress(0.0, "walls")
-        rule = _rule(params, max(1, ctx.cores // max(1, len(indices))))
-        desk = self._desk = _laid_out(inputs)
-
-        def trace(index: int) -> Trace:
-            photo = photos[index]
-            lens = estimated_lens(photo, oriented[photo.name].intrinsics)
-            camera = oriented[photo.name].viewing()
-            return trace_photo(index, photo, camera, desk.targets, rule, desk.before, lens)
-
-        is_any_missing = params.finds_missing and not _has_all(inputs.photos, oriented)
-        traced: list[TracedPhoto] = []
-        for index, found in zip(indices, one_by_one(trace, indices, ctx.cores), strict=True):
-            name = photos[index].name
-            traced.append(TracedPhoto.of(found, oriented[name].viewing()))
-            if is_any_missing:
-                desk.traces[index] = found
-            ctx.progress(len(traced) / (len(indices) + 1), name)
-            if not any(len(piece) for piece in found.pieces):
-                ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
-        return TracedPhotos(photos=tuple(traced))
-
-    def _ties(self, inputs: In, found: TracedPhotos, params: Params, ctx: StepContext) -> Out:
-        """Find the photos without a pose on what the others show, and make ties."""
-        photos, walls = inputs.photos, inputs.walls
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
+        oriented = _oriented(inputs.cameras)
+        details: dict[str, JsonValue] = {"intensity_source": walls.intensity_source}
+        traces: dict[str, Trace] = {}
         if params.preset == "paper":
-            ties = ties_of(
-                found.pieces, photos, walls, {"intensity_source": walls.intensity_source}
-            )
-            _report(ctx, ties, {})
-            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-        traces = {photos.photos[one.photo].name: one for one in found.photos}
-        if params.finds_missing:
-            traces |= self._recovered(inputs, found.photos, params, ctx)
-        ties = ties_of(
-            [piece for found in traces.values() for piece in found.pieces],
-            photos,
-            walls,
-            {
-                "photos": {name: _note(found) for name, found in traces.items()},
-                "intensity_source": walls.intensity_source,
-            },
-        )
+            pieces = _masked(photos, walls, oriented, params.ratio or 1.0, ctx)
+        else:
+            traces = _traced(inputs, oriented, params, ctx)
+            pieces = [piece for found in traces.values() for piece in found.pieces]
+            details["photos"] = {name: _note(found) for name, found in traces.items()}
+        ties = ties_of(pieces, photos, walls, details)
         _report(ctx, ties, traces)
         return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-
-    def _recovered(
-        self, inputs: In, traced: Sequence[TracedPhoto], params: Params, ctx: StepContext
-    ) -> dict[str, TracedPhoto]:
-        """Trace the photos without a pose that others help to find, by name."""
-        from orthoflow_plugins.match.recovering import recovered_traces
-
-        photos, oriented = inputs.photos, _oriented(inputs.cameras)
-        if _has_all(photos, oriented):
-            return {}
-        desk = self._desk or _laid_out(inputs)
-        walls = [target.wall for target in desk.targets]
-        known = [
-            desk.traces.get(found.photo)
-            or found.trace(photos.photos[found.photo], walls, desk.before)
-            for found in traced
-        ]
-        rule = _rule(params, max(1, ctx.cores // len(traced)))
-        recovered = recovered_traces(photos, oriented, desk.targets, known, rule, desk.before)
-        for name in recovered:
-            ctx.log(f"photo {name}: found by what other photos show of the walls")
-        return {name: TracedPhoto.of(found, found.view.camera) for name, found in recovered.items()}
 
     @classmethod
     def tools(cls) -> dict[str, str]:
@@ -259,55 +160,66 @@ class MatchGuided(Method):
         return opencv_version()
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Desk:
-    """What photos are laid on: the walls as targets, and what stands before them.
-
-    Attributes:
-        targets: the walls.
-        before: what stands free before them, where the cloud is wired.
-        traces: by index, of photos that lie there still, for those that are looked for with them.
-    """
-
-    targets: list[WallTarget]
-    before: Before | None
-    traces: dict[int, Trace] = field(default_factory=dict)
-
-
-def _laid_out(inputs: MatchGuided.In) -> _Desk:
-    """Prepare the walls, and what any oriented photo has before them."""
+def _traced(
+    inputs: MatchGuided.In,
+    oriented: dict[str, Camera],
+    params: MatchGuided.Params,
+    ctx: StepContext,
+) -> dict[str, Trace]:
+    """Trace oriented photos on the walls, and those that they help to find, by name."""
     from orthoflow_plugins.match.channels import target_of
     from orthoflow_plugins.match.joined_cells import in_cells_of_points
+    from orthoflow_plugins.match.recovering import recovered_traces
+    from orthoflow_plugins.match.tracing import CONTENTS, Desk, estimated_lens, trace_photo
 
-    oriented = _oriented(inputs.cameras)
-    names = [photo.name for photo in inputs.photos.photos if photo.name in oriented]
-    return _Desk(
+    photos = inputs.photos.photos
+    indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
+    ctx.progress(0.0, "walls")
+    desk = Desk(
         targets=[target_of(in_cells_of_points(wall)) for wall in inputs.walls.walls],
-        before=_before(inputs, [oriented[name] for name in names]),
+        before=_before(inputs, [oriented[photos[index].name] for index in indices]),
+        max_ties=params.max_ties,
+        contents=CONTENTS if params.channels == "auto" else (params.channels,),
+        threads=max(1, ctx.cores // max(1, len(indices))),
     )
 
+    def trace(index: int) -> Trace:
+        photo = photos[index]
+        lens = estimated_lens(photo, oriented[photo.name].intrinsics)
+        return trace_photo(index, photo, oriented[photo.name].viewing(), desk, lens)
 
-def _has_all(photos: Photos, oriented: dict[str, Camera]) -> bool:
-    return all(photo.name in oriented for photo in photos.photos)
+    traces: dict[str, Trace] = {}
+    for index, found in zip(indices, one_by_one(trace, indices, ctx.cores), strict=True):
+        name = photos[index].name
+        traces[name] = found
+        ctx.progress(len(traces) / (len(indices) + 1), name)
+        if not any(len(piece) for piece in found.pieces):
+            ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
+    if not params.finds_missing or len(indices) == len(photos):
+        return traces
+    recovered = recovered_traces(inputs.photos, oriented, desk, list(traces.values()))
+    for name in recovered:
+        ctx.log(f"photo {name}: found by what other photos show of the walls")
+    return traces | recovered
 
 
 def _masked(
     photos: Photos,
     walls: Walls,
-    which: tuple[dict[str, Camera], list[int]],
-    ratio_most: float,
+    oriented: dict[str, Camera],
+    max_ratio: float,
     ctx: StepContext,
-) -> TracedPhotos:
+) -> list[TiePiece]:
     """Match as markiewicz2015 did, within the footprint of each oriented photo."""
-    oriented, indices = which
     on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
-    for nth, index in enumerate(indices):
-        photo = photos.photos[index]
-        ctx.progress(nth / len(indices), photo.name)
+    for index, photo in enumerate(photos.photos):
+        if photo.name not in oriented:
+            continue
+        ctx.progress(index / len(photos.photos), photo.name)
         masks = footprints(oriented[photo.name].viewing(), walls)
-        pieces += paper_pieces(index, photo, on_walls, walls, masks, ratio_most=ratio_most)
-    return TracedPhotos(pieces=tuple(pieces))
+        pieces += paper_pieces(index, photo, on_walls, walls, masks, max_ratio=max_ratio)
+    return pieces
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
@@ -329,6 +241,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
     """What stands free before the walls, where the cloud is wired."""
     from orthoflow.geometry.occluders import occluders_before
+    from orthoflow_plugins.match.warping import Before
 
     cloud, walls = inputs.cloud, inputs.walls
     if cloud is None or not walls.walls:
@@ -347,22 +260,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
     return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))
 
 
-def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
-    from orthoflow_plugins.match.tracing import CONTENTS, TracingRule
-
-    return TracingRule(
-        radius_cells=params.search_radius_cells,
-        half_patch_cells=params.half_patch_cells,
-        score_least=params.score_min_share,
-        distinct_least=params.distinct_min_share,
-        n_ties_most=params.n_ties_max,
-        n_rounds_most=params.n_rounds_max,
-        threads=threads,
-        contents=CONTENTS if params.channels == "auto" else (params.channels,),
-    )
-
-
-def _note(trace: TracedPhoto) -> JsonValue:
+def _note(trace: Trace) -> JsonValue:
     return {
         "n_ties": trace.n_ties,
         "n_measured": trace.n_measured,
@@ -372,7 +270,7 @@ def _note(trace: TracedPhoto) -> JsonValue:
     }
 
 
-def _report(ctx: StepContext, ties: Ties, traces: dict[str, TracedPhoto]) -> None:
+def _report(ctx: StepContext, ties: Ties, traces: dict[str, Trace]) -> None:
     per_photo = np.bincount(ties.photo, minlength=len(ties.photo_names))
     n_measured = sum(trace.n_measured for trace in traces.values())
     n_outliers = sum(trace.n_outliers for trace in traces.values())

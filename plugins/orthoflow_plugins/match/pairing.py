@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from orthoflow.products import Wall
+from orthoflow.products import Photo, Wall
+from orthoflow.sdk import MethodParams
 from orthoflow_plugins.match.descriptors import (
     Matches,
     Window,
     mutual_matches,
     mutual_matches_within,
 )
-from orthoflow_plugins.match.features import FeatureRule, Features, find_features
-from orthoflow_plugins.match.pictures import equalised, shrunk, wall_picture
+from orthoflow_plugins.match.features import Features, find_features
+from orthoflow_plugins.match.pictures import (
+    CLIP_LIMIT,
+    equalised,
+    photo_grey,
+    photo_rgb,
+    shrunk,
+    wall_picture,
+)
 
 # A photo is tried at this size first, then at twice, until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
@@ -37,38 +46,59 @@ _MIRRORED_OVER: Final = 2
 _LOG_SIZE_MOST: Final = 0.7
 _ANGLE_MOST_DEG: Final = 30.0
 _VOID_MARGIN_CELLS: Final = 3
+MIN_AGREEING: Final = 8
+"""Matches that agree with one homography where a photo shows a wall."""
 _SEED: Final = 1
 
+# Key points bear another strength of contrast, not another sign. A laser that sees red dark, or
+# bright what the eye sees dark, shows half of all edges the other way round than grey does; in a
+# mixture of the photo's colours most are as the laser sees them. Which mixture that is nobody knows
+# beforehand: the one is taken in which most key points agree.
+MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
+    "green less red": (-1.0, 1.0, 0.0),
+    "red as dark": (-1.0, 0.0, 0.0),
+    "blue less red": (-1.0, 0.0, 1.0),
+    "negative": (-0.299, -0.587, -0.114),
+    "red less green": (1.0, -1.0, 0.0),
+}
+"""By name, weights of red, green and blue, in the order in which they are tried."""
 
-@dataclass(frozen=True, kw_only=True)
-class PairingRule:
-    """How photos are paired with walls.
-
-    Attributes:
-        features: how key points are found.
-        ratio_most: of the distances of best and second best.
-        n_verified_least: ties that agree with one homography, for a wall to count as shown.
-        longest_side_px: larger photos are shrunk to this.
-        clip_limit: of the local equalisation.
-        is_exact: whether all pairs of key points are compared, or only those roughly alike.
-    """
-
-    features: FeatureRule
-    ratio_most: float
-    n_verified_least: int
-    longest_side_px: int
-    clip_limit: float
-    is_exact: bool = True
+# Measured in rooms of inverted contrast: up to 15 matches agreed on a wrong place, and once 19. A
+# mixture that recognises a wall needs more than 15, as there are several of them.
+LEAST: Final = 16
+# From so many on, neither another mixture is tried nor structure.
+CLEARLY: Final = 24
+# A mixture is there to find the place, not to measure it.
+_LONGEST_SIDE_PX: Final = 2000
+# A photo without colours has but one mixture.
+_GREY_LEVELS_LEAST: Final = 8.0
 
 
-USUAL_RULE: Final = PairingRule(
-    features=FeatureRule(n_most=8000, contrast_threshold=0.02, edge_threshold=10.0),
-    ratio_most=0.85,
-    n_verified_least=8,
-    longest_side_px=4000,
-    clip_limit=3.0,
-)
-"""As `match.sift` has them, for methods that look for photos on walls besides."""
+class PairingParams(MethodParams):
+    """How photos are paired with walls by key points."""
+
+    max_features: int = Field(
+        default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
+    )
+    ratio: float | None = Field(
+        default=0.85,
+        gt=0,
+        le=1,
+        description="Largest distance of the best match over the second best; null for any. "
+        "With preset: paper 0.8 unless given, as its openMVG has it.",
+    )
+    max_side_px: int = Field(
+        default=4000,
+        ge=200,
+        description="Larger photos are shrunk to this for matching. Smaller sizes come first, "
+        "from 800 px on, until a wall is recognised; then the size at which a pixel is about "
+        "as wide as a cell of the walls.",
+    )
+
+    @property
+    def max_ratio(self) -> float:
+        """The ratio up to which matches count, 1 where all do."""
+        return 1.0 if self.ratio is None else self.ratio
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,17 +152,17 @@ class PhotoPairs:
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
 
 
-def wall_features(wall: Wall, rule: PairingRule) -> Features | None:
+def wall_features(wall: Wall, params: PairingParams) -> Features | None:
     """Key points of a wall's intensity; None where it shows nothing."""
-    picture = wall_picture(wall, clip_limit=rule.clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
+    picture = wall_picture(wall, clip_limit=CLIP_LIMIT, void_margin_cells=_VOID_MARGIN_CELLS)
     if picture is None:
         return None
     usable = picture.usable & np.isfinite(wall.depth_m)
-    return find_features(picture.grey, rule.features, usable)
+    return find_features(picture.grey, params.max_features, usable)
 
 
 def pair_photo(
-    grey: NDArray[np.uint8], walls: Sequence[Features | None], rule: PairingRule
+    grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
     """Recognise the walls in a photo, coarse to fine, then match these at their own resolution.
 
@@ -142,9 +172,9 @@ def pair_photo(
     Args:
         grey: (height, width) of the photo.
         walls: key points per wall, None where it shows nothing.
-        rule: how.
+        params: how.
     """
-    seeker = _Seeker(grey=grey, rule=rule)
+    seeker = _Seeker(grey=grey, params=params)
     first, key_points = seeker.first_look(walls)
     if not first.n_verified:
         return first
@@ -164,11 +194,56 @@ def pair_photo(
         key_points = seeker.key_points(wanted)
     second = seeker.pairs(key_points, _shown(first, walls))
     best = second if second.n_verified > first.n_verified else first
-    return replace(_completed(best, walls, rule), n_recognised=best.n_verified)
+    return replace(_completed(best, walls, params), n_recognised=best.n_verified)
+
+
+def pair_in_colours(
+    photo: Photo, walls: Sequence[Features | None], params: PairingParams
+) -> PhotoPairs:
+    """Pair a photo with walls in grey; where that shows none clearly, in mixtures of its colours.
+
+    Args:
+        photo: the photo.
+        walls: key points per wall, None where it shows nothing.
+        params: how.
+
+    Returns:
+        What most key points agree in, grey where no mixture has more.
+    """
+    best = pair_photo(photo_grey(photo), walls, params)
+    if best.n_recognised >= CLEARLY:
+        return best
+    smaller = params.model_copy(update={"max_side_px": min(params.max_side_px, _LONGEST_SIDE_PX)})
+    rgb = photo_rgb(photo)
+    for name in MIXTURES:
+        picture = mixed(rgb, name)
+        if picture is None:
+            continue
+        tried = pair_photo(picture, walls, smaller)
+        if not tried.is_mirrored and tried.n_recognised >= max(LEAST, best.n_recognised + 1):
+            best = replace(tried, picture=name)
+        if best.n_recognised >= CLEARLY:
+            break
+    return best
+
+
+def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
+    """Mix a photo's colours, stretched to all grey levels; None for what shows nothing.
+
+    Args:
+        rgb: (height, width, 3).
+        name: of a mixture.
+    """
+    mixture = rgb.astype(np.float32) @ np.array(MIXTURES[name], dtype=np.float32)
+    low, high = np.percentile(mixture[::4, ::4], (0.5, 99.5))
+    if high - low < _GREY_LEVELS_LEAST:
+        return None
+    stretched = (mixture - np.float32(low)) * np.float32(255.0 / (high - low))
+    return np.asarray(np.rint(np.clip(stretched, 0.0, 255.0)), dtype=np.uint8)
 
 
 def side_matches(
-    grey: NDArray[np.uint8], walls: Sequence[Features | None], rule: PairingRule
+    grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> NDArray[np.intp]:
     """Count the matches that agree when walls are seen from the front, and from behind.
 
@@ -177,12 +252,12 @@ def side_matches(
     Args:
         grey: (height, width) of the photo.
         walls: key points per wall, None where it shows nothing or is not asked about.
-        rule: how.
+        params: how.
 
     Returns:
-        (walls, 2): front, behind; 0 where fewer than the rule's least agree.
+        (walls, 2): front, behind; 0 where fewer than the least agree.
     """
-    seeker = _Seeker(grey=grey, rule=rule)
+    seeker = _Seeker(grey=grey, params=params)
     counts = np.zeros((len(walls), 2), dtype=np.intp)
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
@@ -217,7 +292,7 @@ def rematched(
     sets: tuple[Features, Features],
     expected: Expectation,
     *,
-    ratio_most: float,
+    ratio: float,
 ) -> Matches:
     """Add matches within reach of what is expected: place, size and direction of key points.
 
@@ -228,7 +303,7 @@ def rematched(
         matches: of the first look; they stay.
         sets: key points of the photo and of the wall.
         expected: from the first look.
-        ratio_most: largest distance of the best over the second best within reach.
+        ratio: largest distance of the best over the second best within reach.
     """
     photo, wall = sets
     good = matches.take(expected.agreeing)
@@ -249,9 +324,7 @@ def rematched(
         log_size_most=_LOG_SIZE_MOST,
         angle_most_deg=_ANGLE_MOST_DEG,
     )
-    found = mutual_matches_within(
-        photo.descriptors, wall.descriptors[near], window, ratio_most=ratio_most
-    )
+    found = mutual_matches_within(photo.descriptors, wall.descriptors[near], window, ratio=ratio)
     new = ~np.isin(found.first, matches.first)
     return Matches(
         first=np.concatenate([matches.first, found.first[new]]),
@@ -273,16 +346,16 @@ class _Seeker:
     """Looks for walls in one photo."""
 
     grey: NDArray[np.uint8]
-    rule: PairingRule
+    params: PairingParams
 
     @property
     def finest(self) -> float:
         """Largest scale the photo is matched at."""
-        return min(1.0, self.rule.longest_side_px / float(max(self.grey.shape)))
+        return min(1.0, self.params.max_side_px / float(max(self.grey.shape)))
 
     def key_points(self, scale: float) -> _KeyPoints:
-        small = equalised(shrunk(self.grey, scale), self.rule.clip_limit)
-        features = find_features(small, self.rule.features)
+        small = equalised(shrunk(self.grey, scale), CLIP_LIMIT)
+        features = find_features(small, self.params.max_features)
         return _KeyPoints(features=features.scaled(1.0 / scale), scale=scale)
 
     def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, _KeyPoints]:
@@ -293,11 +366,11 @@ class _Seeker:
             key_points = self.key_points(scale)
             few = replace(key_points, features=key_points.features.strongest(_FIRST_IN_PHOTO))
             pairs = self.pairs(few, _strongest(walls))
-            if pairs.n_verified < self.rule.n_verified_least:
+            if pairs.n_verified < MIN_AGREEING:
                 pairs = self.pairs(key_points, walls)
             if found is None or pairs.n_verified >= found[0].n_verified:
                 found = pairs, key_points
-            if found[0].n_verified >= self.rule.n_verified_least or scale >= self.finest:
+            if found[0].n_verified >= MIN_AGREEING or scale >= self.finest:
                 return found
             scale = min(self.finest, 2.0 * scale)
 
@@ -311,12 +384,11 @@ class _Seeker:
             matches = mutual_matches(
                 key_points.features.descriptors,
                 wall.descriptors,
-                ratio_most=self.rule.ratio_most,
-                is_exact=self.rule.is_exact,
+                ratio=self.params.max_ratio,
             )
             if len(matches):
                 sets = (key_points.features, wall)
-                pairs.append(_verified(index, matches, sets, (radius_px, self.rule)))
+                pairs.append(verified(index, matches, sets, radius_px))
         return PhotoPairs(
             features=key_points.features,
             scale=key_points.scale,
@@ -363,10 +435,18 @@ def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features
     return [wall if index in shown else None for index, wall in enumerate(walls)]
 
 
-def _verified(
-    index: int, matches: Matches, sets: tuple[Features, Features], limits: tuple[float, PairingRule]
+def verified(
+    index: int, matches: Matches, sets: tuple[Features, Features], loose_px: float
 ) -> Pair:
-    (features, wall), (loose_px, rule) = sets, limits
+    """Ask which matches agree with one homography of a wall, roughly.
+
+    Args:
+        index: of the wall.
+        matches: of key points of the photo and of the wall.
+        sets: these.
+        loose_px: matches agree up to this distance in the photo.
+    """
+    features, wall = sets
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
     agreeing = np.zeros(len(matches), dtype=np.bool_)
     homography = None
@@ -379,7 +459,7 @@ def _verified(
     n_places = min(_n_places(source[agreeing], 2.0), _n_places(target[agreeing], 2.0))
     if (
         homography is None
-        or n_places < rule.n_verified_least
+        or n_places < MIN_AGREEING
         or not _is_from_the_front(homography, source[agreeing].mean(axis=0))
     ):
         return Pair(wall=index, matches=matches, agreeing=agreeing, is_shown=False)
@@ -389,7 +469,7 @@ def _verified(
 
 
 def _completed(
-    pairs: PhotoPairs, walls: Sequence[Features | None], rule: PairingRule
+    pairs: PhotoPairs, walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
     """Add what a second look finds, each key point only where the homography roughly puts it."""
     completed = []
@@ -403,7 +483,7 @@ def _completed(
             pair.matches,
             (pairs.features, wall),
             Expectation(pixels=expected, agreeing=pair.agreeing, radius_px=pairs.radius_px),
-            ratio_most=rule.ratio_most,
+            ratio=params.max_ratio,
         )
         offsets = expected[matches.second] - pairs.features.pixels[matches.first]
         agreeing = np.hypot(*offsets.T) < pairs.radius_px

@@ -17,22 +17,16 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photo, Wall, Walls
 from orthoflow_plugins.match.descriptors import best_matches
-from orthoflow_plugins.match.features import FeatureRule, Features, find_features
+from orthoflow_plugins.match.features import Features, find_features
 from orthoflow_plugins.match.pictures import photo_grey, wall_picture
-from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties
+from orthoflow_plugins.match.ties import TiePiece, key_point_ties
 from orthoflow_plugins.match.warping import project_walls
 
 # What openMVG's documentation names for its best match.
 _PAPER_RATIO: Final = 0.8
 _VOID_MARGIN_CELLS: Final = 3
-# OpenCV's own values.
-PAPER_FEATURES: Final = FeatureRule(
-    n_most=50_000,
-    contrast_threshold=0.04,
-    edge_threshold=10.0,
-    upscales_precisely=False,
-    is_rooted=False,
-)
+# So many key points of a picture at most.
+_MAX_FEATURES: Final = 50_000
 
 
 # Any: what a user wrote, before it is checked.
@@ -43,18 +37,13 @@ def with_paper_ratio(given: Any) -> Any:
     return given
 
 
-def largest_ratio(ratio: float | None) -> float:
-    """Give the ratio up to which matches count, 1 where all do."""
-    return 1.0 if ratio is None else ratio
-
-
 def paper_wall_features(wall: Wall) -> Features | None:
     """Key points of a wall's intensity; None where it shows nothing."""
     picture = wall_picture(wall, clip_limit=0.0, void_margin_cells=_VOID_MARGIN_CELLS)
     if picture is None:
         return None
     usable = picture.usable & np.isfinite(wall.depth_m)
-    return find_features(picture.grey, PAPER_FEATURES, usable)
+    return find_features(picture.grey, _MAX_FEATURES, usable, as_opencv=True)
 
 
 def footprints(camera: ViewingCamera, walls: Walls) -> list[NDArray[np.bool_] | None]:
@@ -77,7 +66,7 @@ def paper_pieces(
     walls: Walls,
     masks: Sequence[NDArray[np.bool_] | None] | None,
     *,
-    ratio_most: float,
+    max_ratio: float,
 ) -> list[TiePiece]:
     """Best matches of a photo with every wall.
 
@@ -87,9 +76,9 @@ def paper_pieces(
         on_walls: key points per wall, None where it shows nothing.
         walls: the walls.
         masks: cells of each wall that may be matched, None for none; without, all may.
-        ratio_most: largest distance of the best match over the second best; 1 for any.
+        max_ratio: largest distance of the best match over the second best; 1 for any.
     """
-    in_photo = find_features(photo_grey(photo), PAPER_FEATURES)
+    in_photo = find_features(photo_grey(photo), _MAX_FEATURES, as_opencv=True)
     pieces = []
     for place, (wall, features) in enumerate(zip(walls.walls, on_walls, strict=True)):
         chosen = features
@@ -97,7 +86,7 @@ def paper_pieces(
             chosen = _within(features, masks[place])
         if chosen is None or not len(chosen) or not len(in_photo):
             continue
-        best = best_matches(chosen.descriptors, in_photo.descriptors, ratio_most=ratio_most)
+        best = best_matches(chosen.descriptors, in_photo.descriptors, ratio=max_ratio)
         pairs = in_photo.take(best.second), chosen.take(best.first)
         pieces.append(key_point_ties((index, place), wall, pairs))
     return pieces

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from importlib.metadata import PackageNotFoundError, version
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +13,14 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Photos, Wall, Walls
 
+_OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
+# Each works on a picture of its own, which takes up to a gigabyte.
+_MAX_AT_ONCE: Final = 4
+CLIP_LIMIT: Final = 3.0
+"""Local contrast is evened out up to this much (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
 # Depths about a point that differ by more than this many cells are an edge of the relief.
@@ -278,3 +286,32 @@ def _bilinear(
     lower = (1 - a) * raster[bottom, left] + a * raster[bottom, right]
     result: NDArray[np.float64] = (1 - b) * upper + b * lower
     return result
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def one_by_one(
+    function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
+) -> Iterator[_Result]:
+    """Give a function's results item by item, several computed at once in threads.
+
+    OpenCV's own threads help little with pictures of this size: each worker gets its share of
+    them, and the rest is Python's.
+    """
+    import cv2
+
+    workers = max(1, min(cores, _MAX_AT_ONCE))
+    cv2.setNumThreads(max(1, cores // workers))
+    yield from in_order(function, items, threads=workers)
+
+
+def opencv_version() -> dict[str, str]:
+    """OpenCV's distribution and version, whichever of its distributions is installed."""
+    for name in _OPENCV:
+        try:
+            return {name: version(name)}
+        except PackageNotFoundError:
+            continue
+    return {}

@@ -23,8 +23,8 @@ from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Wall
-from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
+from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
+from orthoflow_plugins.match.displacements import Displacements, Search, measure
 from orthoflow_plugins.match.pictures import photo_rgb, points_on_wall, shrunk
 from orthoflow_plugins.match.structures import (
     PHOTO_SIDE_PX,
@@ -35,7 +35,7 @@ from orthoflow_plugins.match.structures import (
     structure_of,
     wall_structure,
 )
-from orthoflow_plugins.match.tie_pieces import TiePiece
+from orthoflow_plugins.match.ties import TiePiece
 from orthoflow_plugins.match.tracing import agrees_around, between, fitted_pose
 from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
 
@@ -50,10 +50,9 @@ _CLOSER: Final = 24
 _RADII: Final = (6, 4, 3, 3)
 # Longer side to which a photo is shrunk, once, for all its patches.
 _SIDE_PX: Final = 1200
-_HALF_PATCH: Final = 10
 _APART_CELLS: Final = 5
-_SCORE_LEAST: Final = 0.3
-_DISTINCT_LEAST: Final = 0.03
+_MIN_SCORE: Final = 0.3
+_MIN_DISTINCT: Final = 0.03
 # Ties of a round, to go on with the pose that they give.
 _FIT_LEAST: Final = 8
 # Ties of a place that photos beside it may confirm.
@@ -395,7 +394,7 @@ def _tied(
 
 def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
     """Displacements of patches all over the part of a wall that a photo shows."""
-    border = radius + _HALF_PATCH + 2
+    border = radius + HALF_PATCH_CELLS + 2
 
     def framed(channels: Channels) -> Channels:
         # Patches at the photo's border count by what is known of them.
@@ -408,13 +407,8 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
         np.arange(_APART_CELLS // 2, length, _APART_CELLS) for length in first.known.shape
     )
     places = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.intp)
-    rule = SearchRule(
-        radius_cells=radius,
-        half_patch_cells=_HALF_PATCH,
-        score_least=_SCORE_LEAST,
-        distinct_least=_DISTINCT_LEAST,
-    )
-    moved = measure(framed(first), framed(second), places + border, rule)
+    search = Search(radius_cells=radius, min_score=_MIN_SCORE, min_distinct=_MIN_DISTINCT)
+    moved = measure(framed(first), framed(second), places + border, search)
     moved = moved.take(agrees_around(moved))
     return replace(moved, places=moved.places - border)
 

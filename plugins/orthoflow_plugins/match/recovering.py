@@ -18,25 +18,19 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.products import Camera, Intrinsics, Photo, Photos, Wall
-from orthoflow_plugins.match.channels import WallTarget
 from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.pairing import USUAL_RULE, PhotoPairs, pair_photo, wall_features
+from orthoflow_plugins.match.pairing import PairingParams, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.pictures import photo_grey
-from orthoflow_plugins.match.tie_pieces import key_point_ties
-from orthoflow_plugins.match.tracing import (
-    Trace,
-    TracingRule,
-    estimated_lens,
-    lens_by_ties,
-    trace_photo,
-)
-from orthoflow_plugins.match.warping import Before
+from orthoflow_plugins.match.ties import Trace, key_point_ties
+from orthoflow_plugins.match.tracing import Desk, estimated_lens, lens_by_ties, trace_photo
+from orthoflow_plugins.match.warping import View, view_of
 
 # Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
 _AGREEING_LEAST: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _SEED: Final = 1
+_PARAMS: Final = PairingParams()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,20 +49,16 @@ class PaintedWall:
 def recovered_traces(
     photos: Photos,
     oriented: Mapping[str, Camera],
-    targets: Sequence[WallTarget],
+    desk: Desk,
     traces: Sequence[Trace],
-    rule: TracingRule,
-    before: Before | None = None,
 ) -> dict[str, Trace]:
     """Trace photos without a pose from the one that the traced photos give them.
 
     Args:
         photos: all photos.
         oriented: cameras of those with a pose, by name.
-        targets: the walls.
+        desk: the walls.
         traces: of the oriented photos.
-        rule: how photos are traced.
-        before: what stands free before the walls, as far as it is known.
 
     Returns:
         By name, for each photo that was found.
@@ -77,18 +67,18 @@ def recovered_traces(
     known = [trace for trace in traces if trace.n_ties]
     settled = _settled(photos, oriented, known)
     missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
+    views = [_view(trace, photos, desk) for trace in known] if missing else []
     is_new = bool(known)
     while is_new and missing:
         # What was found shows more of the walls, for the next round.
-        painted = painted_walls([*known, *recovered.values()], [t.wall for t in targets])
+        painted = painted_walls(views, desk.walls)
         n_before = len(recovered)
         for index in missing:
             photo = photos.photos[index]
-            found = _recovered(
-                index, photo, painted, lens_of(photo, settled, photos), (targets, rule, before)
-            )
+            found = _recovered(index, photo, painted, lens_of(photo, settled, photos), desk)
             if found is not None:
                 recovered[photo.name] = found
+                views.append(_view(found, photos, desk))
         missing = [k for k in missing if photos.photos[k].name not in recovered]
         is_new = len(recovered) > n_before
     return recovered
@@ -103,7 +93,7 @@ def _settled(
     """
     cameras: list[tuple[float, Camera]] = []
     for trace in traces:
-        photo = photos.photos[trace.view.index]
+        photo = photos.photos[trace.photo]
         camera, sigma = oriented[photo.name], 0.0
         freedom = estimated_lens(photo, camera.intrinsics)
         if freedom is not None:
@@ -120,31 +110,39 @@ def _recovered(
     photo: Photo,
     painted: Sequence[PaintedWall],
     lens: Intrinsics | None,
-    how: tuple[Sequence[WallTarget], TracingRule, Before | None],
+    desk: Desk,
 ) -> Trace | None:
     if lens is None:
         return None
     pose = recovered_pose(photo_grey(photo), painted, lens.posed())
     freedom = estimated_lens(photo, lens)
-    found = None if pose is None else trace_photo(index, photo, pose, *how, freedom)
+    found = None if pose is None else trace_photo(index, photo, pose, desk, freedom)
     return found if found is not None and found.n_ties else None
 
 
-def painted_walls(traces: Sequence[Trace], walls: Sequence[Wall]) -> list[PaintedWall]:
+def _view(trace: Trace, photos: Photos, desk: Desk) -> View:
+    """Lay a photo onto the walls as it lay there in the end; its first pose hides what it hides."""
+    photo = photos.photos[trace.photo]
+    first = view_of(trace.photo, photo, trace.camera, desk.walls, desk.before)
+    return first.posed(trace.settled, desk.walls)
+
+
+def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[PaintedWall]:
     """Paint oriented photos on the walls, in each cell the one that shows the wall largest."""
     painted = []
     for index, wall in enumerate(walls):
         grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
-        views = [trace.view for trace in traces if trace.view.projections[index] is not None]
-        sizes = [getattr(view.projections[index], "pixels_per_cell", 0.0) for view in views]
-        for nth in np.argsort(sizes, kind="stable"):
-            projection = views[nth].projections[index]
-            assert projection is not None  # noqa: S101 - only such views were taken
-            shown = views[nth].on_wall(index, projection)
+        laid = [
+            (view, projection)
+            for view in views
+            if (projection := view.projections[index]) is not None
+        ]
+        for view, projection in sorted(laid, key=lambda each: each[1].pixels_per_cell):
+            shown = view.on_wall(index, projection)
             part = grey[projection.part]
             part[np.isfinite(shown)] = shown[np.isfinite(shown)]
         as_shown = replace(wall, intensity=grey / np.float32(255.0))
-        features = wall_features(as_shown, USUAL_RULE) if np.isfinite(grey).any() else None
+        features = wall_features(as_shown, _PARAMS) if np.isfinite(grey).any() else None
         painted.append(PaintedWall(wall=as_shown, features=features))
     return painted
 
@@ -161,7 +159,7 @@ def recovered_pose(
         painted: the walls.
         lens: its interior orientation, roughly; the pose is ignored.
     """
-    pairs = pair_photo(grey, [each.features for each in painted], USUAL_RULE)
+    pairs = pair_photo(grey, [each.features for each in painted], _PARAMS)
     pixels, points = _agreeing(pairs, painted)
     if len(pixels) < _AGREEING_LEAST:
         return None

@@ -27,10 +27,21 @@ from orthoflow.products import (
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.mixtures import MIXTURES, mixed
-from orthoflow_plugins.match.opencv import one_by_one, opencv_version
-from orthoflow_plugins.match.pairing import USUAL_RULE, side_matches, wall_features
-from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, photo_rgb, require_photos
+from orthoflow_plugins.match.pairing import (
+    MIXTURES,
+    PairingParams,
+    mixed,
+    side_matches,
+    wall_features,
+)
+from orthoflow_plugins.match.pictures import (
+    filled_smoothly,
+    one_by_one,
+    opencv_version,
+    photo_grey,
+    photo_rgb,
+    require_photos,
+)
 
 # Key points need cells as fine as the points lie; what is between them is filled from around. A
 # wall is no larger than key points are found on at once.
@@ -169,7 +180,7 @@ def _seen_sides(
     picture = photo_grey(photo) if mixture == "grey" else mixed(photo_rgb(photo), mixture)
     if picture is None:
         return np.zeros((len(pictures), 2), dtype=np.intp)
-    return side_matches(picture, pictures, USUAL_RULE)
+    return side_matches(picture, pictures, PairingParams())
 
 
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
@@ -212,7 +223,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
         mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
         intensity=grey,
     )
-    return wall_features(wall, USUAL_RULE)
+    return wall_features(wall, PairingParams())
 
 
 def _grey_on(

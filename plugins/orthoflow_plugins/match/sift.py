@@ -3,50 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
+from orthoflow.sdk import Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.hand_ties import (
-    is_by_hand_alone,
+from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.pairing import (
+    CLEARLY,
+    LEAST,
+    Pair,
+    PairingParams,
+    PhotoPairs,
+    pair_in_colours,
+    pair_photo,
+    wall_features,
+)
+from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features, with_paper_ratio
+from orthoflow_plugins.match.pictures import (
+    one_by_one,
+    opencv_version,
+    photo_grey,
+    require_photos,
+)
+from orthoflow_plugins.match.ties import (
+    TiePiece,
+    key_point_ties,
     ties_by_hand_alone,
+    ties_of,
     with_ties_by_hand,
+    without_twins,
 )
-from orthoflow_plugins.match.mixtures import CLEARLY, LEAST, pair_in_colours
-from orthoflow_plugins.match.opencv import one_by_one, opencv_version
-from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
-from orthoflow_plugins.match.paper import (
-    largest_ratio,
-    paper_pieces,
-    paper_wall_features,
-    with_paper_ratio,
-)
-from orthoflow_plugins.match.pictures import photo_grey, require_photos
-from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.placing import Placed
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairedPhotos:
-    """What the photos share with the walls.
-
-    Attributes:
-        photos: of each photo, without descriptors.
-        pieces: ties of all of them, of `preset: paper`, which pairs none.
-        walls: key points per wall, without descriptors; None where it shows nothing.
-    """
-
-    photos: tuple[PhotoPairs, ...] = ()
-    pieces: tuple[TiePiece, ...] = ()
-    walls: tuple[Features | None, ...] = ()
 
 
 class MatchSift(Method):
@@ -80,49 +74,14 @@ class MatchSift(Method):
         ),
     )
 
-    class Params(MethodParams):
-        """Key points, their contrast, and what counts as a match."""
+    class Params(PairingParams):
+        """Key points, and what counts as a match."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
             description="paper: SIFT as OpenCV sets it, on the pictures as they are, and the key "
             "points of a wall with their best match in the photo, as in markiewicz2015; of the "
             "other options `ratio` applies.",
-        )
-        n_features_max: int = Field(
-            default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
-        )
-        ratio: float | None = Field(
-            default=0.85,
-            gt=0,
-            le=1,
-            description="Largest distance of the best match over the second best; null for any. "
-            "With preset: paper 0.8 unless given, as its openMVG has it.",
-        )
-        search: Literal["exact", "approximate"] = Field(
-            default="exact",
-            description="approximate: descriptors are compared only with those in lists of similar "
-            "ones, which is several times as fast with many key points and misses some matches.",
-        )
-        contrast_threshold_factor: float = Field(
-            default=0.02,
-            ge=0,
-            lt=1,
-            description="Weakest key points taken, as OpenCV's contrastThreshold (0.04 there).",
-        )
-        edge_threshold_ratio: float = Field(
-            default=10.0, gt=1, description="Largest ratio of curvatures of a key point."
-        )
-        equalise_clip_factor: float = Field(
-            default=3.0,
-            ge=0,
-            description="Clip limit of the local contrast equalisation; 0 turns it off.",
-        )
-        n_verified_min: int = Field(
-            default=8,
-            ge=4,
-            description="Matches that must agree with one homography for a wall to count as "
-            "shown by a photo.",
         )
         tries_colours: bool = Field(
             default=True,
@@ -137,13 +96,6 @@ class MatchSift(Method):
             "same things there. alone: also when no photo says so, by which a photo of something "
             "else with the same pattern may win: look at the overlays. Such ties err together, "
             "more than an orientation by them states: match.guided measures anew.",
-        )
-        longest_side_max_px: int = Field(
-            default=4000,
-            ge=200,
-            description="Larger photos are shrunk to this for matching. Smaller sizes come first, "
-            "from 800 px on, until a wall is recognised; then the size at which a pixel is about "
-            "as wide as a cell of the walls.",
         )
 
         @model_validator(mode="before")
@@ -165,65 +117,22 @@ class MatchSift(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Match photos with every wall, and make ties."""
-        return self._ties(inputs, self._paired(inputs, params, ctx), params, ctx)
-
-    def _paired(self, inputs: In, params: Params, ctx: StepContext) -> PairedPhotos:
-        """Match photos with every wall."""
-        items = range(len(inputs.photos.photos))
-        photos, walls = inputs.photos.photos, inputs.walls
-        require_photos(inputs.photos)
-        if is_by_hand_alone(inputs.hand, walls):
-            return PairedPhotos()
-        if params.preset == "paper":
-            return _paper(inputs.photos, walls, items, largest_ratio(params.ratio), ctx)
-        rule = _rule(params)
-        ctx.progress(0.0, "key points of the walls")
-        on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
-
-        def pair(index: int) -> PhotoPairs:
-            if params.tries_colours:
-                return pair_in_colours(photos[index], on_walls, rule)
-            return pair_photo(photo_grey(photos[index]), on_walls, rule)
-
-        paired: list[PhotoPairs] = []
-        for index, pairs in zip(items, one_by_one(pair, items, ctx.cores), strict=True):
-            paired.append(replace(pairs, features=pairs.features.undescribed()))
-            ctx.progress(len(paired) / (len(items) + 1), photos[index].name)
-        return PairedPhotos(photos=tuple(paired), walls=_undescribed(on_walls))
-
-    def _ties(self, inputs: In, found: PairedPhotos, params: Params, ctx: StepContext) -> Out:
-        """Place photos that show no wall clearly with the help of the others, and make ties."""
         photos, walls = inputs.photos, inputs.walls
+        require_photos(photos)
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
-        on_walls = found.walls
-        if params.preset == "paper":
-            ties = ties_of(
-                found.pieces, photos, walls, {"intensity_source": walls.intensity_source}
-            )
-            _report(ctx, ties, on_walls)
-            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-        paired = found.photos
-        pieces: list[TiePiece] = []
-        notes: dict[str, JsonValue] = {}
+        details: dict[str, JsonValue] = {"intensity_source": walls.intensity_source}
         radii_px: list[float] = []
-        placed = _placed(photos, walls, paired, params, ctx)
-        for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
-            place = placed.get(index)
-            if place is None:
-                pieces += _pieces(index, pairs, on_walls, walls)
-            else:
-                pieces.append(place.piece)
-            notes[photo.name] = _note(ctx, photo.name, (pairs, place), walls)
-            radii_px.append(pairs.radius_px if place is None else place.radius_px)
-        ties = ties_of(
-            pieces,
-            photos,
-            walls,
-            {"photos": notes, "intensity_source": walls.intensity_source},
-            search_radius_px=tuple(radii_px),
-        )
+        if params.preset == "paper":
+            on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
+            pieces = _paper(photos, walls, on_walls, params.max_ratio, ctx)
+        else:
+            ctx.progress(0.0, "key points of the walls")
+            find = one_by_one(lambda wall: wall_features(wall, params), walls.walls, ctx.cores)
+            on_walls = list(find)
+            pieces, details["photos"], radii_px = _matched(photos, walls, on_walls, params, ctx)
+        ties = ties_of(pieces, photos, walls, details, search_radius_px=tuple(radii_px))
         _report(ctx, ties, on_walls)
         return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
 
@@ -234,19 +143,51 @@ class MatchSift(Method):
 
 
 def _paper(
-    photos: Photos, walls: Walls, items: range, ratio_most: float, ctx: StepContext
-) -> PairedPhotos:
-    on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
+    photos: Photos,
+    walls: Walls,
+    on_walls: Sequence[Features | None],
+    max_ratio: float,
+    ctx: StepContext,
+) -> list[TiePiece]:
     pieces: list[TiePiece] = []
-    for nth, index in enumerate(items):
-        photo = photos.photos[index]
-        ctx.progress(nth / len(items), photo.name)
-        pieces += paper_pieces(index, photo, on_walls, walls, None, ratio_most=ratio_most)
-    return PairedPhotos(pieces=tuple(pieces), walls=_undescribed(on_walls))
+    for index, photo in enumerate(photos.photos):
+        ctx.progress(index / len(photos.photos), photo.name)
+        pieces += paper_pieces(index, photo, on_walls, walls, None, max_ratio=max_ratio)
+    return pieces
 
 
-def _undescribed(on_walls: Sequence[Features | None]) -> tuple[Features | None, ...]:
-    return tuple(None if found is None else found.undescribed() for found in on_walls)
+def _matched(
+    photos: Photos,
+    walls: Walls,
+    on_walls: Sequence[Features | None],
+    params: MatchSift.Params,
+    ctx: StepContext,
+) -> tuple[list[TiePiece], dict[str, JsonValue], list[float]]:
+    """Pair photos with the walls, and place those that show none clearly with the others' help.
+
+    Returns:
+        Ties, what there is to say of each photo, and how far ties were searched in each.
+    """
+
+    def pair(photo: Photo) -> PhotoPairs:
+        if params.tries_colours:
+            return pair_in_colours(photo, on_walls, params)
+        return pair_photo(photo_grey(photo), on_walls, params)
+
+    paired: list[PhotoPairs] = []
+    for photo, pairs in zip(photos.photos, one_by_one(pair, photos.photos, ctx.cores), strict=True):
+        paired.append(replace(pairs, features=pairs.features.undescribed()))
+        ctx.progress(len(paired) / (len(photos.photos) + 1), photo.name)
+    pieces: list[TiePiece] = []
+    notes: dict[str, JsonValue] = {}
+    radii_px: list[float] = []
+    placed = _placed(photos, walls, paired, params, ctx)
+    for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
+        place = placed.get(index)
+        pieces += _pieces(index, pairs, on_walls, walls) if place is None else [place.piece]
+        notes[photo.name] = _note(ctx, photo.name, (pairs, place), walls)
+        radii_px.append(pairs.radius_px if place is None else place.radius_px)
+    return pieces, notes, radii_px
 
 
 def _placed(
@@ -298,21 +239,6 @@ def _placed(
                 f"structure: alone takes it all the same"
             )
     return placed
-
-
-def _rule(params: MatchSift.Params) -> PairingRule:
-    return PairingRule(
-        features=FeatureRule(
-            n_most=params.n_features_max,
-            contrast_threshold=params.contrast_threshold_factor,
-            edge_threshold=params.edge_threshold_ratio,
-        ),
-        ratio_most=largest_ratio(params.ratio),
-        n_verified_least=params.n_verified_min,
-        longest_side_px=params.longest_side_max_px,
-        clip_limit=params.equalise_clip_factor,
-        is_exact=params.search == "exact",
-    )
 
 
 def _pieces(

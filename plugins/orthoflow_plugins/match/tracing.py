@@ -26,11 +26,11 @@ from orthoflow_plugins.match.channels import (
 from orthoflow_plugins.match.displacements import (
     CORRELATION_AREA_CELLS,
     Displacements,
-    SearchRule,
+    Search,
     measure,
 )
 from orthoflow_plugins.match.pictures import points_on_wall
-from orthoflow_plugins.match.tie_pieces import TiePiece
+from orthoflow_plugins.match.ties import TiePiece, Trace
 from orthoflow_plugins.match.warping import Before, Projection, View, view_of
 
 _NEIGHBOURS: Final = 12
@@ -42,7 +42,11 @@ _SIGMA_MOST_CELLS: Final = 2.0
 # What no refinement gets below: the raster's own interpolation.
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
+# How far a place is searched in the first round; halved in every next, down to the least.
+_FIRST_RADIUS_CELLS: Final = 8
 _RADIUS_LEAST: Final = 2
+# Photos are warped and measured at most so often.
+_MAX_ROUNDS: Final = 4
 # Warping again by a pose that moves the photo less than this on the walls changes nothing.
 _SETTLED_CELLS: Final = 0.3
 # Held-out error has to fall by this share for another round.
@@ -56,44 +60,28 @@ CONTENTS: Final = ("gradients", "grey", _LAST)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TracingRule(SearchRule):
-    """How a photo is traced on the walls; the search radius is that of the first round.
+class Desk:
+    """What photos are laid on, and how they are compared.
 
     Attributes:
-        n_ties_most: per photo.
-        n_rounds_most: measured at most so often, each time with half the radius.
+        targets: all walls; any of them may hide another.
+        before: what stands free before the walls, as far as it is known: patches keep off what it
+            hides.
+        max_ties: places measured per photo.
         contents: what is compared, of `gradients`, `grey` and `colours`; the best one is kept.
+        threads: patches are shared between so many.
     """
 
-    n_ties_most: int
-    n_rounds_most: int
-    contents: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trace:
-    """What tracing a photo found.
-
-    Attributes:
-        pieces: ties per wall, outliers left out.
-        n_measured: displacements measured in the last round.
-        n_outliers: of these, dropped.
-        held_out_px: RMS of a residual coordinate of held-out ties, per round.
-        content: what was compared.
-        view: how the photo lay on the walls in the end.
-    """
-
-    pieces: tuple[TiePiece, ...]
-    n_measured: int
-    n_outliers: int
-    held_out_px: tuple[float, ...]
-    content: str
-    view: View
+    targets: Sequence[WallTarget]
+    before: Before | None = None
+    max_ties: int = 1200
+    contents: tuple[str, ...] = CONTENTS
+    threads: int = 1
 
     @property
-    def n_ties(self) -> int:
-        """Ties on all walls."""
-        return sum(len(piece) for piece in self.pieces)
+    def walls(self) -> list[Wall]:
+        """The walls as they are matched."""
+        return [target.wall for target in self.targets]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +114,7 @@ def trace_photo(
     index: int,
     photo: Photo,
     camera: ViewingCamera,
-    targets: Sequence[WallTarget],
-    rule: TracingRule,
-    before: Before | None = None,
+    desk: Desk,
     lens: LensFreedom | None = None,
 ) -> Trace:
     """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
@@ -137,26 +123,23 @@ def trace_photo(
         index: of the photo.
         photo: the photo.
         camera: its pose, good to a few cells on the walls.
-        targets: all walls; any of them may hide another.
-        rule: how.
-        before: what stands free before the walls, as far as it is known: patches keep off what it
-            hides.
+        desk: what it is laid on.
         lens: how far the lens may be off, too, where it was only estimated. Held as first ties had
             it where ties ask for another, it would bend what is searched, and leave out as wrong
             what contradicts it.
     """
-    view = view_of(index, photo, camera, [target.wall for target in targets], before)
-    found: Trace | None = None
-    for content in rule.contents:
-        if content == _LAST and found is not None and not _is_doubtful(found, rule):
+    view = view_of(index, photo, camera, desk.walls, desk.before)
+    found: tuple[Trace, View] | None = None
+    for content in desk.contents:
+        if content == _LAST and found is not None and not _is_doubtful(found[0], desk):
             continue
         # What one content found out about the pose is the next one's start.
-        start = (view, rule.radius_cells) if found is None else (found.view, _RADIUS_LEAST)
-        tried = _traced(start, targets, rule, content, lens)
-        if found is None or _is_better(tried, found):
+        start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _RADIUS_LEAST)
+        tried = _traced(start, desk, content, lens)
+        if found is None or _is_better(tried[0], found[0]):
             found = tried
     assert found is not None  # noqa: S101 - there is at least one content
-    return found
+    return replace(found[0], camera=camera)
 
 
 def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None:
@@ -176,19 +159,19 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
 
     Args:
         trace: of the photo.
-        lens: how far the lens may be off from that of its view, the focal length among it.
+        lens: how far the lens may be off from that of its pose, the focal length among it.
     """
     seen = _joined(trace.pieces)
     try:
-        found = adjust(seen, trace.view.camera, lens=lens, soft_limit=2.0)
+        found = adjust(seen, trace.settled, lens=lens, soft_limit=2.0)
     except GeometryError:
-        return trace.view.camera, math.inf
+        return trace.settled, math.inf
     return found.camera, math.sqrt(found.covariance[POSE_PARAMETERS, POSE_PARAMETERS])
 
 
-def _is_doubtful(found: Trace, rule: TracingRule) -> bool:
+def _is_doubtful(found: Trace, desk: Desk) -> bool:
     """Whether laser and camera may see different things: grey says less than edges, or little."""
-    return found.content != "grey" or found.n_ties < _FEW_SHARE * rule.n_ties_most
+    return found.content != "grey" or found.n_ties < _FEW_SHARE * desk.max_ties
 
 
 def _is_better(tried: Trace, found: Trace) -> bool:
@@ -209,18 +192,18 @@ def _promised(trace: Trace) -> float:
 
 def _traced(
     start: tuple[View, int],
-    targets: Sequence[WallTarget],
-    rule: TracingRule,
+    desk: Desk,
     content: str,
     lens: LensFreedom | None = None,
-) -> Trace:
+) -> tuple[Trace, View]:
+    """Trace a photo by one content; also how it lay on the walls in the end."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
     free: _Known | None = None
     history: list[float] = []
-    for _ in range(rule.n_rounds_most):
-        found = _measured(view, targets, (rule, radius, content))
+    for _ in range(_MAX_ROUNDS):
+        found = _measured(view, desk, radius, content)
         fit = _refitted(_joined(found.pieces), view.camera, known)
         if fit is None:
             # A round that finds too little does not spoil the one before.
@@ -232,19 +215,22 @@ def _traced(
             best, free = found, fit.free
         if not improved or _moved_cells(found, view, fit.camera) < _SETTLED_CELLS:
             break
-        view = view.posed(fit.camera, [target.wall for target in targets])
+        view = view.posed(fit.camera, desk.walls)
         radius = max(_RADIUS_LEAST, radius // 2)
     result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
     cleaned = _without_misfits(result.pieces, view.camera, free)
     n_kept = sum(len(piece) for piece in cleaned)
-    return Trace(
+    trace = Trace(
+        photo=view.index,
         pieces=tuple(cleaned),
         n_measured=result.n_measured,
         n_outliers=result.n_measured - n_kept,
         held_out_px=tuple(history),
         content=content,
-        view=view,
+        camera=view.camera,
+        settled=view.camera,
     )
+    return trace, view
 
 
 def _moved_cells(found: _Round, view: View, refitted: ViewingCamera) -> float:
@@ -261,10 +247,8 @@ def _moved_cells(found: _Round, view: View, refitted: ViewingCamera) -> float:
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def _measured(
-    view: View, targets: Sequence[WallTarget], how: tuple[TracingRule, int, str]
-) -> _Round:
-    rule, radius, content = how
+def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
+    targets = desk.targets
     sizes = [_footprint(item) for item in view.projections]
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
@@ -276,17 +260,17 @@ def _measured(
             continue
         share = sizes[index] / sum(sizes)
         on_wall = "grey" if content == "colours" else content
-        target.prepare(on_wall, rule.half_patch_cells)
+        target.prepare(on_wall)
         channels = target.channels[on_wall].part(projection.part)
         usable = (channels.known > 0.0) & np.isfinite(projection.u)
         strength = target.textures[on_wall][projection.part]
-        places = textured_places(strength, usable, max(50, round(rule.n_ties_most * share)))
+        places = textured_places(strength, usable, max(50, round(desk.max_ties * share)))
         places = _unoccupied(places, projection, occupied)
-        search = replace(rule, radius_cells=radius)
+        search = Search(radius_cells=radius, threads=desk.threads)
         moved = measure(channels, _seen(view, index, content), places, search)
         n_measured += len(moved.places)
         moved = moved.take(agrees_around(moved))
-        grain = target.grains[rule.half_patch_cells][projection.part]
+        grain = target.grain[0][projection.part]
         pieces.append(_piece(view.index, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
     return _Round(

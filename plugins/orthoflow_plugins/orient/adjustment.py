@@ -245,7 +245,7 @@ def _block(
         point=place.ravel().astype(np.intp),
         pixels=np.vstack([part.pixels_photo for part in seen]),
         sigma_px=np.concatenate(
-            [unit * part.sigma_px for unit, part in zip(state.units, seen, strict=True)]
+            [max(1.0, unit) * part.sigma_px for unit, part in zip(state.units, seen, strict=True)]
         ),
     )
     return Block(

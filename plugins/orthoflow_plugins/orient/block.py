@@ -17,9 +17,9 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
-    common_error,
-    stable,
+    outwards,
     widened,
+    with_common_error,
 )
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values, linearised
 from orthoflow.geometry.resection import whiten
@@ -30,9 +30,8 @@ from orthoflow_plugins.orient.pose import PLACES_A_SIDE, places_in_photo
 
 # A known point is never exact: an adjustment divides by its variance.
 SIGMA_LEAST_M: Final = 1e-6
-# Correlations of so many places are summed at once.
-_MAX_PLACES: Final = 3000
 _CORRELATED: Final = 0.95
+_MIN_FOR_PLANE: Final = 3
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
 
 
@@ -129,13 +128,18 @@ class BlockCovariance:
     redundancy: float
 
 
-def pixel_covariances(block: Block) -> NDArray[np.float64]:
-    """Covariances (m, 2, 2) of the pixels; of points seen once, with that of the point."""
+def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
+    """Covariances (m, 2, 2) of the pixels; of points seen once, with that of the point.
+
+    Args:
+        block: the block.
+        alone: take every point as if it were seen once.
+    """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)
-    alone = ~block.is_joint[seen.point]
+    is_alone = ~block.is_joint[seen.point] | alone
     for photo, camera in enumerate(block.cameras):
-        mine = np.flatnonzero(alone & (seen.photo == photo))
+        mine = np.flatnonzero(is_alone & (seen.photo == photo))
         points = seen.point[mine]
         by_point = linearised(camera, block.points.known[points], LensFreedom()).by_camera_point
         variances = (block.points.sigma_m[points] ** 2)[:, None, None]
@@ -181,7 +185,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
         # Photos of one place share the errors that the scan has there.
         shared = list(_rows(block, soft_limit, _places(block)))
         matrix = _honest(shared, cofactors, matrix)
-    matrix = _with_common_error(block, rows, cofactors, matrix, soft_limit)
+    matrix = with_common_error(matrix, _adjusted_points(block, cofactors, soft_limit))
     return BlockCovariance(
         matrix=matrix,
         cofactors=cofactors,
@@ -282,16 +286,12 @@ class _Rows:
         group: of observations that may err together.
         jacobian: (r, c).
         residuals: (r,).
-        places: (k, 3) metres, of the scan, that residuals depend on.
-        pulls: (k, c, 3) of an error of each place on the unknowns' normal equations.
     """
 
     columns: NDArray[np.intp]
     group: int
     jacobian: NDArray[np.float64]
     residuals: NDArray[np.float64]
-    places: NDArray[np.float64]
-    pulls: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,64 +337,51 @@ def _honest(
     return widened(plain, (len(by_group) - 1) / len(by_group) * spread)
 
 
-def _with_common_error(
-    block: Block,
-    rows: list[_Rows],
-    cofactors: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    soft_limit: float,
-) -> NDArray[np.float64]:
-    """Widen by the error of the scan that neighbouring places share, in whichever photo."""
-    error = common_error(list(_adjusted_points(block, cofactors, soft_limit)))
-    if not error.sigma_m:
-        return covariance
-    n_places = sum(len(part.places) for part in rows)
-    # What is left out in between is taken as its neighbours.
-    step = max(1, -(-n_places // _MAX_PLACES))
-    places, pulls, start = [], [], 0
-    for part in rows:
-        some = slice(-start % step, None, step)
-        wide = np.zeros((len(part.places[some]), len(cofactors), 3))
-        wide[:, part.columns] = part.pulls[some]
-        places.append(part.places[some])
-        pulls.append(wide)
-        start += len(part.places)
-    own, together = np.concatenate(pulls), error.covariance(*[np.concatenate(places)] * 2)
-    shared = np.zeros_like(cofactors)
-    for axis in range(3):
-        shared += own[:, :, axis].T @ together @ own[:, :, axis]
-    move = step * cofactors
-    spread = error.sigma_alone**2 * cofactors + move @ stable(shared) @ move.T
-    return widened(covariance, spread)
-
-
 def _adjusted_points(
     block: Block, cofactors: NDArray[np.float64], soft_limit: float
-) -> Iterator[AdjustedPoints]:
-    """The places of the scan that each photo sees, and how far they are from there."""
+) -> AdjustedPoints:
+    """The places of the scan that photos see, and how far they are from there."""
     seen = block.seen
-    is_known = np.isfinite(block.points.sigma_m[seen.point])
+    known = np.flatnonzero(np.isfinite(block.points.sigma_m[seen.point]))
     # Also what several photos see is compared with where the scan has it.
-    as_scanned = replace(block, points=replace(block.points, now=block.points.known))
+    as_scanned = replace(
+        block,
+        points=replace(block.points, now=block.points.known),
+        seen=seen.take(known),
+    )
+    n_points, n_known = len(block.points), len(known)
+    jacobian, pulls = (np.zeros((n_known, k, len(cofactors))) for k in (2, 3))
+    residuals, by_place = np.zeros((n_known, 2)), np.zeros((n_known, 2, 3))
+    towards, information = np.zeros((n_known, 3)), np.zeros((n_points, 3, 3))
+    of_pixels = (as_scanned.seen.sigma_px**2)[:, None, None] * np.eye(2)
+    with_places = pixel_covariances(as_scanned, alone=True)
     for photo, camera in enumerate(block.cameras):
-        mine = np.flatnonzero((seen.photo == photo) & is_known)
-        if 2 * len(mine) <= len(block.columns(photo)):
-            continue
-        points = seen.point[mine]
-        by_point = linearised(camera, block.points.known[points], LensFreedom()).by_camera_point
-        covariances = (seen.sigma_px[mine] ** 2)[:, None, None] * np.eye(2)
-        covariances += (block.points.sigma_m[points] ** 2)[:, None, None] * (
-            by_point @ by_point.transpose(0, 2, 1)
+        mine = np.flatnonzero(as_scanned.seen.photo == photo)
+        point, own = as_scanned.seen.point[mine], block.columns(photo)
+        linear = _seen_by(as_scanned, photo, mine, with_places[mine], soft_limit)
+        residuals[mine], by_place[mine] = linear.residuals, linear.by_point
+        jacobian[mine[:, None, None], [[0], [1]], own] = linear.by_camera
+        # A place pulls with what it is known by, once for all photos that see it.
+        linear = _seen_by(as_scanned, photo, mine, of_pixels[mine], math.inf)
+        pulls[mine[:, None, None], [[0], [1], [2]], own] = np.einsum(
+            "nip,nid->ndp", linear.by_camera, linear.by_point
         )
-        linear = _seen_by(as_scanned, photo, mine, covariances, soft_limit)
-        columns = block.columns(photo)
-        yield AdjustedPoints(
-            places=block.points.known[points],
-            residuals=linear.residuals,
-            jacobian=linear.by_camera,
-            by_place=linear.by_point,
-            cofactors=cofactors[np.ix_(columns, columns)],
-        )
+        squares = np.einsum("nid,nie->nde", linear.by_point, linear.by_point)
+        np.add.at(information, point, squares)
+        if len(mine) >= _MIN_FOR_PLANE:
+            towards[mine] = outwards(block.points.known[point], camera.centre_world)
+    variances = np.where(np.isfinite(block.points.sigma_m), block.points.sigma_m, 0.0) ** 2
+    held = np.linalg.inv(np.eye(3) + variances[:, None, None] * information)
+    return AdjustedPoints(
+        photo=as_scanned.seen.photo,
+        places=block.points.known[as_scanned.seen.point],
+        residuals=residuals,
+        jacobian=jacobian,
+        by_place=by_place,
+        pulls=np.einsum("ndp,nde->npe", pulls, held[as_scanned.seen.point]),
+        towards=towards,
+        cofactors=cofactors,
+    )
 
 
 def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator[_Rows]:
@@ -421,8 +408,6 @@ def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator
                 group=int(group),
                 jacobian=linear.by_camera[alone].reshape(-1, linear.by_camera.shape[2]),
                 residuals=linear.residuals[alone].ravel(),
-                places=block.points.known[seen.point[mine[alone]]],
-                pulls=-np.einsum("nic,nid->ncd", linear.by_camera[alone], linear.by_point[alone]),
             )
         for nth in np.flatnonzero(joint[mine]):
             one = _Equations(
@@ -484,17 +469,11 @@ def _without_point(block: Block, point: int, parts: list[_Equations]) -> _Rows:
         residuals[-3:] = (block.points.known[point] - block.points.now[point]) / least
     across = np.linalg.qr(by_point, mode="complete").Q[:, 3:]
     remaining = np.einsum("ij,ik->jk", across, jacobian)
-    places, pulls = np.empty((0, 3)), np.empty((0, columns.size, 3))
-    if n_known:
-        places = block.points.known[point][None]
-        pulls = np.einsum("jc,jd->cd", remaining, across[-3:].T / least)[None]
     return _Rows(
         columns=columns,
         group=parts[0].group,
         jacobian=remaining,
         residuals=np.einsum("ij,i->j", across, residuals),
-        places=places,
-        pulls=pulls,
     )
 
 

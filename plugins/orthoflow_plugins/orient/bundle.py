@@ -37,6 +37,7 @@ from orthoflow_plugins.orient.photos import (
     Trusted,
     by_itself,
     candidate_of,
+    looked_at,
     refused,
     require,
     tied_photo,
@@ -68,7 +69,7 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 11
+    result_version: ClassVar[int] = 12
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
@@ -114,16 +115,12 @@ class OrientColmapBundle(Method):
         ties = inputs.ties
         require(ties, inputs.photos)
         photos = with_believable_priors(inputs.photos.photos, ties, params, ctx)
-        found: dict[int, Oriented] = {}
-        trusted: dict[int, Trusted] = {}
-        for nth, photo in enumerate(photos):
-            ctx.progress(_SHARE_BY_ITSELF * nth / len(photos), photo.name)
-            tied = tied_photo(photo, ties, params, ctx.rng)
-            result = _by_itself(tied, ties, params)
-            if isinstance(result, Trusted):
-                trusted[nth] = result
-            else:
-                found[nth] = result
+        tied = [tied_photo(photo, ties, params, ctx.rng) for photo in photos]
+        looks = looked_at(
+            tied, lambda one: _by_itself(one, ties, params), ctx, share=_SHARE_BY_ITSELF
+        )
+        found = {nth: look for nth, look in enumerate(looks) if isinstance(look, Oriented)}
+        trusted = {nth: look for nth, look in enumerate(looks) if isinstance(look, Trusted)}
         details: dict[str, JsonValue] = {}
         if trusted:
             block = list(trusted.values())

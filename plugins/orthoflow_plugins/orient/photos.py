@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from orthoflow_plugins.orient.gates import (
 )
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.pose import (
+    EXIF_OFF_LEAST,
     Estimate,
     Estimator,
     TiedPhoto,
@@ -47,6 +48,9 @@ _MAX_TIES: Final = 20_000
 _STRATA: Final = 6
 # Photos of a lens that are asked whether EXIF is right.
 _ASKED_OF_LENS: Final = 5
+# So many photos of a camera, which agree up to this factor, say more than the EXIF of another.
+_MIN_OTHERS: Final = 2
+_SAME_FOCAL: Final = 1.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +103,9 @@ class Trusted:
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
             return found
         return self.by_hand
+
+
+Look = TypeVar("Look", bound=Trusted | Oriented)
 
 
 def require(ties: Ties, photos: Photos) -> None:
@@ -220,16 +227,75 @@ def each_by_itself(
         MethodError: no photos, no ties, or ties of other photos.
     """
     require(ties, photos)
-    found = []
-    believed = with_believable_priors(photos.photos, ties, params, ctx)
-    for nth, photo in enumerate(believed):
-        ctx.progress(nth / len(believed), photo.name)
-        tied = tied_photo(photo, ties, params, ctx.rng)
+
+    def look(tied: TiedPhoto) -> Oriented:
         result = by_itself(tied, ties, params, estimator)
-        if isinstance(result, Trusted):
-            result = result.judged(ties, params, result.estimate)
-        found.append(result)
+        if isinstance(result, Oriented):
+            return result
+        return result.judged(ties, params, result.estimate)
+
+    believed = with_believable_priors(photos.photos, ties, params, ctx)
+    tied = [tied_photo(photo, ties, params, ctx.rng) for photo in believed]
+    return looked_at(tied, look, ctx)
+
+
+def looked_at(
+    photos: Sequence[TiedPhoto],
+    look: Callable[[TiedPhoto], Look],
+    ctx: StepContext,
+    share: float = 1.0,
+) -> list[Look]:
+    """Orient photos one after the other, and those again that a wrong prior may have spoilt.
+
+    Args:
+        photos: the photos.
+        look: orients one.
+        ctx: is told of progress, and of priors that are not used.
+        share: of the step that this is.
+    """
+    found = []
+    for nth, tied in enumerate(photos):
+        ctx.progress(share * nth / len(photos), tied.photo.name)
+        found.append(look(tied))
+    for at, (tied, result) in enumerate(zip(photos, found, strict=True)):
+        focal_px = None if _focal_px(result) else _focal_of_others(tied.photo, photos, found)
+        if focal_px is None:
+            continue
+        again = look(replace(tied, photo=replace(tied.photo, exif_focal_px=focal_px)))
+        if _focal_px(again):
+            found[at] = again
+            ctx.warn(
+                f"photo {tied.photo.name}: its EXIF contradicts the other photos of its camera, "
+                f"so it is oriented with their focal length of {focal_px:.0f} px"
+            )
     return found
+
+
+def _focal_px(found: Trusted | Oriented) -> float | None:
+    """Focal length of a photo that is oriented."""
+    if isinstance(found, Trusted):
+        return found.estimate.resection.camera.fx
+    return found.camera.intrinsics.fx if found.camera.intrinsics is not None else None
+
+
+def _focal_of_others(
+    photo: Photo, photos: Sequence[TiedPhoto], found: Sequence[Trusted | Oriented]
+) -> float | None:
+    """Focal length of the other photos of a camera, where they agree and EXIF is far from it."""
+    if photo.intrinsics is not None or photo.exif_focal_px is None:
+        return None
+    camera = (photo.camera, photo.width, photo.height)
+    others = [
+        focal_px
+        for tied, result in zip(photos, found, strict=True)
+        if (tied.photo.camera, tied.photo.width, tied.photo.height) == camera
+        and (focal_px := _focal_px(result)) is not None
+    ]
+    if len(others) < _MIN_OTHERS or max(others) > _SAME_FOCAL * min(others):
+        return None
+    focal_px = float(np.median(others))
+    is_far = abs(math.log(focal_px / photo.exif_focal_px)) > EXIF_OFF_LEAST
+    return focal_px if is_far else None
 
 
 def by_itself(

@@ -62,9 +62,11 @@ _FOCAL_OFF_SIGMAS: Final = 5.0
 # A first step far below that saves the rest of the adjustment.
 _FOCAL_STEP_LEAST: Final = 0.5 * _FOCAL_OFF_LEAST
 _LEAST_FOR_FOCAL: Final = 25
-# EXIF is off by some percent at most where it is right: a focal length farther from it that many
-# more ties agree with shows that it is wrong.
-_EXIF_OFF_LEAST: Final = 0.15
+EXIF_OFF_LEAST: Final = 0.15
+"""EXIF is off by some percent at most where it is right (of ln f).
+
+A focal length farther from it that many more ties agree with shows that it is wrong.
+"""
 _MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 
@@ -184,7 +186,7 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
         return None
     off = abs(math.log(found.camera.fx / exif_px))
     sigma = focal_sigma(found)
-    return found.camera.fx if off > max(_EXIF_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma) else None
+    return found.camera.fx if off > max(EXIF_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma) else None
 
 
 def no_pose(seen: SeenPoints) -> str:

@@ -97,30 +97,30 @@ def test_a_patch_tells_no_more_than_its_measured_cells(every: int, grain: float)
     count = np.zeros((60, 60), dtype=np.uint32)
     count[::every, ::every] = 5
     depth_m = np.zeros((60, 60), dtype=np.float32)
-    found = channels.grain_of(wall(count, depth_m), 5)
+    found = channels.grain_of(wall(count, depth_m))
     assert np.mean(found[12:48, 12:48]) == pytest.approx(grain, rel=0.1)
     assert found.min() >= 1.0
     # Void does not count; where nothing is known there is nothing to share.
     depth_m[:, 30:] = np.nan
-    assert channels.grain_of(wall(count, depth_m), 5)[30, 50] == 1.0
+    assert channels.grain_of(wall(count, depth_m))[30, 50] == 1.0
 
 
 def test_a_wall_without_intensity_is_no_target() -> None:
     count, depth_m = np.ones((30, 30), dtype=np.uint32), np.zeros((30, 30), dtype=np.float32)
     blind = channels.target_of(wall(count, depth_m, intensity=False))
     assert blind.grey is None
-    blind.prepare("grey", 5)
+    blind.prepare("grey")
     assert blind.channels == {}
     depth_m[3, 4] = np.nan
     target = channels.target_of(wall(count, depth_m))
     assert target.grey is not None
     assert np.isnan(target.grey[3, 4])
-    target.prepare("grey", 5)
+    target.prepare("grey")
     first = target.channels["grey"]
-    target.prepare("grey", 5)
+    target.prepare("grey")
     assert target.channels["grey"] is first
     assert set(target.textures) == {"grey"}
-    assert set(target.grains) == {5}
+    assert len(target.grain) == 1
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_texture_is_the_weaker_direction() -> None:
 
     def strength(values: NDArray[np.float32]) -> float:
         made = Channels(values=values[..., None], known=everywhere)
-        return float(channels.texture(made, half_patch_cells=5)[30, 30])
+        return float(channels.texture(made)[30, 30])
 
     assert strength(columns) == pytest.approx(0.0, abs=1e-2)
     assert strength(rows + columns) == pytest.approx(0.0, abs=1e-1)
@@ -245,10 +245,8 @@ def test_columns_and_rows_count_alike() -> None:
     there, turned = channels.gradient_channels(grey), channels.gradient_channels(grey.T.copy())
     mirrored = there.values[:, :, [3, 2, 1, 0, 5, 4]]
     np.testing.assert_allclose(turned.values, mirrored.transpose(1, 0, 2), atol=1e-4)
-    strength = channels.texture(there, half_patch_cells=5)
-    np.testing.assert_allclose(
-        channels.texture(turned, half_patch_cells=5), strength.T, atol=1e-3 * strength.max()
-    )
+    strength = channels.texture(there)
+    np.testing.assert_allclose(channels.texture(turned), strength.T, atol=1e-3 * strength.max())
 
 
 def test_an_edge_is_as_broad_as_noise_and_pooling_make_it() -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match import features
-from orthoflow_plugins.match.features import FeatureRule, Features, find_features
+from orthoflow_plugins.match.features import Features, find_features
 
-RULE = FeatureRule(n_most=200, contrast_threshold=0.02, edge_threshold=10.0)
+MAX_FEATURES = 200
 
 
 def some(n: int = 5) -> Features:
@@ -58,27 +57,6 @@ def test_mirroring_twice_changes_nothing_and_once_swaps_left_and_right() -> None
         np.testing.assert_allclose(one, other)
 
 
-def test_the_strongest_are_taken_in_turns_from_a_grid_of_twelve() -> None:
-    # Two cells of 10 px: three strong points in the one, two weak ones in the other.
-    pixels = np.array([[1.0, 1], [2, 1], [3, 1], [119, 59], [118, 59]])
-    strengths = np.array([7.0, 9.0, 8.0, 1.0, 2.0])
-    order = features._spread(pixels, strengths, (60, 120), 4)
-    assert order.tolist() == [1, 4, 2, 3]
-    # Points at the very rim belong to the last cell.
-    rim = np.array([[120.0, 60.0], [119.0, 59.0]])
-    assert features._spread(rim, np.array([1.0, 2.0]), (60, 120), 1).tolist() == [1]
-    # Cells are a twelfth of the width and a twelfth of the height.
-    beside = np.array([[9.9, 1.0], [10.1, 1.0], [1.0, 4.9], [1.0, 5.1]])
-    turns = features._spread(beside, np.array([4.0, 3.0, 2.0, 1.0]), (60, 120), 3)
-    assert turns.tolist() == [0, 1, 3]
-
-
-def test_a_pixel_lies_in_its_cell_and_beyond_the_rim_in_the_last_one() -> None:
-    rows, cols = features._cell_of(np.array([[0.9, 1.0], [5.0, 3.0], [-1.0, 9.0]]), (3, 5))
-    assert rows.tolist() == [1, 2, 2]
-    assert cols.tolist() == [0, 4, 0]
-
-
 def blobs() -> np.ndarray:
     """Bright discs on black, 40 px apart."""
     rows, cols = np.mgrid[:120, :160] + 0.5
@@ -86,15 +64,9 @@ def blobs() -> np.ndarray:
     return np.rint(255.0 * np.exp(-0.5 * (away / 3.0) ** 2)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("upscales_precisely", [True, False])
-def test_discs_are_found_at_their_centres(*, upscales_precisely: bool) -> None:
-    rule = FeatureRule(
-        n_most=200,
-        contrast_threshold=0.02,
-        edge_threshold=10.0,
-        upscales_precisely=upscales_precisely,
-    )
-    found = find_features(blobs(), rule)
+@pytest.mark.parametrize("as_opencv", [True, False])
+def test_discs_are_found_at_their_centres(*, as_opencv: bool) -> None:
+    found = find_features(blobs(), MAX_FEATURES, as_opencv=as_opencv)
     off = found.pixels % 40.0 - 20.0
     # There are others between the discs.
     at_disc = (np.abs(off) < 5.0).all(axis=1)
@@ -105,8 +77,8 @@ def test_discs_are_found_at_their_centres(*, upscales_precisely: bool) -> None:
 def test_key_points_lie_only_where_they_may() -> None:
     usable = np.zeros((120, 160), dtype=np.bool_)
     usable[:, :80] = True
-    found = find_features(blobs(), RULE, usable)
-    everywhere = find_features(blobs(), RULE)
+    found = find_features(blobs(), MAX_FEATURES, usable)
+    everywhere = find_features(blobs(), MAX_FEATURES)
     assert 0 < len(found) < len(everywhere)
     assert (found.pixels[:, 0] < 80.0).all()
 
@@ -116,43 +88,19 @@ def test_pictures_of_fifteen_pixels_have_no_key_points(side: int, n_found: int) 
     rows, cols = np.mgrid[:side, :side] + 0.5
     away = np.hypot(rows - 8.0, cols - 8.0)
     disc = np.rint(255.0 * np.exp(-0.5 * (away / 1.5) ** 2)).astype(np.uint8)
-    found = find_features(disc, RULE)
+    found = find_features(disc, MAX_FEATURES)
     assert (len(found) > 0) == bool(n_found)
     assert found.descriptors.shape == (len(found), 128)
 
 
 def test_rooted_descriptors_have_one_length_and_plain_ones_are_whole_numbers() -> None:
-    rooted = find_features(blobs(), RULE).descriptors
+    rooted = find_features(blobs(), MAX_FEATURES).descriptors
     # Whole numbers of 512 parts, so that their products are exact.
     np.testing.assert_array_equal(rooted, np.rint(rooted))
-    plain = find_features(
-        blobs(),
-        FeatureRule(n_most=200, contrast_threshold=0.02, edge_threshold=10.0, is_rooted=False),
-    ).descriptors
+    plain = find_features(blobs(), MAX_FEATURES, as_opencv=True).descriptors
     np.testing.assert_array_equal(plain, np.rint(plain))
-    shares = plain / plain.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(rooted, 512.0 * np.sqrt(shares), atol=0.51)
-
-
-def test_tiles_cover_an_image_once() -> None:
-    assert features._tiles((2048, 2049)) == [(0, 0), (0, 2048)]
-    assert features._tiles((2049, 10)) == [(0, 0), (2048, 0)]
-
-
-def test_discs_are_found_once_and_in_place_whichever_tile_they_lie_in(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def at_discs() -> np.ndarray:
-        pixels = find_features(blobs(), RULE).pixels
-        near = (np.abs(pixels % 40.0 - 20.0) < 5.0).all(axis=1)
-        return np.array(sorted(map(tuple, pixels[near].round(6).tolist())))
-
-    whole = at_discs()
-    monkeypatch.setattr(features, "_TILE_PX", 80)
-    monkeypatch.setattr(features, "_TILE_OVERLAP_PX", 40)
-    tiled = at_discs()
-    assert tiled.shape == whole.shape
-    np.testing.assert_allclose(tiled, whole, atol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(rooted, axis=1), 512.0, rtol=0.02)
+    assert (plain.max(axis=1) > 100.0).all()
 
 
 def test_undescribed_ones_keep_where_they_are_and_no_bytes_of_descriptors() -> None:

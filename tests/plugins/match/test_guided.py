@@ -14,7 +14,7 @@ from orthoflow_plugins.match.channels import (
     texture,
     textured_places,
 )
-from orthoflow_plugins.match.displacements import SearchRule, measure
+from orthoflow_plugins.match.displacements import Search, measure
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.sift import MatchSift
@@ -26,7 +26,7 @@ from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 
-SEARCH = SearchRule(radius_cells=6, half_patch_cells=10, score_least=0.3, distinct_least=0.05)
+SEARCH = Search(radius_cells=6, min_score=0.3)
 # Turned by 0.3 degrees and shifted by 2 cm: about five cells on the wall.
 SCREEN_M = np.array([0.0, -0.8, 0.0])
 ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
@@ -66,7 +66,7 @@ def test_a_known_shift_is_measured_without_bias(channels, moved: tuple[float, fl
         (image + 0.1 * rng.normal(size=image.shape)).astype(np.float32) for image in (grey, later)
     ]
     first, second = (channels(image) for image in noisy)
-    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 200)
+    places = textured_places(texture(first), first.known > 0.0, 200)
     found = measure(first, second, places, SEARCH)
     assert len(found.places) > 100
     error = found.shift_cells - moved
@@ -78,7 +78,7 @@ def test_inverted_contrast_is_matched_in_gradients() -> None:
     rng = np.random.default_rng(4)
     grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0).astype(np.float32)
     first, second = gradient_channels(grey), gradient_channels(100.0 - grey)
-    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 100)
+    places = textured_places(texture(first), first.known > 0.0, 100)
     found = measure(first, second, places, SEARCH)
     assert len(found.places) > 0.9 * len(places) - 20
     np.testing.assert_allclose(found.shift_cells, 0.0, atol=0.01)
@@ -96,7 +96,7 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them(
     later = shift(colours, (moved[1], moved[0], 0.0), order=5, mode="grid-wrap")
     first = grey_channels((wall + rng.normal(size=wall.shape)).astype(np.float32))
     noisy = (later + rng.normal(size=later.shape)).astype(np.float32)
-    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 200)
+    places = textured_places(texture(first), first.known > 0.0, 200)
     places = places[np.abs(places[:, 0] - 150) > 12]
     found = measure(first, colour_channels(noisy), places, SEARCH)
     as_grey = measure(first, grey_channels(noisy.mean(axis=2)), places, SEARCH)

@@ -9,15 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import recovering
-from orthoflow_plugins.match.descriptors import Matches
-from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.recovering import (
-    PaintedWall,
     _pose,
     lens_of,
     painted_walls,
-    recovered_pose,
 )
 
 from orthoflow.geometry.cameras import ViewingCamera
@@ -72,37 +67,6 @@ def test_photos_of_another_size_have_another_lens(size: tuple[int, int]) -> None
     assert lens_of(photo(), {}, ms.photos()) is None
 
 
-def test_a_missing_photo_starts_with_the_lens_that_ties_tell_best() -> None:
-    photos = ms.photos(photo(name="few.png"), photo(name="many.png"), photo())
-    rough = replace(VIEW, fx=1.1 * VIEW.fx, fy=1.1 * VIEW.fy)
-    known = {
-        name: replace(ms.oriented(rough, name=name), intrinsics=Intrinsics.of(rough, source=source))
-        for name, source in (("few.png", "estimated"), ("many.png", "estimated"))
-    }
-    traces: Any = [trace_of(at, n, rough) for at, n in ((0, 16), (1, 80))]
-    found = lens_of(photo(), recovering._settled(photos, known, traces), photos)
-    assert found is not None
-    assert found.source == "estimated"
-    assert found.fx == pytest.approx(VIEW.fx, rel=0.01)
-    # What was given from elsewhere stays, and is known best.
-    given = Intrinsics.of(replace(rough, fx=1000.0))
-    known["few.png"] = replace(known["few.png"], intrinsics=given)
-    assert lens_of(photo(), recovering._settled(photos, known, traces), photos) == given
-    assert recovering._settled(photos, known, traces)["many.png"].viewing().fx == found.fx
-
-
-def trace_of(index: int, n: int, camera: ViewingCamera) -> Any:
-    """Exact ties of the view, traced from a camera."""
-    pixels, points = ties(n, seed=index)
-    piece = SimpleNamespace(
-        pixels_photo=pixels,
-        points_world=points,
-        sigma_px=np.full(len(pixels), 0.3),
-        sigma_m=np.full(len(pixels), 1e-4),
-    )
-    return SimpleNamespace(pieces=[piece], view=SimpleNamespace(index=index, camera=camera))
-
-
 def view_of(
     grey: float, part: tuple[slice, slice], size: float, *, unknown: tuple[int, int] | None = None
 ) -> Any:
@@ -112,9 +76,7 @@ def view_of(
     if unknown is not None:
         shown[unknown] = np.nan
     return SimpleNamespace(
-        view=SimpleNamespace(
-            projections=[projection, None], on_wall=lambda _index, _projection: shown
-        )
+        projections=[projection, None], on_wall=lambda _index, _projection: shown
     )
 
 
@@ -172,53 +134,3 @@ def test_two_dozen_points_must_agree_with_a_pose(n_right: int, is_found: bool) -
     pixels, points = ties(40)
     pixels[n_right:] = np.random.default_rng(6).uniform([0, 0], [900, 640], (40 - n_right, 2))
     assert (_pose(pixels, points, lens(), 0.5) is not None) == is_found
-
-
-def key_points(pixels: NDArray[np.float64]) -> Features:
-    n = len(pixels)
-    return Features(
-        pixels=pixels,
-        sizes_px=np.full(n, 4.0),
-        angles_deg=np.zeros(n),
-        descriptors=np.zeros((n, 128), dtype=np.float32),
-    )
-
-
-def test_matches_that_agree_are_pixels_and_points_of_the_walls_shown() -> None:
-    frame = samples.facing_south(0.01, 40, 30)
-    cells = np.random.default_rng(2).uniform(5.0, 25.0, (6, 2))
-    wall = PaintedWall(wall=samples.wall(frame), features=key_points(cells))
-    blind = PaintedWall(wall=samples.wall(frame), features=None)
-    in_photo = key_points(np.arange(12.0).reshape(6, 2))
-    at = np.arange(5)
-    matches = Matches(first=at, second=at[::-1] + 1, ratio=np.ones(5))
-
-    def pair(index: int, *, is_shown: bool) -> Any:
-        return SimpleNamespace(wall=index, matches=matches, agreeing=at % 2 == 0, is_shown=is_shown)
-
-    pairs: Any = SimpleNamespace(
-        features=in_photo,
-        scale=1.0,
-        pairs=[pair(0, is_shown=False), pair(0, is_shown=True), pair(1, is_shown=True)],
-    )
-    pixels, points = recovering._agreeing(pairs, [wall, blind])
-    np.testing.assert_array_equal(pixels, in_photo.pixels[[0, 2, 4]])
-    np.testing.assert_allclose(points, frame.world_from_wall(cells[[5, 3, 1]], np.zeros(3)))
-    pairs.pairs.clear()
-    pixels, points = recovering._agreeing(pairs, [wall, blind])
-    assert (pixels.shape, points.shape) == ((0, 2), (0, 3))
-
-
-@pytest.mark.parametrize(("n", "is_found"), [(23, False), (24, True)])
-def test_a_pose_is_asked_of_two_dozen_matches_that_agree(
-    monkeypatch: pytest.MonkeyPatch, n: int, is_found: bool
-) -> None:
-    pixels, points = ties(n)
-    monkeypatch.setattr(recovering, "pair_photo", lambda *_: None)
-    monkeypatch.setattr(recovering, "_agreeing", lambda *_: (pixels, points))
-    limits: list[float] = []
-    monkeypatch.setattr(recovering, "_pose", lambda *args: limits.append(args[-1]) or VIEW)
-    grey = np.zeros((640, 900), dtype=np.uint8)
-    assert (recovered_pose(grey, [], lens()) is not None) == is_found
-    # Two thousandths of the photo's longer side.
-    assert limits == [pytest.approx(1.8)] * is_found

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match import sides
 from orthoflow_plugins.match.sides import FaceByPhotos
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.raster.grid import RasterGrid
 
-from orthoflow.geometry import WallFrame
 from orthoflow.products import Photos, Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
-from tests import inspect_scenes, raster_scenes, samples
+from tests import samples
 from tests.long_loops import IS_LONG
-
-FLOOR = 1
 
 
 def context(tmp_path: Path) -> StepContext:
@@ -176,7 +171,7 @@ def test_walls_are_seen_from_the_side_of_their_photos_whichever_way_their_planes
         RasterGrid.In(cloud=merged, planes=found), RasterGrid.Params(gsd_m=0.01), context(tmp_path)
     )
     ctx = context(tmp_path)
-    params = MatchSift.Params(n_features_max=2000)
+    params = MatchSift.Params(max_features=2000)
     ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls.walls), params, ctx).ties
     assert not [warning for warning in ctx.warnings if "mirror" in warning]
     posed = OrientPnp().run(
@@ -232,81 +227,3 @@ def test_a_plane_turned_twice_is_the_plane(scene: ms.TexturedWall, cloud: PointC
 
 
 # --- how a verdict comes about ---
-
-
-@pytest.mark.parametrize(
-    ("front", "behind", "is_told"),
-    [
-        (15, 0, False),
-        (16, 0, True),
-        (0, 16, True),
-        (0, 15, False),
-        # Twice as many as on the other side, of whichever.
-        (40, 20, True),
-        (20, 40, True),
-        (39, 20, False),
-        (20, 39, False),
-        (0, 0, False),
-    ],
-)
-def test_a_side_is_told_by_enough_matches_and_clearly_more(
-    front: int, behind: int, is_told: bool
-) -> None:
-    assert sides._is_told(front, behind, FaceByPhotos.Params()) is is_told
-
-
-def test_holes_between_points_are_filled_and_larger_ones_are_not() -> None:
-    grey = np.full((11, 20), np.nan, dtype=np.float32)
-    grey[:, 2], grey[:, 6] = 0.25, 0.75
-    filled = sides._filled_between(grey)
-    # Two cells about each point.
-    known = np.zeros((11, 20), dtype=np.bool_)
-    known[:, :9] = True
-    np.testing.assert_array_equal(np.isfinite(filled), known)
-    np.testing.assert_array_equal(filled[:, [2, 6]], grey[:, [2, 6]])
-    assert (np.diff(filled[5, 2:7]) > 0.0).all()
-    assert 0.25 < filled[5, 4] < 0.75
-
-
-@pytest.mark.parametrize("is_colour", [True, False])
-def test_the_picture_of_a_plane_is_of_its_topmost_points(is_colour: bool) -> None:
-    frame = inspect_scenes.frame(shape=(4, 6))
-    # Of two points in each cell the lower one is dark; one lies too far before the plane.
-    places = np.array([[c + 0.5, r + 0.5] for r in range(4) for c in range(6)])
-    depths = np.repeat([0.0, 0.01, 0.5], len(places))
-    points = frame.world_from_wall(np.tile(places, (3, 1)), depths)
-    levels = np.repeat([0, 204, 255], len(places)).astype(np.uint8)
-    known = {"rgb": np.stack([levels] * 3, axis=1)} if is_colour else {}
-    bright = None if is_colour else levels.astype(np.float32) / np.float32(255.0)
-    seen = replace(raster_scenes.cloud_of(points, intensity=bright), **known)
-    grey = sides._grey_on(frame, 0.02, seen, 1)
-    np.testing.assert_allclose(grey, 0.8, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("n_points", "cell_m"), [(1_500, 0.6 * 0.02), (10**9, np.sqrt(0.6 / 4_000_000))]
-)
-def test_cells_are_as_fine_as_points_lie_and_no_more_than_millions(
-    monkeypatch: pytest.MonkeyPatch, n_points: int, cell_m: float
-) -> None:
-    # One metre by sixty centimetres: a point every two centimetres.
-    corners = np.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.6]])
-    planes = samples.planes(
-        normal=np.array([[0.0, -1.0, 0.0]]),
-        offset=np.zeros(1),
-        corners=corners[None],
-        n_points=np.array([n_points]),
-        names=("wall",),
-    )
-    asked: list[float] = []
-
-    def grey_on(frame: WallFrame, *_: object) -> np.ndarray:
-        asked.append(frame.gsd_m)
-        return np.full((2, 2), np.nan, dtype=np.float32)
-
-    monkeypatch.setattr(sides, "_grey_on", grey_on)
-    monkeypatch.setattr(sides, "Wall", lambda **_: None)
-    monkeypatch.setattr(sides, "wall_features", lambda *_: None)
-    cloud: Any = None
-    assert sides._features(planes, 0, cloud, 1) is None
-    assert asked == [pytest.approx(cell_m, rel=0.01)]

@@ -13,11 +13,11 @@ from orthoflow_plugins.match.descriptors import (
     mutual_matches,
     mutual_matches_within,
 )
-from orthoflow_plugins.match.features import FeatureRule, find_features
+from orthoflow_plugins.match.features import find_features
 from orthoflow_plugins.match.pairing import Expectation, rematched
-from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, points_on_wall, shrunk
+from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
 from orthoflow_plugins.match.sift import MatchSift
-from orthoflow_plugins.match.tie_pieces import TiePiece, without_twins
+from orthoflow_plugins.match.ties import TiePiece, without_twins
 from scipy.spatial.distance import cdist
 
 from orthoflow.errors import MethodError
@@ -26,7 +26,7 @@ from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 
-RULE = FeatureRule(n_most=3000, contrast_threshold=0.02, edge_threshold=10.0)
+MAX_FEATURES = 3000
 
 
 def context(tmp_path: Path, *, seed: int = 1, cores: int = 2) -> StepContext:
@@ -103,7 +103,7 @@ def test_neighbours_are_those_of_brute_force(seed: int) -> None:
     second = np.vstack([first[:700] + rng.integers(-6, 7, (700, 128)), first[:300]]).astype(
         np.float32
     )
-    found = mutual_matches(first, second, ratio_most=0.8, is_exact=True)
+    found = mutual_matches(first, second, ratio=0.8)
     distance = cdist(first.astype(np.float64), second.astype(np.float64))
     order = np.argsort(distance, axis=1, kind="stable")
     rows = np.arange(len(first))
@@ -114,35 +114,15 @@ def test_neighbours_are_those_of_brute_force(seed: int) -> None:
     np.testing.assert_array_equal(found.second, nearest[expected])
 
 
-def test_the_approximate_search_finds_nearly_all_that_the_exact_one_does(
-    scene: ms.TexturedWall,
-) -> None:
-    pictures = [
-        photo_grey(ms.photo_of(scene, camera))
-        for camera in (ms.camera_before(scene), ms.camera_before(scene, centre=(1.6, -2.3, 1.0)))
-    ]
-    first, second = (find_features(picture, RULE).descriptors for picture in pictures)
-    assert min(len(first), len(second)) > 2000
-    found = []
-    for is_exact in (True, False):
-        matches = mutual_matches(first, second, ratio_most=0.85, is_exact=is_exact)
-        found.append(set(zip(matches.first.tolist(), matches.second.tolist(), strict=True)))
-    exact, approximate = found
-    assert len(exact) > 500
-    # A second best that was missed lets a few pass that are not distinct.
-    assert len(exact & approximate) > 0.9 * len(exact)
-    assert len(approximate - exact) < 0.1 * len(exact)
-
-
-@pytest.mark.parametrize("upscales_precisely", [True, False], ids=["precise", "as OpenCV sets it"])
-def test_key_points_lie_where_they_are(*, upscales_precisely: bool) -> None:
+@pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
+def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
     places = np.array([(u, v) for u in np.linspace(30.3, 370.7, 7) for v in (40.1, 200.6, 360.4)])
     columns, rows = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
     picture = np.full((400, 400), 60.0)
     for u, v in places:
         picture += 120.0 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2.0 * 4.0**2))
-    rule = replace(RULE, upscales_precisely=upscales_precisely)
-    found = find_features(np.rint(picture).astype(np.uint8), rule).pixels
+    grey = np.rint(picture).astype(np.uint8)
+    found = find_features(grey, MAX_FEATURES, as_opencv=as_opencv).pixels
     nearest = found[np.linalg.norm(found[None] - places[:, None], axis=2).argmin(axis=1)]
     # OpenCV's default puts them a quarter of a pixel too far to the right and down.
     np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
@@ -152,7 +132,7 @@ def test_the_key_points_that_are_kept_are_described_as_if_all_were(walls: Walls)
     rgb = walls.walls[0].rgb
     assert rgb is not None
     grey = np.tile(rgb[..., 0], (1, 5))
-    every, few = (find_features(grey, replace(RULE, n_most=n)) for n in (10**6, 100))
+    every, few = (find_features(grey, n) for n in (10**6, 100))
     assert len(few) == 100 < len(every) / 10
     # Some lie in the second tile.
     assert (few.pixels[:, 0] > 2048).any()
@@ -179,7 +159,7 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
         log_size_most=0.7,
         angle_most_deg=90.0,
     )
-    found = mutual_matches_within(first, second, window, ratio_most=0.95)
+    found = mutual_matches_within(first, second, window, ratio=0.95)
     distance = cdist(first.astype(np.float64), second.astype(np.float64))
     turn = np.abs(angles[0][:, None] - angles[1]) % 360.0
     distance[
@@ -202,18 +182,15 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
 
 def test_nothing_matches_nothing() -> None:
     empty = np.empty((0, 128), dtype=np.float32)
-    assert (
-        len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio_most=0.8, is_exact=True))
-        == 0
-    )
+    assert len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio=0.8)) == 0
 
 
 def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
     photo = ms.photo_of(scene, ms.camera_before(scene))
     grey = decode_image(photo.encoded)[:, :, 0]
-    upright = find_features(grey, RULE)
-    turned = find_features(np.ascontiguousarray(grey[::-1, ::-1]), RULE)
-    pairs = mutual_matches(upright.descriptors, turned.descriptors, ratio_most=0.8, is_exact=True)
+    upright = find_features(grey, MAX_FEATURES)
+    turned = find_features(np.ascontiguousarray(grey[::-1, ::-1]), MAX_FEATURES)
+    pairs = mutual_matches(upright.descriptors, turned.descriptors, ratio=0.8)
     back = np.array([photo.width, photo.height]) - turned.pixels[pairs.second]
     error = upright.pixels[pairs.first] - back
     error = error[np.linalg.norm(error, axis=1) < 2.0]
@@ -224,10 +201,10 @@ def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
 
 def test_mirrored_descriptors_are_those_of_the_mirrored_image(scene: ms.TexturedWall) -> None:
     grey = decode_image(ms.photo_of(scene, ms.camera_before(scene)).encoded)[:, :, 0]
-    upright = find_features(grey, RULE)
-    flipped = find_features(np.ascontiguousarray(grey[:, ::-1]), RULE)
+    upright = find_features(grey, MAX_FEATURES)
+    flipped = find_features(np.ascontiguousarray(grey[:, ::-1]), MAX_FEATURES)
     expected = upright.mirrored(grey.shape[1])
-    pairs = mutual_matches(expected.descriptors, flipped.descriptors, ratio_most=0.8, is_exact=True)
+    pairs = mutual_matches(expected.descriptors, flipped.descriptors, ratio=0.8)
     error = np.linalg.norm(expected.pixels[pairs.first] - flipped.pixels[pairs.second], axis=1)
     turn = expected.angles_deg[pairs.first] - flipped.angles_deg[pairs.second]
     assert np.median(np.abs((turn + 180.0) % 360.0 - 180.0)) < 1.0
@@ -259,7 +236,7 @@ def test_a_mirrored_photo_is_recognised_as_such(
 
 def test_a_second_look_finds_several_times_the_ties(scene: ms.TexturedWall) -> None:
     grey = decode_image(ms.photo_of(scene, ms.camera_before(scene)).encoded)[:, :, 0]
-    features = find_features(grey, RULE)
+    features = find_features(grey, MAX_FEATURES)
     aside = np.array([5000.0, 0.0])
     # Every key point has a double far away, so that none is distinct in the whole image.
     double = replace(
@@ -269,32 +246,17 @@ def test_a_second_look_finds_several_times_the_ties(scene: ms.TexturedWall) -> N
         angles_deg=np.tile(features.angles_deg, 2),
         descriptors=np.tile(features.descriptors, (2, 1)),
     )
-    none = mutual_matches(features.descriptors, double.descriptors, ratio_most=0.9, is_exact=True)
+    none = mutual_matches(features.descriptors, double.descriptors, ratio=0.9)
     assert len(none) == 0
     seeds = Matches(first=np.arange(20), second=np.arange(20), ratio=np.full(20, 0.5))
     found = rematched(
         seeds,
         (features, double),
         Expectation(pixels=double.pixels, agreeing=np.ones(20, np.bool_), radius_px=100.0),
-        ratio_most=0.9,
+        ratio=0.9,
     )
     assert len(found) > 0.8 * len(features)
     np.testing.assert_array_equal(found.first, found.second)
-
-
-def test_tiles_find_what_the_whole_image_holds(
-    scene: ms.TexturedWall, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from orthoflow_plugins.match import features
-
-    grey = decode_image(ms.photo_of(scene, ms.camera_before(scene)).encoded)[:, :, 0]
-    whole = find_features(grey, RULE)
-    monkeypatch.setattr(features, "_TILE_PX", 320)
-    tiled = find_features(grey, RULE)
-    places = {tuple(pixel) for pixel in whole.pixels.round(1)}
-    same = [tuple(pixel) in places for pixel in tiled.pixels.round(1)]
-    assert len(tiled) == pytest.approx(len(whole), rel=0.05)
-    assert np.mean(same) > 0.9
 
 
 def test_shrinking_keeps_positions() -> None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import structures
 from orthoflow_plugins.match.structures import (
     Place,
     WallStructure,
@@ -247,105 +244,3 @@ def test_a_wall_without_intensity_or_of_few_cells_has_no_structure(wall: Wall) -
             },
         )
         assert (wall_structure(low) is not None) == is_enough
-
-
-@pytest.mark.parametrize(
-    ("width", "level", "width_there"),
-    [(250.0, 0, 250.0), (251.0, 1, 125.5), (500.0, 1, 250.0), (501.0, 2, 125.25)],
-)
-@pytest.mark.parametrize("is_upright", [False, True])
-def test_a_size_is_looked_at_in_cells_that_are_wide_enough(
-    width: float, level: int, width_there: float, is_upright: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-    monkeypatch.setattr(structures, "_best_at", lambda _, *how: asked.append(how))
-    levels: Any = [SimpleNamespace(photo_cells=250) for _ in range(3)]
-    # The longer side counts, whichever it is.
-    rgb = np.zeros((200, 100, 3) if is_upright else (100, 200, 3), dtype=np.uint8)
-    structures._best_of_size(rgb, 0.5 * width if is_upright else width, levels)
-    ((found, of),) = asked
-    assert of is levels[level]
-    assert found == (0.5 * width_there if is_upright else width_there)
-
-
-def test_parts_slip_by_three_hundredths_of_the_photo_and_one_cell_at_least() -> None:
-    assert [structures._slip(width) for width in (10, 66, 67, 200)] == [1, 1, 2, 6]
-
-
-def test_a_halved_depth_is_known_where_all_four_are() -> None:
-    depth_m = np.arange(35, dtype=np.float32).reshape(5, 7)
-    depth_m[1, 2] = np.nan
-    halved = structures._halved_depth(depth_m)
-    expected = depth_m[:4:2, :6:2].copy()
-    expected[0, 1] = np.nan
-    np.testing.assert_array_equal(halved, expected)
-
-
-@pytest.mark.parametrize("roughly", [False, True])
-def test_places_are_looked_for_finely_or_roughly(
-    roughly: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def best(_: object, width: float, levels: object) -> Place:
-        asked.append(levels)
-        parts = np.zeros((9, 2))
-        return Place(
-            centre_m=np.array([width, 0.0]), width_m=0.01, lead=width, parts_photo=parts,
-            parts_m=parts,
-        )  # fmt: skip
-
-    monkeypatch.setattr(structures, "_best_of_size", best)
-    of: Any = SimpleNamespace(
-        fine="fine",
-        rough="rough",
-        wall=SimpleNamespace(frame=SimpleNamespace(shape=(200, 300), gsd_m=0.01)),
-    )
-    rgb = np.zeros((60, 90, 3), dtype=np.uint8)
-    widths = _widths_cells((60, 90), (200, 300))
-    places = likely_places(rgb, of, n_most=3, roughly=roughly)
-    assert asked == ["rough" if roughly else "fine"] * len(widths)
-    # Those that stand out most.
-    assert [place.lead for place in places] == sorted(widths, reverse=True)[:3]
-    asked.clear()
-    closer(rgb, of, places[0])
-    assert asked == ["fine"]
-
-
-def test_nine_parts_that_slipped_as_far_as_they_may_tell_a_place(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # A photo of 100 by 75 samples, whose parts may slip by three of them.
-    sides, shape, padded = (37, 50), (120, 160), (200, 260)
-    corners = [(top, left) for top in (0, 19, 38) for left in (0, 25, 50)]
-    slips = [(3 * i, 3 * j) for i in (-1, 0, 1) for j in (1, 0, -1)]
-    row, column = 20, 30
-    maps = iter(
-        np.where(
-            (np.arange(padded[0])[:, None] == row + top + down)
-            & (np.arange(padded[1]) == column + left + right),
-            np.float32(1.0),
-            np.float32(0.0),
-        )
-        for (top, left), (down, right) in zip(corners, slips, strict=True)
-    )
-    asked = []
-
-    def part_map(part: NDArray[np.float32], under: object, _: object) -> NDArray[np.float32]:
-        asked.append((part.shape, under))
-        return next(maps)
-
-    monkeypatch.setattr(structures, "_part_map", part_map)
-    monkeypatch.setattr(structures, "_energy_under", lambda side, _: side)
-    spectra: Any = SimpleNamespace(shape=shape, padded=padded, sample_m=0.5)
-    rgb = np.random.default_rng(3).integers(0, 255, (150, 200, 3), dtype=np.uint8)
-    found = structures._best_at(rgb, 200.0, spectra)
-    assert asked == [((5, *sides), sides)] * 9
-    np.testing.assert_allclose(found.centre_m, 0.5 * np.array([column + 50.0, row + 37.5]))
-    assert found.width_m == 50.0
-    assert found.lead == pytest.approx(9e9)
-    lefts = np.array([[left, top] for top, left in corners])
-    moves = np.array([[right, down] for down, right in slips])
-    half = np.array([25.0, 18.5])
-    np.testing.assert_allclose(found.parts_photo, (lefts + half) / [100.0, 75.0])
-    np.testing.assert_allclose(found.parts_m, 0.5 * (lefts + moves + half + [column, row]))

@@ -236,13 +236,6 @@ def test_colours_are_resampled_as_greys_are_and_what_is_not_shown_is_unknown() -
         )
 
 
-def test_a_cell_is_as_large_as_the_median_of_its_sides() -> None:
-    projection = flat_projection(1.0)
-    assert warping._pixels_per_cell(3.0 * projection.u, 12.0 * projection.v) == pytest.approx(6.0)
-    nothing = np.full((4, 4), np.nan, dtype=np.float32)
-    assert warping._pixels_per_cell(nothing, nothing) is None
-
-
 @pytest.mark.parametrize("y_m", [100.0, -100.0])
 def test_a_wall_far_from_where_coordinates_begin_appears_as_any_other(y_m: float) -> None:
     (near,) = warping.project_walls(camera_at(), [wall_at(0.0)])

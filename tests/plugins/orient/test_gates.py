@@ -383,3 +383,23 @@ def test_a_line_and_two_points_have_no_area() -> None:
     assert hull_area(np.tile([[1.0, 2.0], [3.0, 9.0]], (4, 1))) == 0.0
     assert hull_area(np.empty((0, 2))) == 0.0
     assert hull_area(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]])) == pytest.approx(3.0)
+
+
+def test_wrong_ties_gather_on_a_quarter_of_what_has_texture() -> None:
+    # Six of twenty agree so closely that a fifth of the limit of three, 30 px, holds them all; the
+    # matcher looked everywhere.
+    is_check = candidate().is_check
+    agrees = candidate().estimate.agreeing.copy()
+    agrees[is_check] = np.arange(20) < 6
+    lengths = np.where(agrees, 0.01, 8.0)
+    radius_px = 0.2 * 3.0 * 0.5 / 0.01
+    by_chance = optimize.brentq(lambda p: 4.0 * stats.binom.sf(5, 20, p) - 1e-5, 1e-4, 0.5)
+    # The ties lie on a grid of ten by ten places, the hull of which is 0.9 by 0.9 of the photo.
+    textured_px2 = math.pi * radius_px**2 / by_chance
+    scale = math.sqrt(4.0 * textured_px2 / (900.0 * 720.0))
+    for factor, is_fine in ((1.02, True), (0.98, False)):
+        pixels = (500.0, 400.0) + factor * scale * (grid() - (500.0, 400.0))
+        found = refusal(
+            candidate(agreeing=agrees, normalised=lengths, pixels=pixels), CONTROL_GATES[2:3]
+        )
+        assert (found is None) == is_fine

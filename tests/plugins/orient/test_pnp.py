@@ -91,7 +91,7 @@ def test_the_chain_orients_within_its_stated_error(tmp_path: Path, seed: int) ->
     camera = ms.camera_before(scene, centre=(0.6 + 0.6 * seed, -2.6, 1.1), roll=0.8 * seed)
     photos, walls = ms.photos(ms.photo_of(scene, camera)), ms.walls_of(scene)
     ctx = context(tmp_path, seed=seed)
-    params = MatchSift.Params(n_features_max=2000)
+    params = MatchSift.Params(max_features=2000)
     ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls), params, ctx).ties
     for folder in ("first", "second"):
         (tmp_path / folder).mkdir()

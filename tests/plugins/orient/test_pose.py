@@ -271,3 +271,29 @@ def test_cells_are_numbered_row_by_row_and_hold_what_lies_beside_the_image() -> 
     np.testing.assert_array_equal(image_cells(pixels, (300, 150), 3), [0, 0, 1, 3, 8])
     beside = np.array([[-5.0, -5.0], [400.0, -5.0], [-5.0, 200.0], [300.0, 150.0]])
     np.testing.assert_array_equal(image_cells(beside, (300, 150), 3), [0, 2, 6, 8])
+
+
+@pytest.mark.parametrize("unit", [0.4, 2.5])
+def test_a_pose_does_not_hang_on_the_unit_in_which_ties_state_their_sigmas(unit: float) -> None:
+    # Some residuals lie beyond the soft limit: what of them counts must not change either.
+    true = camera()
+    seen = seen_by(true, 300, noise_px=0.5, seed=5)
+    rng = np.random.default_rng(6)
+    far = rng.random(300) < 0.15
+    seen = replace(seen, pixels_photo=seen.pixels_photo + far[:, None] * rng.uniform(-1.6, 1.6, 2))
+    is_check = np.arange(300) % 5 == 0
+    params = OrientParams(threshold_px=4.0)
+    stated, other = (
+        estimate_pose(tied(photo_by(true), some, is_check), params)
+        for some in (
+            seen,
+            replace(seen, sigma_px=unit * seen.sigma_px, sigma_m=unit * seen.sigma_m),
+        )
+    )
+    assert isinstance(stated, Estimate)
+    assert isinstance(other, Estimate)
+    np.testing.assert_allclose(
+        other.resection.camera.centre_world, stated.resection.camera.centre_world, atol=2e-6
+    )
+    assert other.resection.sigma0 == pytest.approx(stated.resection.sigma0 / unit, rel=1e-3)
+    assert other.limit == pytest.approx(stated.limit / unit, rel=1e-3)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
+from orthoflow_plugins.match.ties import TiePiece, key_point_ties, ties_of, without_twins
 
 from orthoflow.files.images import encode_png
 from orthoflow.products import TieRole

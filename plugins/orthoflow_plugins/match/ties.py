@@ -1,19 +1,26 @@
-"""Ties by pieces, each piece one photo on one wall: made from key points, joined, without twins."""
+"""Ties by pieces, each piece one photo on one wall: made from key points, joined, without twins.
+
+Ties that a person measured join them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import used_pixels
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.pictures import points_on_wall
+from orthoflow_plugins.match.pictures import points_on_wall, require_intensity
+
+if TYPE_CHECKING:
+    from orthoflow.sdk import StepContext
 
 # How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
 # and growing with their size.
@@ -44,6 +51,36 @@ class TiePiece(Rows):
     sigma_px: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
     role: TieRole = TieRole.CONTROL
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """What tracing a photo on the walls found.
+
+    Attributes:
+        photo: index of the photo.
+        pieces: ties per wall, outliers left out.
+        n_measured: displacements measured in the last round.
+        n_outliers: of these, dropped.
+        held_out_px: RMS of a residual coordinate of held-out ties, per round.
+        content: what was compared.
+        camera: the pose that it was traced from.
+        settled: the pose in the end.
+    """
+
+    photo: int
+    pieces: tuple[TiePiece, ...]
+    n_measured: int
+    n_outliers: int
+    held_out_px: tuple[float, ...]
+    content: str
+    camera: ViewingCamera
+    settled: ViewingCamera
+
+    @property
+    def n_ties(self) -> int:
+        """Ties on all walls."""
+        return sum(len(piece) for piece in self.pieces)
 
 
 def key_point_ties(
@@ -159,6 +196,57 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
     return [
         piece.take(kept[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
     ]
+
+
+def ties_by_hand_alone(
+    hand: Ties | None, photos: Photos, walls: Walls, ctx: StepContext
+) -> Ties | None:
+    """Give the ties by hand where the walls show nothing that a photo could be matched with.
+
+    Returns:
+        None where the walls show something.
+
+    Raises:
+        MethodError: the walls show nothing, and nobody measured a tie.
+    """
+    if hand is None or any(wall.intensity is not None for wall in walls.walls):
+        require_intensity(walls)
+        return None
+    ctx.warn(
+        "the scan has neither intensity nor colour that a photo could be matched with: only the "
+        "ties measured by hand are used"
+    )
+    return with_ties_by_hand(ties_of([], photos, walls, {}), hand, walls, ctx)
+
+
+def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepContext) -> Ties:
+    """Put ties that a person measured behind those that matching found.
+
+    Args:
+        ties: of all photos, with their walls.
+        hand: measured by a person, in the photos of the same names; None for none.
+        walls: the walls of `ties`.
+        ctx: takes how many they are.
+    """
+    if hand is None or not len(hand.photo):
+        return ties
+    place = {name: index for index, name in enumerate(ties.photo_names)}
+    known = np.array([place.get(name, -1) for name in hand.photo_names], dtype=np.int32)
+    kept = np.flatnonzero(known[hand.photo] >= 0)
+    ctx.metric("n_by_hand", len(kept), "1")
+    own_walls = walls.nearest(hand.points_world[kept])
+    return replace(
+        ties,
+        photo=np.concatenate([ties.photo, known[hand.photo[kept]]]),
+        wall=np.concatenate([ties.wall, own_walls]),
+        pixels_photo=np.concatenate([ties.pixels_photo, hand.pixels_photo[kept]]),
+        points_world=np.concatenate([ties.points_world, hand.points_world[kept]]),
+        sigma_px=np.concatenate([ties.sigma_px, hand.sigma_px[kept]]),
+        sigma_m=np.concatenate([ties.sigma_m, hand.sigma_m[kept]]),
+        role=np.concatenate([ties.role, hand.role[kept]]),
+        residual_px=np.concatenate([ties.residual_px, np.full((len(kept), 2), np.nan)]),
+        by_hand=np.repeat(np.array([0, 1], dtype=np.uint8), [len(ties.photo), len(kept)]),
+    )
 
 
 def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,194 @@
+"""Errors that photos state on clouds whose points err together, against the truth.
+
+    python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...]
+    python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
+
+Drawn rooms: of each kind of cloud some rooms with scan noise, camera and viewpoints of their own,
+six photos of which no file says the focal length. The scans are registered to 5 mm, the cloud is
+bent by 8 mm at the ends of the room, or its points err together over half a metre as those of
+stereo do. Photos are matched at their true poses (`match.guided`), and oriented by a bundle. `true`
+is the error of a coordinate on the wall, RMS over all photos, `stated` that of what they state;
+`wrong` counts photos that are `ok` and off by more than five of their stated deviations.
+
+Real photos: folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11) with
+`images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same frame.
+Each is run by `photos-on-scan.yaml` in cells of 10 mm, with and without its calibration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from orthoflow_plugins.inspect.orientation_errors import pose_errors
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.orient.bundle import OrientColmapBundle
+from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.simulate.room import SimulateRoom
+
+from orthoflow.geometry.scene_views import SceneCameras
+from orthoflow.products import Cameras, Photos
+from orthoflow.sdk import StepContext
+
+CLOUDS: Final[dict[str, dict[str, float]]] = {
+    "plain": {},
+    "registered": {"registration_error_m": 0.005},
+    "bent": {"bending_m": 0.008},
+    "stereo": {"shared_noise_m": 0.004, "shared_noise_length_m": 0.5},
+    "far": {"shared_noise_m": 0.004, "shared_noise_length_m": 3.0},
+}
+# Photos that no cloud of these folders was made from.
+ENTRY: Final = ("0002", "0003", "0004", "0007", "0008", "0009")
+FOUNTAIN: Final = ("0000", "0003", "0006", "0009", "0010")
+
+
+def context(folder: str, seed: int) -> StepContext:
+    return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=Path(folder))
+
+
+def room(cloud: str, seed: int, folder: str) -> tuple[list[tuple[float, float]], list[str], int]:
+    """True and stated error of each oriented photo, reasons of the others, and wrong ones."""
+    params = SimulateRoom.Params.model_validate(
+        {"scan_step_m": 0.004, "panorama_step_m": 0.02, "noise_m": 0.002, "photo_gsd_m": 0.003}
+        | {"photo_layout": "quick", "textile_share": 0.33}
+        | CLOUDS[cloud]
+    )
+    built = SimulateRoom().run(SimulateRoom.In(), params, context(folder, seed))
+    planes = Hough2d().run(Hough2d.In(cloud=built.cloud), Hough2d.Params(), context(folder, 1))
+    walls = (
+        RasterGrid()
+        .run(
+            RasterGrid.In(cloud=built.cloud, planes=planes.planes),
+            RasterGrid.Params(gsd_m=0.006, buffer_m=0.3, n_walls_max=1),
+            context(folder, 1),
+        )
+        .walls
+    )
+    true = built.truth.cameras or Cameras(cameras=())
+    ties = (
+        MatchGuided()
+        .run(
+            MatchGuided.In(photos=built.photos, walls=walls, cameras=true),
+            MatchGuided.Params(),
+            context(folder, 1),
+        )
+        .ties
+    )
+    unknown = Photos(
+        photos=tuple(
+            replace(photo, intrinsics=None, exif_focal_px=None) for photo in built.photos.photos
+        )
+    )
+    wide = {"max_sigma_wall_cells": 10.0, "max_sigma_corner_cells": 30.0}
+    cameras = (
+        OrientColmapBundle()
+        .run(
+            OrientColmapBundle.In(ties=ties, photos=unknown),
+            OrientColmapBundle.Params.model_validate(wide),
+            context(folder, 1),
+        )
+        .cameras
+    )
+    errors = pose_errors(cameras, walls, built.truth, SceneCameras(built.truth.scene, cores=2))
+    known = [
+        (error.wall_m, error.sigma_wall_m)
+        for error in errors
+        if error.wall_m is not None and error.sigma_wall_m is not None
+    ]
+    refused = [error.status for error in errors if error.status != "ok"]
+    return known, refused, sum(error.is_wrong for error in errors)
+
+
+def drawn(chosen: argparse.Namespace) -> None:
+    print(f"{'cloud':12s} photos    true  stated  stated/true  wrong")
+    for cloud in chosen.clouds:
+        found: list[tuple[float, float]] = []
+        n_refused = n_wrong = 0
+        for seed in range(chosen.first, chosen.first + chosen.rooms):
+            with tempfile.TemporaryDirectory() as folder:
+                known, refused, wrong = room(cloud, seed, folder)
+            for reason in refused:
+                print(f"  {cloud} {seed}: {reason}", flush=True)
+            found += known
+            n_refused, n_wrong = n_refused + len(refused), n_wrong + wrong
+        true, stated = np.sqrt(np.mean(np.square(found), axis=0))
+        print(
+            f"{cloud:12s} {len(found):2d}/{len(found) + n_refused:<3d} {1e3 * true:6.2f}  "
+            f"{1e3 * stated:6.2f}  {stated / true:11.2f}  {n_wrong:5d}",
+            flush=True,
+        )
+
+
+def real(folder: Path, names: tuple[str, ...]) -> None:
+    """Run photos on their cloud, with and without calibration, and compare the cameras."""
+    with tempfile.TemporaryDirectory() as scratch:
+        photos, calibration = Path(scratch, "photos"), Path(scratch, "calibration.yaml")
+        photos.mkdir()
+        for name in names:
+            (photos / f"{name}.jpg").symlink_to((folder / "images" / f"{name}.jpg").resolve())
+        rows = [float(word) for word in (folder / "images" / "K.txt").read_text().split()]
+        calibration.write_text(
+            'cameras: {"*": {width: 3072, height: 2048, '
+            f"fx: {rows[0]}, fy: {rows[4]}, cx: {rows[2]}, cy: {rows[5]}, "
+            "distortion: [0, 0, 0, 0, 0]}}\n"
+        )
+        for is_known in (True, False):
+            run = Path(scratch, f"run-{is_known}")
+            subprocess.run(
+                [sys.executable, "-m", "orthoflow", "run", "photos-on-scan.yaml", "-o", str(run)]
+                + ["--store", str(Path(scratch, "store")), "--until", "orient"]
+                + ["--set", "cloud.up=-z", "--set", "wall.gsd_m=0.01"]
+                + ["--input", f"scan={folder / 'cloud_from_photos.laz'}"]
+                + ["--input", f"photos={photos}"]
+                + (["--input", f"calibration={calibration}"] if is_known else []),
+                check=True,
+                capture_output=True,
+            )
+            written = json.loads(next(run.glob("products/orient*/cameras.json")).read_text())
+            for name in names:
+                camera = written["cameras"][f"{name}.jpg"]
+                label = f"{folder.name} {'with' if is_known else 'without'} K {name}"
+                if camera["status"] != "ok":
+                    print(f"{label}: {camera['status']}")
+                    continue
+                rotation = np.array(camera["R_camera_from_world"])
+                centre = -rotation.T @ np.array(camera["t_camera_from_world"])
+                lines = (folder / "images" / f"{name}.jpg.camera").read_text().splitlines()
+                true = np.array([float(word) for word in lines[7].split()])
+                axes = np.array([[float(word) for word in line.split()] for line in lines[4:7]])
+                turn = rotation @ axes
+                angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+                print(
+                    f"{label}: centre {1e3 * np.linalg.norm(centre - true):5.1f} mm off, "
+                    f"{angle:.3f} deg, f {camera['K'][0][0]:.1f} px, states "
+                    f"{camera['sigma_wall_mm']:.2f} mm on the wall",
+                    flush=True,
+                )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rooms", type=int, default=3, help="rooms of each kind of cloud")
+    parser.add_argument("--first", type=int, default=1, help="seed of the first room")
+    parser.add_argument("--clouds", nargs="*", default=list(CLOUDS), choices=list(CLOUDS))
+    parser.add_argument("--entry", type=Path)
+    parser.add_argument("--fountain", type=Path)
+    chosen = parser.parse_args()
+    if chosen.entry or chosen.fountain:
+        for folder, names in ((chosen.entry, ENTRY), (chosen.fountain, FOUNTAIN)):
+            if folder is not None:
+                real(folder, names)
+        return
+    drawn(chosen)
+
+
+if __name__ == "__main__":
+    main()
