@@ -461,7 +461,7 @@ def test_a_name_states_its_value_exactly_or_is_an_index_whatever_the_order(
 
 
 def test_parameters_are_cut_as_far_as_they_stay_apart_and_then_are_an_index() -> None:
-    two = [{"max_sigma_corner_cells": 100, "max_sigma_wall_cells": 5}]
+    two = [{"sigma_corner_max_cells": 100, "sigma_wall_max_cells": 5}]
     assert variant_names("fine", two) == ["fine-sigma_corn-100-sigma_wall-5"]
     alike = [{"sigma_corner_a": 100000, "sigma_corner_b": 500000}]
     assert variant_names("fine", alike) == ["fine-sweep-1"]

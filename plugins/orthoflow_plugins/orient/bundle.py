@@ -33,7 +33,6 @@ from orthoflow_plugins.orient.photo_ties import (
     tie_photos,
 )
 from orthoflow_plugins.orient.photos import (
-    Oriented,
     Trusted,
     by_itself,
     candidate_of,
@@ -44,7 +43,7 @@ from orthoflow_plugins.orient.photos import (
     with_believable_priors,
 )
 from orthoflow_plugins.orient.pose import TiedPhoto, estimate_pose
-from orthoflow_plugins.orient.report import hand_over
+from orthoflow_plugins.orient.report import Oriented, hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7

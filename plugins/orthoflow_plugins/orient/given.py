@@ -16,8 +16,8 @@ from orthoflow.sdk import Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
 from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientOut, OrientParams
-from orthoflow_plugins.orient.photos import Oriented, oriented_by_hand, tied_photo
-from orthoflow_plugins.orient.report import hand_over, measure_expected
+from orthoflow_plugins.orient.photos import oriented_by_hand, tied_photo
+from orthoflow_plugins.orient.report import Oriented, hand_over, measure_expected
 
 _SIDE: Final = 15
 # A tie farther off than that does not belong to the pose.

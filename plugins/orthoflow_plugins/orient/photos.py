@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, JsonValue, Photo, Photos, ResidualRow, TieRole, Ties
+from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.orient.by_hand import TIES_LEAST, PoseByHand, pose_by_hand
 from orthoflow_plugins.orient.gates import (
@@ -34,7 +34,7 @@ from orthoflow_plugins.orient.pose import (
     ties_of_photo,
 )
 from orthoflow_plugins.orient.report import (
-    PhotoNumbers,
+    Oriented,
     numbers_json,
     photo_numbers,
     residual_table,
@@ -51,33 +51,6 @@ _ASKED_OF_LENS: Final = 5
 # So many photos of a camera, which agree up to this factor, say more than the EXIF of another.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
-
-
-@dataclass(frozen=True, kw_only=True)
-class Oriented:
-    """What became of one photo.
-
-    Attributes:
-        camera: its orientation, or why there is none.
-        chosen: (n,) index into all ties of those that were used.
-        role: (n,) `TieRole` of these.
-        residuals_px: (n, 2), NaN without an orientation.
-        numbers: for the metrics, None without an orientation.
-        entry: for the record.
-        table: rows of the table of residuals.
-        notes: what limits it.
-        candidate: what it was judged by, of a photo that is ok.
-    """
-
-    camera: Camera
-    chosen: NDArray[np.intp]
-    role: NDArray[np.uint8]
-    residuals_px: NDArray[np.float64]
-    numbers: PhotoNumbers | None = None
-    entry: JsonValue = None
-    table: tuple[ResidualRow, ...] = ()
-    notes: tuple[str, ...] = ()
-    candidate: Candidate | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from orthoflow_plugins.orient.figures import (
 )
 from orthoflow_plugins.orient.gates import Candidate
 from orthoflow_plugins.orient.pose import metres_per_pixel, ties_of_photo
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.orient.photos import Oriented
 
 # Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
 _BEYOND: Final = 2.0
@@ -66,6 +63,33 @@ class PhotoNumbers:
     check_rmse_mm: float
     pixel_mm: float
     hull_ratio: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Oriented:
+    """What became of one photo.
+
+    Attributes:
+        camera: its orientation, or why there is none.
+        chosen: (n,) index into all ties of those that were used.
+        role: (n,) `TieRole` of these.
+        residuals_px: (n, 2), NaN without an orientation.
+        numbers: for the metrics, None without an orientation.
+        entry: for the record.
+        table: rows of the table of residuals.
+        notes: what limits it.
+        candidate: what it was judged by, of a photo that is ok.
+    """
+
+    camera: Camera
+    chosen: NDArray[np.intp]
+    role: NDArray[np.uint8]
+    residuals_px: NDArray[np.float64]
+    numbers: PhotoNumbers | None = None
+    entry: JsonValue = None
+    table: tuple[ResidualRow, ...] = ()
+    notes: tuple[str, ...] = ()
+    candidate: Candidate | None = None
 
 
 def photo_numbers(candidate: Candidate) -> PhotoNumbers:
