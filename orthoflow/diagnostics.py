@@ -15,9 +15,8 @@ from typing import Any, Final, Literal, Protocol
 
 from orthoflow_provenance.document import RecordedDiagnostic as Diagnostic
 
-from orthoflow.alike import first_few
 from orthoflow.errors import ProductError
-from orthoflow.foreign_text import shown
+from orthoflow.foreign_text import first_few, shown
 
 __all__ = [
     "FIRST_SHOWN",

@@ -296,3 +296,14 @@ def _check_declaration(_version: str, encoding: str | None, _standalone: int) ->
 
 def _refuse_instruction(target: str, _data: str) -> None:
     raise _ActiveError(target)
+
+
+def first_few(names: Sequence[str], most: int = 3) -> str:
+    """Name the first few, and count the others.
+
+    >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
+    ('a, b, c and 2 more', 'a and 1 more')
+    """
+    n_more = len(names) - most
+    named = ", ".join(names[:most])
+    return f"{named} and {n_more} more" if n_more > 0 else named

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand, code_for, json_option, store_option
 from orthoflow.cli.tables import (
     ROWS_MOST,
@@ -24,6 +23,7 @@ from orthoflow.cli.tables import (
     say_more,
     say_verify,
 )
+from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile

@@ -158,6 +158,13 @@ _HELP: Final = "\n\n".join(
     "http://localhost:8000 without it.",
 )
 @click.option(
+    "--format",
+    "figure_format",
+    type=click.Choice(["pdf", "svg", "png"]),
+    help="figures: of charts and drawings, png at 300 dpi; svg without it. Pictures become pages "
+    "of a PDF, and stay PNG otherwise.",
+)
+@click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
     help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "

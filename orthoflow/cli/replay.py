@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from orthoflow.alike import first_few
 from orthoflow.cli.commands import (
     DEFAULT_STORE,
     EXIT_GOOD,
@@ -28,6 +27,7 @@ from orthoflow.cli.commands import (
 )
 from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
+from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.engine.scheduler import RunOutcome

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from orthoflow.alike import first_few
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
-from orthoflow.foreign_text import csv_text
+from orthoflow.foreign_text import csv_text, first_few
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary

@@ -10,7 +10,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.keys import (
@@ -25,6 +24,7 @@ from orthoflow.engine.keys import (
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.store import Failures, Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
+from orthoflow.foreign_text import first_few
 from orthoflow.products.input_files import InputFiles
 from orthoflow.system import usable_cores
 from orthoflow.workflow.expand import (

@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.alike import first_few
 from orthoflow.errors import InputError
 from orthoflow.files.colmap import COLMAP_PARTS, read_colmap_model
 from orthoflow.files.e57_images import read_e57_images
@@ -34,7 +33,7 @@ from orthoflow.files.given_cameras import (
 )
 from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.metashape import read_metashape_xml
-from orthoflow.foreign_text import parse_json
+from orthoflow.foreign_text import first_few, parse_json
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 

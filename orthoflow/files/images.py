@@ -6,6 +6,7 @@ orientation: the pixel frame is the stored array.
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -112,6 +113,15 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
 def encode_png(image: Colours) -> bytes:
     """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG, as deep."""
     return _encode(".png", image, [])
+
+
+def encode_pdf(image: Colours, *, dpi: int) -> bytes:
+    """Encode a picture as a PDF with one page of its size."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(eight_bits(image)).convert("RGB").save(stream, format="PDF", resolution=dpi)
+    return stream.getvalue()
 
 
 def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:

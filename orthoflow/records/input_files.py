@@ -23,13 +23,13 @@ from orthoflow_provenance.paths import (
 )
 from orthoflow_provenance.record import extract_files
 
-from orthoflow.alike import first_few
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.errors import (
     InputError,
     RecordError,
 )
+from orthoflow.foreign_text import first_few
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.workflow.inputs import (
     InputOption,

@@ -37,7 +37,6 @@ from orthoflow_provenance.paths import (
 )
 from orthoflow_provenance.record import open_record
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name, is_running
@@ -48,7 +47,7 @@ from orthoflow.errors import (
     RecordError,
     StoreError,
 )
-from orthoflow.foreign_text import shown
+from orthoflow.foreign_text import first_few, shown
 from orthoflow.geometry.threads import in_order
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.published import PRODUCTS_FOLDER, MetricRow, cell_metrics, published_files

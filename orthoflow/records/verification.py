@@ -26,9 +26,9 @@ from orthoflow_provenance.paths import files_below, open_below
 from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
 
-from orthoflow.alike import first_few
 from orthoflow.engine.journal import JOURNAL, LOGS
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
+from orthoflow.foreign_text import first_few
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload

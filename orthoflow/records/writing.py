@@ -28,12 +28,12 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.record import write_record
 
-from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.journal import RECORD_FILE, kept_from_others
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
+from orthoflow.foreign_text import first_few
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, read_run

@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.alike import first_few
-from orthoflow.foreign_text import parse_json
+from orthoflow.foreign_text import first_few, parse_json
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
@@ -85,7 +84,7 @@ class Combination:
 
     @property
     def missing(self) -> tuple[RecordedCell, ...]:
-        """Cells that the run was broken off before; optional steps without data are none."""
+        """Cells that the run was interrupted before; optional steps without data are none."""
         return tuple(cell for cell in self.cells if cell.repeat == 0 and is_missing(cell))
 
     @property
@@ -135,7 +134,7 @@ class Combination:
 
 
 def unequal_walls(combinations: Iterable[Combination]) -> str:
-    """Say where the first walls of combinations are not one, room by room; empty where they are.
+    """Return where the first walls of combinations are not one, room by room; empty where they are.
 
     What was found decides which wall is the first, so that numbers of it may be of different ones.
     """
@@ -214,7 +213,7 @@ def is_check(cell: RecordedCell) -> bool:
 
 
 def is_missing(cell: RecordedCell) -> bool:
-    """Say whether the run was broken off before the cell."""
+    """Return whether the run was interrupted before the cell."""
     return cell.status == "skipped" and cell.error_message == NOT_YET
 
 

@@ -72,7 +72,7 @@ class Row:
         variants: variant of each varied step; a dash where the step has no part in it.
         is_baseline: the workflow calls it its baseline.
         failure: where and why it failed, empty when it did not.
-        missing: addresses that the run was broken off before.
+        missing: addresses that the run was interrupted before.
         values: one per column.
         time: processor seconds of the cells that the variants have a part in: they hardly depend
             on what else the machine does.
@@ -237,7 +237,7 @@ class ComparisonTable:
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
-    """Lay the combinations of one or more runs beside each other; None when there is but one.
+    """Put the combinations of one or more runs beside each other; None when there is but one.
 
     Values are ranked only among those of one environment and one set of data; with more than one
     of either, letters say which is which.

@@ -7,18 +7,16 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
-from html import escape
 from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from orthoflow.alike import first_few
-from orthoflow.foreign_text import shown
+from orthoflow.foreign_text import first_few
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
+from orthoflow.report.charts import ChartFormat, ChartPoint, as_image, line_chart
 from orthoflow.report.combinations import (
     Combination,
     combinations_of,
@@ -29,6 +27,7 @@ from orthoflow.report.combinations import (
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
+from orthoflow.report.pictures import Picture
 from orthoflow.report.rankings import Sense, cost_share, is_flag
 from orthoflow.workflow.model import (
     DATA,
@@ -42,24 +41,6 @@ _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
 # What measures walls gives one of these.
 _OF_WALLS: Final = ("walls", "layers", "orthoimages", "inspection")
-_SHARES: Final = ("main_found", "label_*", "*completeness*", "*_iou*", "*_share*")
-_LOGARITHMIC_RATIO: Final = 20.0
-_WIDTH, _HEIGHT = 460.0, 318.0
-# Above, the button that enlarges lies over the drawing.
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 40.0, 46.0
-_APART: Final = 5.0  # of the lines of one drawing, whose bars stand at the same places
-_LETTER: Final = 6.2  # width of one, at the size of the drawing's text
-
-
-# The colours of the light page, for drawings that stand alone.
-_STYLE: Final = (
-    "svg{font:12px sans-serif;background:#fff;color:#1c2126}.axis,.line,.bar{fill:none}"
-    ".axis{stroke:#56606a}.grid{stroke:#d4d9de;stroke-width:.7}.line,.dot{stroke-width:2}"
-    ".line-0{stroke:#0b5fa5}.line-1{stroke:#8a4b00;stroke-dasharray:7 3}"
-    ".line-2{stroke:#1c6b35;stroke-dasharray:2 3}.line-3{stroke:#a11616;stroke-dasharray:9 3 2 3}"
-    ".line-4{stroke:#56606a}.line-5{stroke:#1c2126;stroke-dasharray:1 4}"
-    ".dot,.bar{stroke-dasharray:none}.dot{fill:#fff}.base{fill:currentColor}.bar{stroke-width:1.2}"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,32 +50,41 @@ class Curve:
     Attributes:
         name: the metric and the parameter by the names of their steps and themselves.
         title: the metric, its step and the parameter, in words.
-        svg: an `<svg>` element.
         caption: what the points and bars are, in words.
+        lines: name -> points.
+        below: label of the axis of the parameter.
+        beside: label of the axis of the metric, with its unit.
+        bounds: that the metric cannot lie beyond.
     """
 
     name: str
     title: str
-    svg: str
     caption: str
+    lines: Mapping[str, Sequence[ChartPoint]]
+    below: str
+    beside: str
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
     @property
-    def file(self) -> bytes:
-        """The drawing as an SVG file; on the page its style sheet colours the parts."""
-        head, _, drawn = self.svg.removeprefix("<svg").partition(">")
-        said = f"<style>{_STYLE}</style><desc>{escape(shown(self.caption))}</desc>"
-        alone = f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH:.0f}"{head}>{said}{drawn}'
-        return alone.encode("utf-8")
+    def picture(self) -> Picture:
+        """The drawing as a picture of a page."""
+        return Picture(uri=as_image(self.file("svg")), title=self.title, caption=self.caption)
+
+    def file(self, suffix: ChartFormat) -> bytes:
+        """The drawing as a file."""
+        return line_chart(
+            self.lines, below=self.below, beside=self.beside, bounds=self.bounds, suffix=suffix
+        )
 
 
-def curve_files(run: Run) -> dict[str, bytes]:
-    """Give the drawings of a run, over its datasets where it has several, as SVG files by name."""
+def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
+    """Give the drawings of a run, over its datasets where it has several, as files by name."""
     parts = parts_of(run)
     drawn = curves_over(parts) if len(parts) > 1 else curves(run)
     # What a record calls its steps and metrics may be no name of a file.
     names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)
     return {
-        f"{index:02d}_{name}.svg": curve.file
+        f"{index:02d}_{name}.{suffix}": curve.file(suffix)
         for index, (name, curve) in enumerate(zip(names, drawn, strict=True), start=1)
     }
 
@@ -275,7 +265,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
 
 
 def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
-    """Say where combinations sum up unequal numbers of photos of a dataset; else empty."""
+    """Return where combinations sum up unequal numbers of photos of a dataset; else empty."""
     counts: dict[str, set[float]] = {}
     for one in combinations:
         n_photos = one.n_items(column.step, column.counted_by)
@@ -369,7 +359,7 @@ def _are_alike(one: _Point, other: _Point) -> bool:
 
 
 def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
-    """Say what is missing behind points: datasets and repeats; empty where nothing is."""
+    """Return what is missing behind points: datasets and repeats; empty where nothing is."""
     partly = [said for points in lines.values() for point in points for said in point.partly]
     some = f"; of only some repeats: {first_few(partly)}" if partly else ""
     if all(_are_alike(*pair) for points in lines.values() for pair in pairwise(points)):
@@ -379,7 +369,7 @@ def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
 
 
 def _behind(points: Sequence[_Point], n_datasets: int, unit: str) -> str:
-    """Say how many datasets points over datasets are of: those that failed have no part."""
+    """Return how many datasets points over datasets are of: those that failed have no part."""
     least, most = min(point.n for point in points), max(point.n for point in points)
     if most == 1:
         return f"each of the only one of {n_datasets} datasets that has a value, without bars"
@@ -429,168 +419,29 @@ def _curve(
         if max(map(len, lines.values())) > _FEWEST_VALUES
         else "Of two values a line shows the difference alone, and nothing of what lies between."
     )
+    every = [point for points in lines.values() for point in points]
+    # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
+    is_size = column.sense is Sense.LESS and all(point.y >= 0.0 for point in every)
+    is_share = column.sense is Sense.MORE and all(0.0 <= point.y <= 1.0 for point in every)
     return Curve(
         name=f"{column.step}.{column.metric}_over_{sweep.step}.{sweep.parameter}",
         title=title,
-        svg=_Axes.of(
-            [point for points in lines.values() for point in points],
-            is_error=column.sense is Sense.LESS,
-            is_share=any(fnmatchcase(column.metric, pattern) for pattern in _SHARES),
-        ).drawn(
-            lines,
-            label=title,
-            below=f"{sweep.step}.{sweep.parameter}",
-            beside=column.label,
-        ),
         caption=f"Points are {said}{good}. {shape}",
+        lines={name: tuple(_chart_points(points)) for name, points in lines.items()},
+        below=f"{sweep.step}.{sweep.parameter}",
+        beside=column.label,
+        bounds=(0.0 if is_size or is_share else -math.inf, 1.0 if is_share else math.inf),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Axes:
-    """Where numbers lie in the drawing.
-
-    Attributes:
-        x: least and largest.
-        y: least and largest.
-        is_logarithmic: along x.
-        floor: no bar reaches below it: sizes of errors are none.
-        ceiling: no bar reaches above it: shares are none.
-    """
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    is_logarithmic: bool
-    floor: float
-    ceiling: float
-
-    @classmethod
-    def of(cls, points: Sequence[_Point], *, is_error: bool, is_share: bool = False) -> _Axes:
-        xs = [point.x for point in points]
-        spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
-        is_share = is_share and all(0.0 <= point.y <= 1.0 for point in points)
-        is_size = is_share or (is_error and all(point.y >= 0.0 for point in points))
-        floor, ceiling = 0.0 if is_size else -math.inf, 1.0 if is_share else math.inf
-        low = min(point.y - spread for point, spread in zip(points, spreads, strict=True))
-        low = max(low, floor)
-        high = max(point.y + spread for point, spread in zip(points, spreads, strict=True))
-        high = min(high, ceiling)
-        margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
-        # An axis that begins near 0 begins there: half of it would show a difference too large.
-        begin = 0.0 if 0.0 <= low < 0.6 * high else low - margin
-        is_logarithmic = min(xs) > 0 and max(xs) / min(xs) >= _LOGARITHMIC_RATIO
-        return cls(
-            x=(min(xs), max(xs)),
-            y=(begin, high + margin),
-            is_logarithmic=is_logarithmic,
-            floor=floor,
-            ceiling=ceiling,
+def _chart_points(points: Sequence[_Point]) -> Iterator[ChartPoint]:
+    before: _Point | None = None
+    for point in points:
+        yield ChartPoint(
+            x=point.x,
+            y=point.y,
+            spread=point.spread,
+            is_filled=point.is_baseline,
+            is_joined=before is None or _are_alike(before, point),
         )
-
-    def across(self, x: float) -> float:
-        low, high = self.x
-        if self.is_logarithmic:
-            x, low, high = math.log(x), math.log(low), math.log(high)
-        share = (x - low) / (high - low) if high > low else 0.5
-        return _LEFT + 12.0 + share * (_WIDTH - _LEFT - _RIGHT - 30.0)
-
-    def down(self, y: float) -> float:
-        low, high = self.y
-        return _HEIGHT - _BOTTOM - (y - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
-
-    def drawn(
-        self, lines: Mapping[str, Sequence[_Point]], *, label: str, below: str, beside: str
-    ) -> str:
-        floor = _HEIGHT - _BOTTOM
-        parts = [
-            f'<path class="axis" d="M{_LEFT} {_TOP}V{floor}H{_WIDTH - _RIGHT}"/>',
-            (
-                f'<text x="{0.5 * (_LEFT + _WIDTH):.0f}" y="{_HEIGHT - 6}" text-anchor="middle">'
-                f"{escape(shown(below))}{' (logarithmic)' if self.is_logarithmic else ''}</text>"
-            ),
-        ]
-        ticks = _ticks(*self.y)
-        # Numbers that differ in their last digits only: how far they lie above the first.
-        base = ticks[0] if len(set(map(number, ticks))) < len(ticks) else 0.0
-        beside += f", above {base:.10g}" if base else ""
-        for value in ticks:
-            y = self.down(value)
-            parts.append(
-                f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>'
-                f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">'
-                f"{number(value - base)}</text>"
-            )
-        taken = -math.inf
-        for value in sorted({point.x for points in lines.values() for point in points}):
-            text, x = number(value), self.across(value)
-            # Values may lie too close for their numbers.
-            if x - 0.5 * _LETTER * len(text) > taken:
-                parts.append(
-                    f'<text x="{x:.1f}" y="{floor + 17}" text-anchor="middle">{text}</text>'
-                )
-                taken = x + 0.5 * _LETTER * len(text) + 6.0
-        # Bars at one place would hide each other.
-        apart = _APART if sum(_has_bars(points) for points in lines.values()) > 1 else 0.0
-        # The baseline's last: its filled point is looked for.
-        drawn = sorted(enumerate(lines.values()), key=lambda one: _has_baseline(one[1]))
-        for index, points in drawn:
-            aside = apart * (index - 0.5 * (len(lines) - 1))
-            line = self._line(index, points)
-            parts.append(f'<g transform="translate({aside:g} 0)">{line}</g>' if aside else line)
-        # The names stand above the lines, which could be anywhere below.
-        named = [(index, name) for index, name in enumerate(lines) if name]
-        above = [f'<text class="beside" x="6" y="{_TOP - 14}">{escape(shown(beside))}</text>']
-        for row, (index, name) in enumerate(named):
-            y = _TOP + 4 + 15 * row
-            above.append(
-                f'<path class="line line-{index}" d="M{_LEFT} {y - 4}h22"/>'
-                f'<text x="{_LEFT + 26}" y="{y}">{escape(shown(name))}</text>'
-            )
-        down = 15 * len(named)
-        return (
-            f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT + down:.0f}" role="img" '
-            f'aria-label="{escape(shown(label))}">{"".join(above)}'
-            f'<g transform="translate(0 {down})">{"".join(parts)}</g></svg>'
-        )
-
-    def _line(self, index: int, points: Sequence[_Point]) -> str:
-        at = [(self.across(point.x), self.down(point.y)) for point in points]
-        joins = ["", *("L" if _are_alike(*pair) else "M" for pair in pairwise(points))]
-        way = "".join(f"{join}{x:.1f} {y:.1f}" for join, (x, y) in zip(joins, at, strict=True))
-        bars = "".join(
-            f"M{x:.1f} {self.down(max(point.y - point.spread, self.floor)):.1f}"
-            f"V{self.down(min(point.y + point.spread, self.ceiling)):.1f}"
-            for (x, _), point in zip(at, points, strict=True)
-            if math.isfinite(point.spread)
-        )
-        dots = "".join(
-            f'<circle class="dot line-{index}{" base" if point.is_baseline else ""}" '
-            f'cx="{x:.1f}" cy="{y:.1f}" r="3.6">'
-            f"<title>{'' if point.is_level else f'{number(point.x)}: '}{number(point.y)}"
-            "</title></circle>"
-            for (x, y), point in zip(at, points, strict=True)
-        )
-        bar = f'<path class="bar line-{index}" d="{bars}"/>' if bars else ""
-        return f'<path class="line line-{index}" d="M{way}"/>{bar}{dots}'
-
-
-def _has_baseline(points: Sequence[_Point]) -> bool:
-    return any(point.is_baseline for point in points)
-
-
-def _has_bars(points: Sequence[_Point]) -> bool:
-    return any(math.isfinite(point.spread) and point.spread > 0.0 for point in points)
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers between two, about five.
-
-    >>> _ticks(0.0, 1.1)
-    [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
-    """
-    rough = (high - low) / 5.0
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(power * round_ for round_ in (1, 2, 5, 10) if power * round_ >= 0.8 * rough)
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [float(f"{index * step:.12g}") for index in range(first, last + 1)]
+        before = point

@@ -38,7 +38,7 @@ class DatasetRow:
         page: where its own page lies, relative to this one; empty without one.
         picture: data URI of its first orthoimage, empty without one.
         failed: its failed cells and why they did, without those that were skipped behind them.
-        missing: its cells that the run was broken off before.
+        missing: its cells that the run was interrupted before.
         values: one per column.
         photos: photos oriented, of how many.
         limit: what limits it most, and how much more does.
@@ -77,7 +77,7 @@ class DatasetTable:
 
 
 def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> DatasetTable:
-    """Lay the datasets of a run below each other.
+    """Put the datasets of a run below each other.
 
     Args:
         parts: dataset -> its part of the run.

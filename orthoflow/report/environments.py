@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.distributions import canonical_name, required_distributions
+from orthoflow.foreign_text import first_few
 from orthoflow.records import RecordedEnvironment
 from orthoflow.records.runs import Run
 from orthoflow.version import DISTRIBUTION

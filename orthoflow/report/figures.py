@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import decode_image, encode_png, shrunk_webp
+from orthoflow.files.images import decode_image, encode_pdf, encode_png, shrunk_webp
 from orthoflow.foreign_text import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
@@ -22,6 +22,7 @@ _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base
 # What the baseline may take of it as it is, before the others share the rest.
 _BASELINE_SHARE: Final = 0.7
 _SIDES_PX: Final = (700, 480, 340, 240)
+_DPI: Final = 300
 _SMALL_BYTES: Final = 20_000  # not worth drawing anew
 
 
@@ -96,7 +97,9 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
     )
 
 
-def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "") -> int:
+def write_figures(
+    run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "", as_pdf: bool = False
+) -> int:
     """Write the figures of cells as PNG or SVG files below `folder/<cell>/`, and the run's graph.
 
     A picture that is damaged has no file, nor has an SVG one in which a browser would run or load
@@ -107,6 +110,7 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
         folder: made when missing.
         addresses: of the cells.
         inside: a folder in it that takes the place of `folder`; it must be no link.
+        as_pdf: pictures as a page of a PDF each, 300 dpi.
 
     Returns:
         How many figures were written.
@@ -119,7 +123,12 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
     contents: dict[str, Callable[[], bytes | None]] = {
         GRAPH_FILE: lambda: run_diagram(run, stands_alone=True).encode("utf-8")
     }
-    contents |= {path: partial(_content, figure) for path, figure in named.items()}
+    for path, figure in named.items():
+        if as_pdf and figure.media_type != "image/svg+xml":
+            name = f"{path.rpartition('.')[0]}.pdf"
+            contents[name] = partial(_as_pdf, figure)
+        else:
+            contents[path] = partial(_content, figure)
     way = f"{inside}/" if inside else ""
     written = write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
     return written - 1
@@ -136,6 +145,14 @@ def _content(figure: RecordedFigure) -> bytes | None:
     if figure.media_type == "image/svg+xml" and not is_plain_svg(figure.data):
         return None
     return figure.data
+
+
+def _as_pdf(figure: RecordedFigure) -> bytes | None:
+    """A picture as a page of a PDF; None for one that is damaged."""
+    try:
+        return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)
+    except InputError:
+        return None
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError, RecordError
 from orthoflow.files.images import cells_webp
-from orthoflow.foreign_text import shown
+from orthoflow.foreign_text import first_few, shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product

@@ -28,11 +28,12 @@ from orthoflow.products import Cameras
 from orthoflow.records import COSTS, RecordedCell
 from orthoflow.records.comparison import compare_runs
 from orthoflow.records.datasets import pages_of, parts_of
+from orthoflow.records.deliverables import DeliveredWall, delivered_walls
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.runs import FIGURES_FOLDER, Run, figure_files
 from orthoflow.records.verification import sealed_page
 from orthoflow.records.wall_results import UncountedPoints, uncounted_points
-from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.combinations import baseline_cells, is_missing
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.cursors import cursor_places
 from orthoflow.report.curves import Curve, curves, curves_over
@@ -129,6 +130,7 @@ class _Section:
     prefix: str
     answers: tuple[Answer, ...]
     limits: tuple[Limit, ...]
+    delivered: tuple[DeliveredWall, ...]
     results: Mapping[str, tuple[str, ...]]
     comparison: ComparisonTable | None
     curves: tuple[Curve, ...]
@@ -148,6 +150,7 @@ class _Section:
     whole: str = ""
     doubt: str = ""
     is_measured: bool = True
+    is_unfinished: bool = False
     uncounted: UncountedPoints | None = None
     datasets: DatasetTable | None = None
     over: tuple[MetricOverDatasets, ...] = ()
@@ -165,7 +168,7 @@ def write_page(
     Args:
         run: the run.
         path: file to write.
-        go_on: of a run that was broken off, the command that goes on with it.
+        go_on: of a run that was interrupted, the command that goes on with it.
         doubts: record -> why nobody should rely on it.
 
     Raises:
@@ -212,7 +215,7 @@ def write_report(
     Args:
         runs: opened with `orthoflow.open_run`; of two, the page also says what differs.
         path: file to write; replaced as a whole, never half.
-        go_on: of a run that was broken off, the command that goes on with it.
+        go_on: of a run that was interrupted, the command that goes on with it.
         doubts: record -> why nobody should rely on it.
         stores: where products are that the records of two runs only name.
 
@@ -242,7 +245,7 @@ class _Place:
     Attributes:
         folder: that the page lies in.
         title: of the page.
-        go_on: of a run that was broken off, the command that goes on with it.
+        go_on: of a run that was interrupted, the command that goes on with it.
         doubts: record -> why nobody should rely on it.
         pages: dataset -> its own page; empty for a page that leads to none.
         whole: the page of all datasets, for the one of a single dataset.
@@ -371,7 +374,7 @@ def _breakable(name: str) -> Markup:
 
 
 def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
-    """Tell of a run on several datasets, whose pictures and figures stand on pages of their own."""
+    """Describe a run on several datasets, whose pictures and figures stand on own pages."""
     parts = parts_of(run)
     over = over_datasets(parts)
     empty = replace(run, record=replace(run.record, cells=()))
@@ -426,8 +429,10 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         prefix=prefix,
         answers=answers(run),
         is_measured=is_measured,
+        is_unfinished=any(is_missing(cell) for cell in run.record.cells),
         uncounted=uncounted_points(run) if on_show and not is_measured else None,
         limits=limits(run, on_show),
+        delivered=delivered_walls(run.folder / PRODUCTS_FOLDER) if on_show else (),
         results=results(run),
         comparison=comparison,
         curves=curves(run) if comparison else (),

@@ -217,7 +217,7 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 
 
 def _states(image: Orthoimage) -> str:
-    """Say what became of the cells, so that the shares add up to all of them."""
+    """Return what became of the cells, so that the shares add up to all of them."""
     words = {
         OrthoMask.PAINTED: "painted",
         OrthoMask.FILLED: "filled from neighbours",
@@ -296,7 +296,7 @@ def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.ui
 
 
 def frame_words(frame: WallFrame) -> str:
-    """Say how large a raster is on the wall, and how fine."""
+    """Return how large a raster is on the wall, and how fine."""
     return (
         f"{frame.width * frame.gsd_m:.2f} x {frame.height * frame.gsd_m:.2f} m at "
         f"{1000 * frame.gsd_m:g} mm, {frame.width} x {frame.height} cells"

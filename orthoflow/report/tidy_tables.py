@@ -96,6 +96,9 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
             "worse",
             "median_difference",
             "p",
+            "p_holm",
+            "interval_low",
+            "interval_high",
             "effect",
         ),
         "deciding",
@@ -108,11 +111,12 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
                 *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
                 *map(_known, (one.median, one.spread if one.n > 1 else math.nan)),
                 *(
-                    ("",) * 7
+                    ("",) * 10
                     if paired is None
                     else (
                         *(paired.n, paired.wins, paired.losses, _known(paired.median)),
-                        *(_known(paired.p), _known(paired.effect), " ".join(paired.deciding)),
+                        *map(_known, (paired.p, paired.p_holm, *paired.interval, paired.effect)),
+                        " ".join(paired.deciding),
                     )
                 ),
             )

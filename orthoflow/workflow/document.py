@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Table, Value, describe
+from orthoflow.foreign_text import first_few
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.checks import check_comparison, check_wiring, first_variants
 from orthoflow.workflow.inputs import (

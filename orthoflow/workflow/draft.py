@@ -14,7 +14,6 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from orthoflow.alike import first_few
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
@@ -25,6 +24,7 @@ from orthoflow.files.photo_files import HOW_TO_DEVELOP, read_exif
 from orthoflow.files.points.blocks import ScanFile
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
+from orthoflow.foreign_text import first_few
 from orthoflow.sdk.lines import text_of_path
 from orthoflow.workflow.source import shipped_workflow
 

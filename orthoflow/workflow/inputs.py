@@ -15,7 +15,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from orthoflow.alike import first_few
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import InputError, WorkflowError
 from orthoflow.files.yaml_positions import (
@@ -28,6 +27,7 @@ from orthoflow.files.yaml_positions import (
     describe,
     plain,
 )
+from orthoflow.foreign_text import first_few
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.model import (

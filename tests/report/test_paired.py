@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
@@ -121,7 +122,7 @@ def leading(n_methods: int, p: float) -> Any:
             name=f"m{k}",
             against="m0" if k else "",
             n_unlike=0,
-            paired=SimpleNamespace(p=p, effect=0.5 if k % 2 else -0.5),
+            paired=SimpleNamespace(p=p, p_holm=p, effect=0.5 if k % 2 else -0.5),
         )
         for k in range(n_methods + 1)
     ]
@@ -139,7 +140,7 @@ def test_who_leads_is_said_of_six_at_most() -> None:
     apart.told[1].n_unlike = 6
     assert "environments that are not alike" in module.who_leads([apart], 6)
     assert module.who_leads([leading(2, 0.051)] * 3, 9) == (
-        "Nobody is shown to lead in any of 3 numbers (p below 0.05)"
+        "Nobody is shown to lead in any of 3 numbers (p below 0.05 after Holm's correction)"
     )
     said = module.who_leads([leading(2, 0.049), leading(2, 0.5)], 9)
     assert "m1 against m0: better in 1 of 2 numbers (error)" in said
@@ -325,3 +326,56 @@ def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None
         ("plane=b, corner=y", "plane=a"),
         ("plane=b, corner=x", "plane=a"),
     ]
+
+
+def test_mean_ranks_are_those_of_a_worked_example() -> None:
+    # Four methods on fourteen sets: Demsar 2006, Table 6 (AUC; more is better, so negative).
+    auc = np.array(
+        [
+            [0.763, 0.768, 0.771, 0.798],
+            [0.599, 0.591, 0.590, 0.569],
+            [0.954, 0.971, 0.968, 0.967],
+            [0.628, 0.661, 0.654, 0.657],
+            [0.882, 0.888, 0.886, 0.898],
+            [0.936, 0.931, 0.916, 0.931],
+            [0.661, 0.668, 0.609, 0.685],
+            [0.583, 0.583, 0.563, 0.625],
+            [0.775, 0.838, 0.866, 0.875],
+            [1.000, 1.000, 1.000, 1.000],
+            [0.940, 0.962, 0.965, 0.962],
+            [0.619, 0.666, 0.614, 0.669],
+            [0.972, 0.981, 0.9751, 0.975],
+            [0.957, 0.978, 0.946, 0.970],
+        ]
+    )
+    found = module.mean_ranks(("C4.5", "+m", "+cf", "+m+cf"), -auc)
+    assert found.n == 14
+    assert found.ranks == {
+        "+m+cf": pytest.approx(1.964, abs=0.01),
+        "+m": pytest.approx(2.000, abs=0.01),
+        "+cf": pytest.approx(2.893, abs=0.01),
+        "C4.5": pytest.approx(3.143, abs=0.01),
+    }
+    assert found.critical_difference == pytest.approx(1.25, abs=0.01)
+    assert 0.01 < found.p < 0.05
+    assert found.leading == ("+m+cf", "+m", "+cf", "C4.5")
+
+
+def test_equal_methods_lead_together() -> None:
+    found = module.mean_ranks(("a", "b", "c"), np.ones((6, 3)))
+    assert (found.p, found.leading) == (1.0, ("a", "b", "c"))
+
+
+def test_the_interval_of_a_median_covers_it_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    for n, rate in ((6, 0.969), (20, 0.959)):
+        covered = 0
+        for _ in range(1000):
+            drawn = dict(enumerate(rng.standard_normal(n)))
+            low, high = module.paired_differences(
+                {str(key): value for key, value in drawn.items()}, Sense.LESS
+            ).interval
+            covered += low <= 0.0 <= high
+        assert covered / 1000 == pytest.approx(rate, abs=0.02)
+    few = module.paired_differences({str(k): float(k) for k in range(5)}, Sense.LESS)
+    assert math.isnan(few.interval[0])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from orthoflow.files.clouds.dressing import Colouring
     from orthoflow.files.drawings.words import Language
+    from orthoflow.report.charts import ChartFormat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +42,7 @@ class Choices:
         language: of labels.
         light: azimuth and altitude of a raking light, `315,25`.
         base_url: where an IIIF folder will be handed out.
+        figure_format: of figures: `pdf`, `svg` or `png`.
     """
 
     cell: str | None = None
@@ -67,3 +69,4 @@ class Choices:
     language: Language | None = None
     light: str | None = None
     base_url: str | None = None
+    figure_format: ChartFormat | None = None

@@ -68,8 +68,13 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "figures": Format(
         writer="results:export_figures",
-        summary="every figure as PNG or SVG, and the curves of sweeps",
-        options=frozenset({"cell"}),
+        summary="every figure, the plan of the photos and the curves of sweeps, for publication: "
+        "--format pdf, svg or png",
+        options=frozenset({"cell", "figure_format"}),
+    ),
+    "tables": Format(
+        writer="results:export_tables",
+        summary="tables of results as CSV, LaTeX and Markdown, and the citations as BibTeX",
     ),
     "geojson": Format(
         writer="drawings:export_geojson",
@@ -203,6 +208,7 @@ FLAGS: Final = {
     "language": "--language",
     "light": "--light",
     "base_url": "--base-url",
+    "figure_format": "--format",
 }
 
 

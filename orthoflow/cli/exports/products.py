@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from orthoflow.alike import first_few
 from orthoflow.cli.commands import say_error
 from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.products import Product

@@ -48,25 +48,44 @@ def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the figures of all cells and the curves of sweeps, or the figures of one cell."""
+    """Write the figures of all cells, the plan of photos and curves of sweeps, or of one cell."""
     from functools import partial
 
     from orthoflow.records.runs import figure_files, write_files
     from orthoflow.report import write_figures
     from orthoflow.report.curves import curve_files
+    from orthoflow.report.photo_plans import photo_plan
+    from orthoflow.report.pictures import wall_pictures
 
+    suffix = chosen.figure_format or "svg"
     addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
     # Refused before a folder is made for them.
     n_figures = len(figure_files(run, addresses))
     make_empty(folder)
-    n_written = write_figures(run, folder, addresses)
+    n_written = write_figures(run, folder, addresses, as_pdf=suffix == "pdf")
     left_out = ""
     if n_written < n_figures:
         left_out = f"; {n_figures - n_written} left out, damaged or more than a drawing"
-    curves = curve_files(run) if chosen.cell is None else {}
-    write_files(folder, {f"curves/{name}": partial(bytes, data) for name, data in curves.items()})
+    curves = curve_files(run, suffix) if chosen.cell is None else {}
+    charts = {f"curves/{name}": data for name, data in curves.items()}
+    plan = photo_plan(run, list(wall_pictures(run))) if chosen.cell is None else None
+    if plan is not None:
+        charts[f"photos_and_walls.{suffix}"] = plan.file(suffix)
+    write_files(folder, {name: partial(bytes, data) for name, data in charts.items()})
     drawn = f", {counted(len(curves), 'curve')}" if curves else ""
+    drawn += ", the plan of photos" if plan is not None else ""
     return f"{counted(n_written, 'figure')}{drawn} and the graph{left_out}"
+
+
+def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
+    """Write tables and citations as a paper takes them."""
+    from orthoflow.report.paper_tables import paper_files
+
+    files = paper_files(run)
+    make_empty(folder)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+    return ", ".join(files)
 
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:

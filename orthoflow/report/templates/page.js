@@ -600,10 +600,10 @@
   });
   addEventListener("afterprint", () => { for (const [image, was] of onScreen) image.src = was; });
 
-  // On paper nothing can be unfolded: limits, figures, metrics and parameters of what the page itself shows are.
+  // On paper nothing can be unfolded: results are, other parts only where the reader unfolded them.
   let folded = [];
   addEventListener("beforeprint", () => {
-    folded = [...document.querySelectorAll(":is(details.group, details.numbers, .warnings details):not([open])")]
+    folded = [...document.querySelectorAll(":is(details.paper, .warnings details):not([open])")]
       .filter((group) => !group.closest(".way"));
     for (const group of folded) group.open = true;
   });

@@ -24,7 +24,15 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import (
+    Determinism,
+    DiagnosticSpec,
+    Method,
+    MethodParams,
+    MetricSpec,
+    Ports,
+    StepContext,
+)
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     CAPPED,
@@ -44,7 +52,7 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
 )
-from orthoflow_plugins.inspect.missed_points import missed_points, said_of_missed, with_reasons
+from orthoflow_plugins.inspect.missed_points import missed_points, ways_to_count, with_reasons
 from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
@@ -52,6 +60,21 @@ from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPo
 
 # Points whose residuals stand in the log.
 _TOLD: Final = 200
+MISSED: Final = DiagnosticSpec(
+    code="check-points-missed",
+    severity="warning",
+    text="{n_missed} of {n_points} check points count nowhere: {reasons}",
+    remedy="{ways}",
+    rank_by="n_missed",
+)
+CAPPED_RULE: Final = DiagnosticSpec(
+    code="outlier-rule-capped",
+    severity="warning",
+    text="the iterated rule for outliers ends at its cap, a quarter of the points ({numbers}), "
+    "though more lie beyond twice the RMS of the rest: the residuals are of two kinds, which the "
+    "rule cannot separate",
+    remedy="compare n_outliers_once",
+)
 
 
 class InspectCheckpoints(Method):
@@ -151,11 +174,17 @@ class InspectCheckpoints(Method):
                 "or check that scan and points have one unit and one coordinate system "
                 "(inspect.checkpoints)"
             )
-        for doubt in doubts(points, inputs.checkpoints, pictures):
-            ctx.warn(doubt)
+        for doubt, name, values in doubts(points, inputs.checkpoints, pictures):
+            ctx.report(doubt, subject=name, **values)
         # In a simulated room points are hidden on purpose.
         if missed and not is_simulated:
-            ctx.warn(said_of_missed(missed, len(points)))
+            ctx.report(
+                MISSED,
+                n_missed=len(missed),
+                n_points=len(points),
+                reasons=with_reasons(missed),
+                ways=ways_to_count(missed),
+            )
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}
         shift_m = np.array(
@@ -295,11 +324,7 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
     capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)
-        ctx.warn(
-            f"the iterated rule for outliers ends at its cap, a quarter of the points ({numbers}), "
-            f"though more lie beyond twice the RMS of the rest: the residuals are of two kinds, "
-            f"which the rule cannot part; compare n_outliers_once"
-        )
+        ctx.report(CAPPED_RULE, numbers=numbers)
 
 
 def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:

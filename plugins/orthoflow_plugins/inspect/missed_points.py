@@ -59,17 +59,12 @@ def with_reasons(missed: Mapping[str, str]) -> str:
     return f"{', '.join(named)}{more}"
 
 
-def said_of_missed(missed: Mapping[str, str], n_points: int) -> str:
-    """Say in one sentence which of the points count nowhere; empty where all do."""
-    if not missed:
-        return ""
+def ways_to_count(missed: Mapping[str, str]) -> str:
+    """Return what would let points count that count nowhere."""
     ways = ["measure them in an orthoimage"]
     if any(_BESIDE.search(reason) for reason in missed.values()):
-        ways.append("let margin_m of raster.grid make walls larger")
-    return (
-        f"{len(missed)} of {n_points} check points count nowhere: {with_reasons(missed)}; "
-        f"{', or '.join(ways)}"
-    )
+        ways.append("let {step[raster.grid]}.margin_m make walls larger")
+    return ", or ".join(ways)
 
 
 def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -> tuple[float, str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, angle_between_deg
 from orthoflow.products import Finding, Inspection, Planes, PointLabels, Truth
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
@@ -20,6 +20,12 @@ _FOUND_OFFSET_M: Final = 0.015
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
 _LABEL_SCORES: Final = ("precision", "recall", "f1", "iou")
+MAIN_MISSED: Final = DiagnosticSpec(
+    code="main-wall-missed",
+    severity="error",
+    text="the main wall of the scene is none of the {n_planes} planes that were found within "
+    "{angle_deg:g} deg and {offset_m:g} m: errors of planes are reported without it",
+)
 
 
 def inspect_planes(
@@ -44,10 +50,11 @@ def inspect_planes(
     if main is not None:
         findings += _plane_findings(main, 0)
     else:
-        ctx.warn(
-            f"the main wall of the scene is none of the {len(planes)} planes that were found "
-            f"within {_FOUND_ANGLE_DEG:g} deg and {_FOUND_OFFSET_M:g} m: "
-            "errors of planes are told without it"
+        ctx.report(
+            MAIN_MISSED,
+            n_planes=len(planes),
+            angle_deg=_FOUND_ANGLE_DEG,
+            offset_m=_FOUND_OFFSET_M,
         )
     seen = [distance for distance in nearest if distance is not None]
     if seen:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.products import CheckPoints
+from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
+# A spec, what it is about, and its values.
+Doubt: TypeAlias = tuple[DiagnosticSpec, str, dict[str, Any]]
 # An orthoimage is off by cells, not by tens of them.
 _OFF_CELLS: Final = 20.0
 # Another cell size, and not what a photo's pose or a scan's scale can be wrong by.
@@ -22,6 +25,36 @@ _ALIKE_LEAST: Final = 3
 _ANY_CELLS: Final = (
     "measure them in this orthoimage, or give what holds for any cell size: shown_x,shown_y,"
     "shown_z as the report saves them, or map_x,map_y of a map"
+)
+OWN_POINTS: Final = DiagnosticSpec(
+    code="check-points-of-the-image",
+    severity="warning",
+    text="x, y, z of {n} of {n_points} check points are those of the orthoimage in which they "
+    "were clicked, so that nothing is compared",
+    remedy="put the surveyed ones there",
+    rank_by="n",
+)
+FAR_POINTS: Final = DiagnosticSpec(
+    code="check-points-far",
+    severity="warning",
+    text="{n} of {n_points} check points lie farther from their wall than it is long{how_far}",
+    remedy="check `unit` of read.checkpoints, and that points and scan have one coordinate system",
+    rank_by="n",
+)
+OTHER_CELLS: Final = DiagnosticSpec(
+    code="check-points-of-other-cells",
+    severity="warning",
+    text="{subject}: its {n_points} check points were measured on cells of about {measured_m:.3g} "
+    "m, but its own are {gsd_m:.3g} m",
+    remedy="{any_cells}",
+)
+SHIFTED_POINTS: Final = DiagnosticSpec(
+    code="check-points-shifted",
+    severity="warning",
+    text="{subject}: all of its {n_points} check points are shown {right_m:+.4g} m right and "
+    "{down_m:+.4g} m down of the survey: was the raster cut or placed otherwise where they were "
+    "measured?",
+    remedy="{any_cells}",
 )
 
 
@@ -34,8 +67,8 @@ def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
 
 def doubts(
     points: Sequence[ShownPoint], surveyed: CheckPoints, pictures: Sequence[Picture]
-) -> Iterator[str]:
-    """Say in words what of the check points can hardly be meant.
+) -> Iterator[Doubt]:
+    """Return diagnostics of what about the check points can hardly be meant.
 
     Args:
         points: where each is expected and shown.
@@ -43,20 +76,13 @@ def doubts(
         pictures: what they are shown in.
     """
     if n_own := int(np.count_nonzero(is_own(surveyed))):
-        yield (
-            f"x, y, z of {n_own} of {len(points)} check points are those of the orthoimage in "
-            "which they were clicked, so that nothing is compared: put the surveyed ones there"
-        )
+        yield OWN_POINTS, "", {"n": n_own, "n_points": len(points)}
     by_wall = {picture.wall: picture for picture in pictures}
     beyond_m = np.array([_beyond_m(point, by_wall.get(point.wall)) for point in points])
     if n_far := np.count_nonzero(beyond_m > 0.0):
         farthest_m = float(beyond_m.max())
         how_far = f", up to {farthest_m:.4g} m" if np.isfinite(farthest_m) else ""
-        yield (
-            f"{n_far} of {len(points)} check points lie farther from their wall than it is long"
-            f"{how_far}: check `unit` of read.checkpoints, and that points and scan have one "
-            "coordinate system"
-        )
+        yield FAR_POINTS, "", {"n": n_far, "n_points": len(points), "how_far": how_far}
     for picture in pictures:
         mine = [
             point
@@ -76,7 +102,7 @@ def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
     return off_m if off_m > frame.gsd_m * size.max() else 0.0
 
 
-def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[str]:
+def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[Doubt]:
     """Measured places that are off by another cell size, or all alike."""
     if len(points) < 2:
         return
@@ -88,17 +114,12 @@ def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterato
     scale = 1.0 + float((aside * shift).sum() / max(float((aside**2).sum()), 1e-12))
     gsd_m, name = picture.frame.gsd_m, picture.image.name
     if scale > 0.0 and abs(scale - 1.0) > _SCALE_OFF:
-        yield (
-            f"{name}: its {len(points)} check points were measured on cells of about "
-            f"{gsd_m / scale:.3g} m, but its own are {gsd_m:.3g} m: {_ANY_CELLS}"
-        )
+        cells = {"measured_m": gsd_m / scale, "gsd_m": gsd_m, "any_cells": _ANY_CELLS}
+        yield OTHER_CELLS, name, {"n_points": len(points), **cells}
         return
     alike = shift.mean(axis=0)
     of_all = float(np.linalg.norm(alike)) / rms(np.linalg.norm(shift, axis=1))
     if len(points) >= _ALIKE_LEAST and of_all > _ALIKE_SHARE:
         right_m, down_m = gsd_m * alike
-        yield (
-            f"{name}: all of its {len(points)} check points are shown {right_m:+.4g} m right and "
-            f"{down_m:+.4g} m down of the survey: was the raster cut or laid otherwise where they "
-            f"were measured? {_ANY_CELLS}"
-        )
+        where = {"right_m": right_m, "down_m": down_m, "any_cells": _ANY_CELLS}
+        yield SHIFTED_POINTS, name, {"n_points": len(points), **where}

@@ -19,7 +19,15 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import (
+    Determinism,
+    DiagnosticSpec,
+    Method,
+    MethodParams,
+    MetricSpec,
+    Ports,
+    StepContext,
+)
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
@@ -44,6 +52,11 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
+UNFIT: Final = DiagnosticSpec(
+    code="surf-not-inspected",
+    severity="warning",
+    text="not inspected: {reason}",
+)
 
 
 class InspectSurf(Method):
@@ -144,7 +157,7 @@ class InspectSurf(Method):
         if reason is not None:
             if params.unfit == "refuse":
                 raise MethodError(f"{reason} (inspect.surf; `unfit: warn` goes on without)")
-            ctx.warn(f"not inspected: {reason}")
+            ctx.report(UNFIT, reason=reason)
         findings = [finding for item in fit for finding in item.findings()]
         if fit:
             findings += _together(fit)

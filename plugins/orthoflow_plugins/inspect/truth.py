@@ -25,7 +25,15 @@ from orthoflow.products import (
     Truth,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import (
+    Determinism,
+    DiagnosticSpec,
+    Method,
+    MethodParams,
+    MetricSpec,
+    Ports,
+    StepContext,
+)
 from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
@@ -165,6 +173,20 @@ _OF_PLANES: Final = (
         "plane_offset_mm", label="position of the main plane, error", better="lower", headline=True
     ),
     MetricSpec("plane_corner_max_mm", label="largest error of the main plane at its corners"),
+)
+NOT_COMPARED: Final = DiagnosticSpec(
+    code="truth-not-compared",
+    severity="warning",
+    text="not compared with the truth: {dropped}, for want of {missing}; only the planes and "
+    "their labels are",
+    remedy="wire {missing} to {step}",
+)
+NOT_TRACED: Final = DiagnosticSpec(
+    code="truth-not-traced",
+    severity="warning",
+    text="displacements are not traced where {n} sources painted ({names}): the cameras have no "
+    "oriented photo of that name",
+    rank_by="n",
 )
 
 
@@ -447,10 +469,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
     dropped = [name for name in given if getattr(inputs, name) is not None]
     if dropped:
         missing = [name for name in given[:2] if name not in dropped]
-        ctx.warn(
-            f"not compared with the truth: {' and '.join(dropped)}, for want of "
-            f"{' and '.join(missing)}; only the planes and their labels are"
-        )
+        ctx.report(NOT_COMPARED, dropped=" and ".join(dropped), missing=" and ".join(missing))
     return inspect_planes(inputs.planes, inputs.labels, inputs.truth, ctx)
 
 
@@ -462,10 +481,7 @@ def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepCon
     unknown = dict.fromkeys(name for image in images.images for name in image.sources)
     names = [name for name in unknown if name not in known]
     if names:
-        ctx.warn(
-            f"displacements are not traced where {', '.join(names)} painted: the cameras have no "
-            f"oriented photo of that name"
-        )
+        ctx.report(NOT_TRACED, n=len(names), names=", ".join(names))
 
 
 def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.paper import (
     footprints,
@@ -31,6 +31,12 @@ if TYPE_CHECKING:
 
 # Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
 _POINTS_LEAST = 6
+NOTHING_AGREES: Final = DiagnosticSpec(
+    code="photo-without-matches",
+    severity="warning",
+    text="photo {subject}: nothing on the walls agrees with it at its pose",
+    remedy="check its pose, or leave it out",
+)
 
 
 class MatchGuided(Method):
@@ -194,7 +200,7 @@ def _traced(
         traces[name] = found
         ctx.progress(len(traces) / (len(indices) + 1), name)
         if not any(len(piece) for piece in found.pieces):
-            ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
+            ctx.report(NOTHING_AGREES, subject=name)
     if not params.finds_missing or len(indices) == len(photos):
         return traces
     recovered = recovered_traces(inputs.photos, oriented, desk, list(traces.values()))

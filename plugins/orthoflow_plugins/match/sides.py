@@ -24,7 +24,7 @@ from orthoflow.products import (
     SurfaceMask,
     Wall,
 )
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pairing import (
@@ -49,6 +49,14 @@ _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _CELLS_MOST: Final = 4_000_000
 _POINTS_LEAST: Final = 3
+SIDES_GUESSED: Final = DiagnosticSpec(
+    code="plane-sides-guessed",
+    severity="warning",
+    text="neither stations nor photos say from which side {n} of {n_planes} planes were seen "
+    "({planes}); the side with more of the other points was taken",
+    remedy="if an image comes out mirrored, set view_from of read.scan",
+    rank_by="n",
+)
 
 
 class FaceByPhotos(Method):
@@ -188,11 +196,7 @@ def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepCon
     named = sources or [planes.side_source(index) for index in range(len(planes))]
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:
-        ctx.warn(
-            f"neither stations nor photos say from which side {len(guessed)} of {len(planes)} "
-            f"planes were seen ({', '.join(guessed)}); the side with more of the other points was "
-            "taken: if an image comes out mirrored, set view_from of read.scan"
-        )
+        ctx.report(SIDES_GUESSED, n=len(guessed), n_planes=len(planes), planes=", ".join(guessed))
 
 
 def _is_asked(planes: Planes, index: int) -> bool:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import Method, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pairing import (
@@ -41,6 +41,31 @@ from orthoflow_plugins.match.ties import (
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.placing import Placed
+
+BY_EDGES: Final = DiagnosticSpec(
+    code="photo-placed-by-edges",
+    severity="warning",
+    text="photo {subject}: placed by where edges run alone; where patterns repeat, that can be a "
+    "wrong place",
+    remedy="look at its overlay",
+)
+MIRRORED: Final = DiagnosticSpec(
+    code="photo-mirrored",
+    severity="warning",
+    text="photo {subject}: the walls show it mirrored, so it gets no ties",
+    remedy="turn it back",
+)
+AMBIGUOUS: Final = DiagnosticSpec(
+    code="photo-ambiguous",
+    severity="warning",
+    text="photo {subject}: its mirror image agrees with the walls no worse than it does, so it "
+    "gets no ties: it shows a pattern that repeats, another wall, or is mirrored",
+)
+NO_WALL: Final = DiagnosticSpec(
+    code="photo-shows-no-wall",
+    severity="warning",
+    text="photo {subject}: no wall is recognised in it, so it gets no ties",
+)
 
 
 class MatchSift(Method):
@@ -228,10 +253,7 @@ def _placed(
         name = photos.photos[index].name
         if params.structure == "alone":
             placed[index] = found[0]
-            ctx.warn(
-                f"photo {name}: placed by where edges run alone; where patterns repeat, that can "
-                f"be a wrong place: look at its overlay"
-            )
+            ctx.report(BY_EDGES, subject=name)
         else:
             ctx.log(
                 f"photo {name}: where edges run suggests a place on "
@@ -285,14 +307,11 @@ def _note(
         }
     shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
     if pairs.is_surely_mirrored:
-        ctx.warn(f"photo {name}: the walls show it mirrored, so it gets no ties: turn it back")
+        ctx.report(MIRRORED, subject=name)
     elif pairs.is_mirrored:
-        ctx.warn(
-            f"photo {name}: its mirror image agrees with the walls no worse than it does, so it "
-            "gets no ties: it shows a pattern that repeats, another wall, or is mirrored"
-        )
+        ctx.report(AMBIGUOUS, subject=name)
     elif not shown:
-        ctx.warn(f"photo {name}: no wall is recognised in it, so it gets no ties")
+        ctx.report(NO_WALL, subject=name)
     return {
         "n_key_points": len(pairs.features),
         "picture": pairs.picture,

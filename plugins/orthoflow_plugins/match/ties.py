@@ -16,6 +16,7 @@ from orthoflow.files.images import used_pixels
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
+from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pictures import points_on_wall, require_intensity
 
@@ -28,6 +29,12 @@ _SIGMA_LEAST_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
 # At an edge of the relief a key point belongs to neither side.
 _SIGMA_MOST_CELLS: Final = 3.0
+BY_HAND_ALONE: Final = DiagnosticSpec(
+    code="scan-without-texture",
+    severity="warning",
+    text="the scan has neither intensity nor colour that a photo could be matched with: only the "
+    "ties measured by hand are used",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,10 +219,7 @@ def ties_by_hand_alone(
     if hand is None or any(wall.intensity is not None for wall in walls.walls):
         require_intensity(walls)
         return None
-    ctx.warn(
-        "the scan has neither intensity nor colour that a photo could be matched with: only the "
-        "ties measured by hand are used"
-    )
+    ctx.report(BY_HAND_ALONE)
     return with_ties_by_hand(ties_of([], photos, walls, {}), hand, walls, ctx)
 
 

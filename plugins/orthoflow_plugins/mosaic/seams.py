@@ -101,6 +101,17 @@ UNCHECKED: Final = DiagnosticSpec(
     remedy="measure points on it in a photo (input ties), or take a photo that shows it beside a "
     "wall with ties",
 )
+EMPTY_IMAGE: Final = DiagnosticSpec(
+    code="orthoimage-empty",
+    severity="error",
+    text="the orthoimage of {subject} is empty: no source shows any of it",
+)
+EMPTY_CELLS: Final = DiagnosticSpec(
+    code="orthoimage-cells-empty",
+    severity="warning",
+    text="the orthoimage of {subject}: {share:.0%} of its cells are empty: {causes}",
+    rank_by="share",
+)
 
 
 class MosaicSeams(Method):
@@ -457,7 +468,7 @@ def _wall(walls: Walls | None, index: int) -> Wall | None:
 
 def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
     if not image.sources:
-        ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
+        ctx.report(EMPTY_IMAGE, subject=image.name)
     else:
         _tell_of_empty(ctx, image, cameras)
         white = 255.0 if image.rgb.dtype == np.uint8 else 65535.0
@@ -485,10 +496,7 @@ def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None)
     causes = "; ".join(
         f"{shares[state]:.0%} {words[state]}" for state in ordered if shares[state] >= _CAUSE_LEAST
     )
-    ctx.warn(
-        f"the orthoimage of {image.name}: {sum(shares.values()):.0%} of its cells are empty: "
-        f"{causes}"
-    )
+    ctx.report(EMPTY_CELLS, subject=image.name, share=sum(shares.values()), causes=causes)
 
 
 def _way_to_a_photo(cameras: Cameras | None) -> str:

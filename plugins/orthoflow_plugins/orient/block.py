@@ -25,7 +25,9 @@ from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values,
 from orthoflow.geometry.resection import whiten
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo
+from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.lenses import Lens
+from orthoflow_plugins.orient.parameters import Note
 from orthoflow_plugins.orient.pose import PLACES_A_SIDE, places_in_photo
 
 # A known point is never exact: an adjustment divides by its variance.
@@ -33,6 +35,15 @@ SIGMA_LEAST_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
+LENS_CONFUSED: Final = DiagnosticSpec(
+    code="lens-correlated-with-pose",
+    severity="warning",
+    text="the {parameter} of the lens of {subject} and the {pose} of its photos correlate by "
+    "{correlation:.3f}",
+    remedy="photos from other sides, some turned by 90 degrees, or a calibration{also} would tell "
+    "them apart",
+    rank_by="correlation",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,9 +262,9 @@ def lens_statistics(block: Block) -> JsonValue:
 
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
-) -> list[str]:
-    """Say where the photos hardly tell a lens from where they were taken."""
-    notes = []
+) -> list[tuple[str, Note]]:
+    """Return where photos hardly tell their lens from their pose, each with the first photo."""
+    notes: list[tuple[str, Note]] = []
     # Lenses of one camera, which nothing says to be one, have each to be told from its own photos.
     shared = ", or intrinsics: shared where one camera took them all at one zoom,"
     also = shared if len(block.lenses) > 1 else ""
@@ -268,12 +279,9 @@ def correlation_notes(
             confused = np.min(rows, axis=0)
             worst = int(confused.argmax())
             if confused[worst] > _CORRELATED:
-                notes.append(
-                    f"the {name} of the lens of {photos[members[0]].name} and the "
-                    f"{_POSE_NAMES[worst]} of its photos correlate by {confused[worst]:.3f}: "
-                    f"photos from other sides, some turned by 90 degrees, or a calibration{also} "
-                    "would tell them apart"
-                )
+                values = {"parameter": name, "pose": _POSE_NAMES[worst], "also": also}
+                note = LENS_CONFUSED, {**values, "correlation": float(confused[worst])}
+                notes.append((photos[members[0]].name, note))
     return notes
 
 

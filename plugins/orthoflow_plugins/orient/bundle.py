@@ -12,7 +12,7 @@ from pydantic import Field
 
 from orthoflow.errors import GeometryError
 from orthoflow.products import JsonValue, Photo, Ties
-from orthoflow.sdk import Method, MetricSpec, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.adjustment import Adjusted, adjust_block, of_another_lens
 from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
@@ -53,6 +53,11 @@ _MIN_OVERLAP: Final = 0.2
 _MAX_PHOTO_POINTS: Final = 1000
 # So shared, a lens is asked of each of its photos whether it can be its own.
 _TESTED: Final = "focal-group"
+NO_BLOCK: Final = DiagnosticSpec(
+    code="bundle-without-result",
+    severity="warning",
+    text="the photos stay as each was oriented by itself: {reason}",
+)
 
 
 class OrientColmapBundle(Method):
@@ -176,7 +181,7 @@ def _adjusted(
                 )
             apart |= others
     except GeometryError as error:
-        ctx.warn(f"the photos stay as each was oriented by itself: {error}")
+        ctx.report(NO_BLOCK, reason=str(error))
         return None
 
 
@@ -203,8 +208,8 @@ def _report_block(
 ) -> dict[str, JsonValue]:
     """Tell of the block as a whole; of its photos, each tells itself."""
     block, covariance = adjusted.block, adjusted.covariance
-    for note in correlation_notes(block, photos, covariance.cofactors):
-        ctx.warn(note)
+    for photo, (note, values) in correlation_notes(block, photos, covariance.cofactors):
+        ctx.report(note, subject=photo, **values)
     ctx.metric("sigma0", covariance.sigma0, "1")
     ctx.metric("redundancy", covariance.redundancy, "1")
     ctx.metric("n_photo_points", adjusted.n_tie_points, "1")

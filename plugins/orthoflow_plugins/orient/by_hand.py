@@ -21,7 +21,9 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import Resection, SeenPoints, adjust, misfit, stated
+from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.lenses import LensPrior, lens_prior
+from orthoflow_plugins.orient.parameters import Note
 from orthoflow_plugins.orient.pose import Estimate, Start, TiedPhoto, undistorted_pixels
 
 TIES_LEAST: Final = 6
@@ -34,6 +36,19 @@ _CONTRADICTION: Final = 1e-3
 _LIMIT: Final = 3.5
 # Adjusted from two starts, one pose comes out twice to far less than that.
 _ONE_POSE_RAD: Final = math.radians(2.0)
+BY_HAND: Final = DiagnosticSpec(
+    code="photo-oriented-by-hand",
+    severity="warning",
+    text="photo {subject}: oriented by ties measured by hand alone",
+)
+HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
+    code="ties-by-hand-contradict",
+    severity="warning",
+    text="photo {subject}: {n} ties measured by hand contradict the others and are left out: "
+    "{places}",
+    remedy="measure them again",
+    rank_by="n",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,10 +96,10 @@ def pose_by_hand(tied: TiedPhoto) -> PoseByHand | str:
     own, camera = seen.take(agreeing), fit.resection.camera
     lens = fit.resection.lens
     n_lost = len(hand) - len(kept)
-    notes = ["oriented by ties measured by hand alone"]
+    notes: list[Note] = [(BY_HAND, {})]
     if n_lost:
         pixels = np.delete(hand.pixels_photo, kept, axis=0)
-        notes.append(f"left out of them, as they contradict the others: {_places(pixels)}")
+        notes.append((HAND_TIES_LEFT_OUT, {"n": n_lost, "places": _places(pixels)}))
     estimate = Estimate(
         resection=_as_stated(fit.resection),
         source=prior.source,

@@ -26,10 +26,11 @@ from orthoflow.geometry.resection import (
     moved_origin,
     predicted_covariances,
 )
-from orthoflow.sdk import Method, MetricSpec, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.parameters import (
     ORIENTATION_METRICS,
+    Note,
     OrientIn,
     OrientOut,
     OrientParams,
@@ -70,6 +71,16 @@ _CONDITION_MOST: Final = 5000.0
 _SIGMA0_MOST: Final = 1.5
 # Points per side of the grid over a photo on which lens models are compared.
 _FRAME: Final = 12
+DLT_MISFIT: Final = DiagnosticSpec(
+    code="dlt-without-distortion",
+    severity="warning",
+    text="photo {subject}: its ties deviate {sigma0:.1f} times as much as they should, and a "
+    "fuller lens model would move its points by {moved_px:.1f} px: its lens has distortion that a "
+    "DLT without that does not describe, worst at the corners; the stated error is {factor:.1f} "
+    "times as large for it",
+    remedy="{step}.distortion=k1k2, or a calibration",
+    rank_by="sigma0",
+)
 
 
 class OrientDlt(Method):
@@ -418,14 +429,9 @@ def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
     return 0.5 * float(np.trace(covariances, axis1=1, axis2=2).mean())
 
 
-def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[str, ...]:
+def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[Note, ...]:
     sigma0 = estimate.resection.sigma0
     if sigma0 <= _SIGMA0_MOST and factor <= _SIGMA0_MOST**2:
         return ()
-    note = (
-        f"its ties deviate {sigma0:.1f} times as much as they should, and a fuller lens model "
-        f"would move its points by {math.sqrt(missing_px2):.1f} px: its lens has distortion "
-        "that a DLT without that does not describe, worst at the corners; the stated error is "
-        f"{math.sqrt(factor):.1f} times as large for it"
-    )
-    return (note,)
+    moved_px, wider = math.sqrt(missing_px2), math.sqrt(factor)
+    return ((DLT_MISFIT, {"sigma0": sigma0, "moved_px": moved_px, "factor": wider}),)

@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
+from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.lenses import UNKNOWN
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import (
+    Note,
+    OrientParams,
+)
 from orthoflow_plugins.orient.pose import Estimate, image_cells
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError, wall_error
 
@@ -29,6 +33,25 @@ _CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _PLACE_PX: Final = 8.0
 _MIN_CHECKS: Final = 5
 _MIN_ON_WALL: Final = 4
+CROWDED: Final = DiagnosticSpec(
+    code="ties-crowded",
+    severity="warning",
+    text="photo {subject}: a quarter of it has {n_most} ties, another {n_least}: more than "
+    "{ratio} times as many",
+)
+SMALL_HULL: Final = DiagnosticSpec(
+    code="control-covers-little",
+    severity="warning",
+    text="photo {subject}: the control points cover {share:.0%} of the part that shows the walls",
+    rank_by="-share",
+)
+FOCAL_ESTIMATED: Final = DiagnosticSpec(
+    code="focal-length-estimated",
+    severity="warning",
+    text="photo {subject}: neither calibration nor EXIF states its focal length, which was "
+    "estimated",
+    remedy="a calibration file makes it more certain",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,21 +201,17 @@ def too_few(n_ties: int) -> str:
     return ""
 
 
-def warnings_for(candidate: Candidate) -> list[str]:
+def warnings_for(candidate: Candidate) -> list[Note]:
     """Say what limits an orientation that is `ok`."""
-    notes = []
+    notes: list[Note] = []
     counts = candidate.quadrant_counts
     if max(counts) > _CROWDED_RATIO * min(counts):
-        notes.append(
-            f"a quarter of the photo has {max(counts)} ties, another {min(counts)}: more than "
-            f"{_CROWDED_RATIO} times as many"
-        )
+        values = {"n_most": max(counts), "n_least": min(counts), "ratio": _CROWDED_RATIO}
+        notes.append((CROWDED, values))
     if candidate.hull_ratio < 1.5 * candidate.params.min_hull_ratio:
-        notes.append(
-            f"the control covers {candidate.hull_ratio:.0%} of the part that shows the walls"
-        )
+        notes.append((SMALL_HULL, {"share": candidate.hull_ratio}))
     if candidate.estimate.source == UNKNOWN:
-        notes.append("neither calibration nor EXIF says its focal length, which was estimated")
+        notes.append((FOCAL_ESTIMATED, {}))
     return notes
 
 

@@ -12,16 +12,30 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.resection import SeenPoints, misfit
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, TieWall, Walls
-from orthoflow.sdk import Method, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
-from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientOut, OrientParams
+from orthoflow_plugins.orient.parameters import (
+    NOT_ORIENTED,
+    ORIENTATION_METRICS,
+    Note,
+    OrientOut,
+    OrientParams,
+)
 from orthoflow_plugins.orient.photos import oriented_by_hand, tied_photo
 from orthoflow_plugins.orient.report import Oriented, hand_over, measure_expected
 
 _SIDE: Final = 15
 # A tie farther off than that does not belong to the pose.
 _DISAGREEING: Final = 3.5
+POSE_DISAGREES: Final = DiagnosticSpec(
+    code="pose-against-ties",
+    severity="warning",
+    text="photo {subject}: {n} of its {n_ties} ties measured by hand disagree with the given "
+    "pose, by up to {longest_px:.1f} px",
+    remedy="measure at least {n_least}, which then orient it, or correct them",
+    rank_by="longest_px",
+)
 
 
 class OrientGiven(Method):
@@ -83,7 +97,7 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
     measure_expected(ctx, cameras)
     for camera in cameras:
         if camera.status != "ok":
-            ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
+            ctx.report(NOT_ORIENTED, subject=camera.photo, status=camera.status)
     return Cameras(cameras=tuple(cameras), details=_said([camera.photo for camera in cameras]))
 
 
@@ -101,7 +115,7 @@ def _oriented(
     if tied.by_hand.sum() >= TIES_LEAST:
         return oriented_by_hand(tied, ties, params)[0]
     residuals_px = np.full((len(tied.chosen), 2), np.nan)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     if camera.status == "ok" and len(tied.seen):
         fit = misfit(tied.seen, camera.viewing())
         residuals_px = fit.residuals_px
@@ -117,17 +131,13 @@ def _oriented(
 
 def _disagreement(
     seen: SeenPoints, normalised: NDArray[np.float64], residuals_px: NDArray[np.float64]
-) -> tuple[str, ...]:
+) -> tuple[Note, ...]:
     off = normalised > _DISAGREEING
     if not off.any():
         return ()
     longest = float(np.nanmax(np.linalg.norm(residuals_px[off], axis=1), initial=0.0))
-    note = (
-        f"{int(off.sum())} of its {len(seen)} ties measured by hand disagree with the given pose, "
-        f"by up to {longest:.1f} px: measure at least {TIES_LEAST}, which then orient it, or "
-        "correct them"
-    )
-    return (note,)
+    values = {"n": int(off.sum()), "n_ties": len(seen), "longest_px": longest}
+    return ((POSE_DISAGREES, {**values, "n_least": TIES_LEAST}),)
 
 
 def _on_walls(ties: Ties, walls: Walls | None) -> Ties:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from collections.abc import Mapping
+from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import Field
 
 from orthoflow.products import Cameras, Photos, Ties
-from orthoflow.sdk import MethodParams, MetricSpec, Ports
+from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
+# What an orientation says of a photo: a spec and its values.
+Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
+NOT_ORIENTED: Final = DiagnosticSpec(
+    code="photo-not-oriented",
+    severity="warning",
+    text="photo {subject} is not oriented: {status}",
+)
 # What every orientation reports of its photos.
 ORIENTATION_METRICS: Final = (
     MetricSpec("n_photos", label="photos"),

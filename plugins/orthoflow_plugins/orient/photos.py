@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.orient.by_hand import TIES_LEAST, PoseByHand, pose_by_hand
 from orthoflow_plugins.orient.gates import (
     GATES_BEFORE_BLOCK,
@@ -22,7 +22,9 @@ from orthoflow_plugins.orient.gates import (
     too_few,
     warnings_for,
 )
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import (
+    OrientParams,
+)
 from orthoflow_plugins.orient.pose import (
     EXIF_OFF_LEAST,
     Estimate,
@@ -51,6 +53,21 @@ _ASKED_OF_LENS: Final = 5
 # So many photos of a camera, which agree up to this factor, say more than the EXIF of another.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
+EXIF_CONTRADICTED: Final = DiagnosticSpec(
+    code="exif-focal-contradicted",
+    severity="warning",
+    text="photos {subject}: EXIF states a focal length of {exif_px:.0f} px, but their ties ask "
+    "for {focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an adapter, "
+    "or a picture that was cut)",
+    remedy="a calibration file settles it",
+)
+EXIF_LEFT_OUT: Final = DiagnosticSpec(
+    code="exif-focal-left-out",
+    severity="warning",
+    text="photo {subject}: its EXIF contradicts the other photos of its camera, so it is oriented "
+    "with their focal length of {focal_px:.0f} px",
+    remedy="a calibration file settles it",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,10 +198,12 @@ def with_believable_priors(
         first = photos[members[0]]
         said_px = first.exif_focal_px or math.nan
         names = f"{first.name} and {len(members) - 1} more" if len(members) > 1 else first.name
-        ctx.warn(
-            f"photos {names}: EXIF says a focal length of {said_px:.0f} px, but their ties ask for "
-            f"{focal_px:.0f} px, a factor of {focal_px / said_px:.2f}: EXIF is not used (digital "
-            "zoom, an adapter, or a picture that was cut)"
+        ctx.report(
+            EXIF_CONTRADICTED,
+            subject=names,
+            exif_px=said_px,
+            focal_px=focal_px,
+            factor=focal_px / said_px,
         )
         for at in members:
             believed[at] = replace(photos[at], exif_focal_px=focal_px)
@@ -237,10 +256,7 @@ def looked_at(
         again = look(replace(tied, photo=replace(tied.photo, exif_focal_px=focal_px)))
         if _focal_px(again):
             found[at] = again
-            ctx.warn(
-                f"photo {tied.photo.name}: its EXIF contradicts the other photos of its camera, "
-                f"so it is oriented with their focal length of {focal_px:.0f} px"
-            )
+            ctx.report(EXIF_LEFT_OUT, subject=tied.photo.name, focal_px=focal_px)
     return found
 
 

@@ -28,7 +28,10 @@ from orthoflow.geometry.resection import (
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Intrinsics, Photo, Ties
 from orthoflow_plugins.orient.lenses import UNKNOWN, focal_sigma, intrinsics_of, lens_prior
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import (
+    Note,
+    OrientParams,
+)
 
 MAX_ROUNDS: Final = 8
 """An adjustment and its rejections take turns at most so often."""
@@ -117,7 +120,7 @@ class Estimate:
     fit: Misfit
     agreeing: NDArray[np.bool_]
     limit: float
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     without_one: tuple[Resection, ...] = ()
 

@@ -21,6 +21,7 @@ from orthoflow_plugins.orient.figures import (
     draw_wall_errors,
 )
 from orthoflow_plugins.orient.gates import Candidate
+from orthoflow_plugins.orient.parameters import NOT_ORIENTED, Note
 from orthoflow_plugins.orient.pose import metres_per_pixel, ties_of_photo
 
 # Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
@@ -88,7 +89,7 @@ class Oriented:
     numbers: PhotoNumbers | None = None
     entry: JsonValue = None
     table: tuple[ResidualRow, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     candidate: Candidate | None = None
 
 
@@ -297,9 +298,9 @@ def _rms(residuals: NDArray[np.float64]) -> float:
 def _warn(ctx: StepContext, oriented: Oriented) -> None:
     camera = oriented.camera
     if camera.status != "ok":
-        ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
-    for note in oriented.notes:
-        ctx.warn(f"photo {camera.photo}: {note}")
+        ctx.report(NOT_ORIENTED, subject=camera.photo, status=camera.status)
+    for note, values in oriented.notes:
+        ctx.report(note, subject=camera.photo, **values)
 
 
 def _measure(ctx: StepContext, found: Sequence[Oriented]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from pydantic import Field
 
 from orthoflow.geometry.bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask
-from orthoflow.sdk import Determinism, Method, MetricSpec, StepContext
+from orthoflow.sdk import Determinism, DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow_plugins.ortho.layers import (
     CellCounts,
     LayerStack,
@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.painting import Painting
     from orthoflow_plugins.ortho.sampling import CellFootprint
     from orthoflow_plugins.ortho.surfaces import Surface
+VISIBILITY_OFF: Final = DiagnosticSpec(
+    code="visibility-not-tested",
+    severity="warning",
+    text="visibility none: cells that a photo cannot see are painted as well",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +130,7 @@ class DsmBackward(Method):
         level = level_of_all([photo for photo, _ in oriented], ctx)
         hides = params.visibility == "full"
         if not hides:
-            ctx.warn("visibility none: cells that a photo cannot see are painted as well")
+            ctx.report(VISIBILITY_OFF)
         surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()

@@ -15,12 +15,18 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, count_known, row_bands
 from orthoflow.geometry.levels import Level
 from orthoflow.products import Layer, LayerMask, Layers, Wall, Walls
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
     "no oriented photo sees a wall: their cameras stand behind the walls, look past them, or "
     "something hides the walls; look at cameras.json and planes.json"
+)
+NO_PHOTO: Final = DiagnosticSpec(
+    code="wall-without-photo",
+    severity="error",
+    text="no photo shows {walls}: the orthoimage stays empty",
+    rank_by="n_walls",
 )
 
 
@@ -149,7 +155,7 @@ def joined_layers(walls: Walls, photos: PaintedPhotos, ctx: StepContext) -> Laye
     bare = [place for place in range(len(walls.walls)) if place not in painted]
     if bare:
         names = ", ".join(walls.walls[place].name for place in bare)
-        ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
+        ctx.report(NO_PHOTO, n_walls=len(bare), walls=names)
     for place in bare:
         reached = [found.mask for found in photos.reached if found.wall == place]
         layers.append(_bare_layer(walls.walls[place], place, reached, level, ctx))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from orthoflow.files.images import before_masks
 from orthoflow.geometry.cameras import ViewingCamera
@@ -14,8 +15,16 @@ from orthoflow.geometry.occluders import (
     occluders_before,
 )
 from orthoflow.products import Photo, PointCloud, Walls
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityParams
+
+NO_CLOUD: Final = DiagnosticSpec(
+    code="occluders-unknown",
+    severity="warning",
+    text="no cloud is wired to {step}: things that stand free before a wall hide nothing, and "
+    "photos paint them onto it",
+    remedy="wire the cloud to {step}",
+)
 
 
 def occluders_of(
@@ -32,10 +41,7 @@ def occluders_of(
         ProductError: the cloud has fewer than three points.
     """
     if inputs.cloud is None:
-        ctx.warn(
-            f"no cloud is wired to {method}: things that stand free before a wall hide nothing, "
-            "and photos paint them onto it"
-        )
+        ctx.report(NO_CLOUD)
         return None
     inputs.cloud.require_points(3)
     return find_occluders(

@@ -15,7 +15,7 @@ from orthoflow.files.images import decode_image, decode_levels
 from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
-from orthoflow.sdk import MethodParams, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, MethodParams, Ports, StepContext
 from orthoflow_plugins.ortho.layers import PaintedPhotos, joined_layers
 
 if TYPE_CHECKING:
@@ -26,6 +26,28 @@ if TYPE_CHECKING:
 _PLAIN_BITS: Final = 8
 # Of the cosine between a photo's top and up, beyond which it was held upright, or turned over.
 _UPRIGHT: Final = 0.5
+UPSIDE_DOWN: Final = DiagnosticSpec(
+    code="photos-upside-down",
+    severity="warning",
+    text="{n_down} of {n_photos} photos are upside down: if the scan's vertical axis points down, "
+    "so do walls, orthoimages and the names of floor and ceiling",
+    remedy="set up of read.scan to {opposite}",
+)
+MIXED_BITS: Final = DiagnosticSpec(
+    code="photos-of-mixed-depth",
+    severity="warning",
+    text="{n} of {n_photos} photos ({names}) have 8 bits per channel, the others 16: the "
+    "orthoimages have 16, levels of 8 bits are taken times 257",
+    rank_by="n",
+)
+MIXED_PROFILES: Final = DiagnosticSpec(
+    code="photos-of-mixed-profiles",
+    severity="warning",
+    text="the photos have {n} different colour profiles, or some have none: the orthoimages get "
+    "none, and colours may step where photos meet",
+    remedy="export all photos with one colour profile",
+    rank_by="n",
+)
 
 
 class PhotosOnWalls(Ports):
@@ -128,11 +150,7 @@ def warn_of_heads(
         return
     axis = int(np.abs(up).argmax())
     opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
-    ctx.warn(
-        f"{n_down} of {len(tops)} photos stand on their heads: if the scan's vertical axis points "
-        f"down, so do walls, orthoimages and the names of floor and ceiling; set up of read.scan "
-        f"to {opposite}"
-    )
+    ctx.report(UPSIDE_DOWN, n_down=n_down, n_photos=len(tops), opposite=opposite)
 
 
 def layers_of_photos(
@@ -157,10 +175,7 @@ def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
     ctx.log("photos have 16 bits per channel, and so have layers and orthoimages")
     if plain:
         names = ", ".join(plain[:3]) + (" ..." if len(plain) > 3 else "")
-        ctx.warn(
-            f"{len(plain)} of {len(photos)} photos ({names}) have 8 bits per channel, the others "
-            "16: the orthoimages have 16, levels of 8 bits are taken times 257"
-        )
+        ctx.report(MIXED_BITS, n=len(plain), n_photos=len(photos), names=names)
     return np.uint16
 
 
@@ -185,8 +200,5 @@ def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:
     """The ICC profile that all photos have; None where they have none, or not the same."""
     profiles = {icc_profile(photo.encoded) for photo in photos}
     if len(profiles) > 1:
-        ctx.warn(
-            f"the photos have {len(profiles)} different colour profiles, or some have none: the "
-            "orthoimages get none, and colours may step where photos meet"
-        )
+        ctx.report(MIXED_PROFILES, n=len(profiles))
     return profiles.pop() if len(profiles) == 1 else None

@@ -51,6 +51,21 @@ SPECKS: Final = DiagnosticSpec(
     "colour are in many files: they paint no pixel",
     remedy="{step}.skip_below_grey=0 paints them, 10 leaves out almost black ones, too",
 )
+NO_COLOUR: Final = DiagnosticSpec(
+    code="cloud-without-colour",
+    severity="warning",
+    text="the cloud has no colours: its intensity is painted as grey",
+)
+BLACK_POINTS: Final = DiagnosticSpec(
+    code="points-black",
+    severity="warning",
+    text="{n_black} points of the cloud ({share:.1%}) are pure black, as points without a colour "
+    "are in many files, and {n_almost} almost; they are painted as they are",
+    remedy="if black specks in the image are none of the wall's, set "
+    "{step}.skip_below_grey={grey} (1 for pure black alone), with which they keep their depth and "
+    "paint no cell",
+    rank_by="share",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +214,7 @@ def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepConte
             "the cloud has neither colours nor intensity, so no orthoimage can be painted from it: "
             "give a coloured scan, or paint the walls from photos"
         )
-    ctx.warn("the cloud has no colours: its intensity is painted as grey")
+    ctx.report(NO_COLOUR)
     n_points = len(cloud)
     grey = np.asarray(ctx.allocate("layers", "grey", (n_points, 1), np.uint8), np.uint8)
     is_left_out: NDArray[np.bool_] | None = None
@@ -251,12 +266,12 @@ def _left_out(
     elif least > 0:
         ctx.report(SPECKS, subject="the cloud", n_points=n_dark, share=n_dark / n_points)
     elif is_worth_words:
-        ctx.warn(
-            f"{n_black} points of the cloud ({n_black / n_points:.1%}) are pure black, as points "
-            f"without a colour are in many files, and {n_almost} almost; they are "
-            "painted as they are: if black specks in the image are none of the wall's, set "
-            f"skip_below_grey to {_ALMOST_BLACK_GREY} (ortho.pointcloud-direct; 1 for pure black "
-            "alone), with which they keep their depth and paint no cell"
+        ctx.report(
+            BLACK_POINTS,
+            n_black=n_black,
+            share=n_black / n_points,
+            n_almost=n_almost,
+            grey=_ALMOST_BLACK_GREY,
         )
     return is_dark
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import Plane, basis_from_up, plane_through, wall_axes
 from orthoflow.products import PointCloud, PointLabels
-from orthoflow.sdk import Method, MethodParams, MetricSpec, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, StepContext
 from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
 
 if TYPE_CHECKING:
@@ -38,6 +38,14 @@ _TOO_FAR: Final = (
     "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
     "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
     "or height_m, or raise buffer_m (plane.given)"
+)
+STRAY_PARTS: Final = DiagnosticSpec(
+    code="points-beside-the-plane",
+    severity="warning",
+    text="{n} points ({share:.2%}) lie beside the rectangle of the plane, in parts that cover "
+    "less than {part_share:.0%} of what all cover",
+    remedy="{step}.part_min_share=0 keeps them",
+    rank_by="share",
 )
 
 
@@ -231,11 +239,8 @@ def _laid(
             raise MethodError(f"{which}: {error}") from error
         laid.append((faced, viewpoint))
         if n_beside > _STRAY_REPORTED * len(cloud):
-            ctx.warn(
-                f"{n_beside} points ({n_beside / len(cloud):.2%}) lie beside the rectangle of the "
-                f"plane, in parts that cover less than {params.part_min_share:.0%} of what all "
-                "cover: part_min_share set to 0 keeps them"
-            )
+            share = n_beside / len(cloud)
+            ctx.report(STRAY_PARTS, n=n_beside, share=share, part_share=params.part_min_share)
     return laid
 
 

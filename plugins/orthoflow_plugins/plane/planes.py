@@ -25,7 +25,7 @@ from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Planes, PointCloud, SideSource, plane_name
 from orthoflow.products.planes import PlaneKind
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.plane.candidates import FoundPlane
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import each_part, piece_of
@@ -57,6 +57,15 @@ _FULL_VOTE_M: Final = 1.0
 _BESIDE_M: Final = 0.3
 # A verdict below this share of all points, each just clear of the plane, is none.
 _DOUBT: Final = 0.01
+SIDES_GUESSED: Final = DiagnosticSpec(
+    code="plane-sides-unknown",
+    severity="warning",
+    text="no scanner station says from which side {n} of {n_planes} planes were seen; the side "
+    "with more of the other points was taken, unless photos decide later (face.photos)",
+    remedy="if an image comes out mirrored, set view_from of read.scan",
+    rank_by="n",
+    settled_by=("face.photos",),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,11 +307,7 @@ def report_planes(
     ctx.metric("phi_deg", phi_deg, "deg")
     ctx.metric("offset_m", float(planes.offset[0]), "m")
     if n_guessed:
-        ctx.warn(
-            f"no scanner station says from which side {n_guessed} of {len(planes)} planes were "
-            "seen; the side with more of the other points was taken, unless photos decide later "
-            "(face.photos): if an image comes out mirrored, set view_from of read.scan"
-        )
+        ctx.report(SIDES_GUESSED, n=n_guessed, n_planes=len(planes))
 
 
 def plane_names(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 
 # Places are squares of this side: many points of each scan, and still one colour mostly.
 _PLACE_M: Final = 0.05
@@ -31,6 +31,11 @@ _DARKEST: Final = 1.0e-4
 _ROUNDS: Final = 20
 _FLOOR: Final = 0.01
 _CHUNK: Final = 1 << 21
+NOT_BALANCED: Final = DiagnosticSpec(
+    code="intensity-not-balanced",
+    severity="warning",
+    text="intensities stay as they are: {reason}",
+)
 
 
 @dataclass(frozen=True)
@@ -55,14 +60,14 @@ def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointClo
     no two scans overlap the cloud stays as it is, and that is said.
     """
     if cloud.intensity is None or cloud.scan is None or cloud.stations is None:
-        ctx.warn("intensities stay as they are: balancing takes scans with known stations")
+        ctx.report(NOT_BALANCED, reason="balancing takes scans with known stations")
         return cloud
     samples = [_places(cloud, slab) for slab in slabs]
     table = np.vstack(samples)
     n_scans = len(cloud.stations)
     trend = _trend(table, n_scans)
     if trend is None:
-        ctx.warn("intensities stay as they are: no two scans overlap on the walls")
+        ctx.report(NOT_BALANCED, reason="no two scans overlap on the walls")
         return cloud
     ctx.metric("intensity_range_power", trend.range_power, "1")
     ctx.metric("intensity_cosine_power", trend.cosine_power, "1")

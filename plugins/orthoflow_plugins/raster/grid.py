@@ -15,7 +15,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
 from orthoflow_plugins.raster.crops import (
@@ -59,6 +59,26 @@ ExtentOf = Callable[[int], Extent]
 _FAR_M: Final = 1.0
 # So much of a wall is missed on a drawing.
 _LARGE_CUT_M: Final = 0.05
+NEAR_RELIEF: Final = DiagnosticSpec(
+    code="near-takes-relief",
+    severity="warning",
+    text="near takes {subject}, which is relief of {wall}",
+    remedy="where that wall is meant, set {step}.ranks=[{index}] and leave near out "
+    "({step}.skip_covered=false states that the relief is)",
+)
+NEAR_FAR: Final = DiagnosticSpec(
+    code="near-is-far",
+    severity="warning",
+    text="near {place}: the nearest wall, {subject}, is {apart_m:.2f} m away",
+    remedy="check the point, its unit and the planes",
+    rank_by="apart_m",
+)
+CROP_OF_SEVERAL: Final = DiagnosticSpec(
+    code="crop-of-several-walls",
+    severity="warning",
+    text="crop cuts the same part out of {n_walls} walls",
+    remedy="choose one with {step}.near or {step}.ranks",
+)
 
 
 class RasterGrid(Method):
@@ -372,11 +392,8 @@ def _crops(
     covered = covered_planes(planes, choice, chosen)
     warn_of_covered(ctx, planes.names, covered)
     for index, wall in chosen_relief(planes, choice, chosen).items():
-        ctx.warn(
-            f"near takes {planes.names[index]}, which is relief of {planes.names[wall]}: where "
-            f"that wall is meant, set ranks to [{wall}] and leave near out (skip_covered: false "
-            "says that the relief is)"
-        )
+        names = planes.names
+        ctx.report(NEAR_RELIEF, subject=names[index], wall=names[wall], index=wall)
     frames = {
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen
@@ -391,10 +408,8 @@ def _crops(
         apart_m = distance_m(planes, index, np.array(place))
         ctx.log(f"near {list(place)}: {planes.names[index]}, {apart_m:.3f} m away")
         if apart_m > _FAR_M:
-            ctx.warn(
-                f"near {list(place)}: the nearest wall, {planes.names[index]}, is {apart_m:.2f} m "
-                "away: check the point, its unit and the planes"
-            )
+            name = planes.names[index]
+            ctx.report(NEAR_FAR, subject=name, place=str(list(place)), apart_m=apart_m)
     if params.crop is None:
         return {index: CroppedFrame(frame=frame) for index, frame in frames.items()}, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
@@ -407,9 +422,7 @@ def _crops(
             f"{frame.height * frame.gsd_m:.3f} m high"
         )
     if len(frames) > 1:
-        ctx.warn(
-            f"crop cuts the same part out of {len(frames)} walls; choose one with near or ranks"
-        )
+        ctx.report(CROP_OF_SEVERAL, n_walls=len(frames))
     return crops, covered
 
 

@@ -13,11 +13,25 @@ from orthoflow.errors import InputError, MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
 from orthoflow.products import Planes
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
 # A tilted raster may show a point so far from its place in the map.
 _OFF_CELLS_MOST: Final = 0.5
+TILTED: Final = DiagnosticSpec(
+    code="map-of-a-tilted-plane",
+    severity="warning",
+    text="{subject} is tilted by {tilt_deg:.2g} deg, which would shift points by up to "
+    "{off_mm:.2g} mm in a map: its raster stays in its plane",
+    remedy="use plane.given with horizontal, or a smaller buffer",
+    rank_by="off_mm",
+)
+NO_MAP: Final = DiagnosticSpec(
+    code="map-without-a-level-plane",
+    severity="warning",
+    text="crs {crs} places no raster: none of the planes is level and seen from above",
+    remedy="leave {step}.crs out, or raster a floor",
+)
 
 
 def mapped(
@@ -56,13 +70,10 @@ def mapped(
         if off_m <= _OFF_CELLS_MOST * frame.gsd_m:
             placed[index] = replace(_centred(frame, planes, index), map_crs=crs)
             continue
-        ctx.warn(
-            f"{planes.names[index]} is tilted by {math.degrees(tilt_rad):.2g} deg, which would "
-            f"shift points by up to {1e3 * off_m:.2g} mm in a map: its raster stays in its plane; "
-            "use plane.given with horizontal, or a smaller buffer"
-        )
+        name = planes.names[index]
+        ctx.report(TILTED, subject=name, tilt_deg=math.degrees(tilt_rad), off_mm=1e3 * off_m)
     if not any(frame.map_crs for frame in placed.values()):
-        ctx.warn(f"crs {crs} places no raster: none of the planes is level and seen from above")
+        ctx.report(NO_MAP, crs=crs)
     return placed
 
 

@@ -94,6 +94,37 @@ COVERED: Final = DiagnosticSpec(
     text="{subject} shows {included} as its relief, so these have no orthoimage of their own",
     remedy="{step}.skip_covered=false makes one of each",
 )
+NO_INTENSITY: Final = DiagnosticSpec(
+    code="scan-without-intensity",
+    severity="warning",
+    text="the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in",
+)
+DEPTH_ONLY: Final = DiagnosticSpec(
+    code="scan-without-intensity-and-colour",
+    severity="warning",
+    text="the cloud has neither intensity nor colour; only the depth of walls is rastered",
+)
+NO_POINT: Final = DiagnosticSpec(
+    code="wall-without-points",
+    severity="error",
+    text="{subject}: no point lies within its buffer",
+    remedy="check {step}.buffer_front_m and {step}.buffer_behind_m",
+)
+CLOSE_CELLS: Final = DiagnosticSpec(
+    code="cells-finer-than-points",
+    severity="warning",
+    text="{subject}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
+    "{measured:.0%} of the cells have a point, {interpolated:.0%} are interpolated{empty}",
+    remedy="{remedy}",
+    rank_by="interpolated",
+)
+WIDE_GAPS: Final = DiagnosticSpec(
+    code="surface-with-wide-gaps",
+    severity="warning",
+    text="{subject}: surface tin spans no gap wider than about {n_cells} cells ({gap_m:.3g} m) "
+    "where more than {n_most} cells of a wall have points, here {n_measured}",
+    remedy="raise {step}.gsd_m to close wider ones",
+)
 _CAUSES: Final = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
@@ -108,13 +139,13 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
     """Tell what limits the walls: what the cloud lacks, and cells finer than its points."""
     if intensity_source == "luminance":
-        ctx.warn("the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in")
+        ctx.report(NO_INTENSITY)
     if intensity_source == "none":
-        ctx.warn("the cloud has neither intensity nor colour; only the depth of walls is rastered")
+        ctx.report(DEPTH_ONLY)
     for raster in rasters:
         wall, gsd_m = raster.wall, raster.wall.frame.gsd_m
         if not wall.count.any():
-            ctx.warn(f"{wall.name}: no point lies within its buffer")
+            ctx.report(NO_POINT, subject=wall.name)
             continue
         step_m = raster.scan_step_m
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
@@ -125,15 +156,17 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
             finer = (
                 "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
             )
-            ctx.warn(
-                f"{wall.name}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
-                f"{measured:.0%} of the cells have a point, {filled:.0%} are interpolated"
-                + (f", {empty:.0%} are empty" if empty >= _SHARE_WORTH_WORDS else "")
-                + (
-                    f" (gsd_m = {_least_gsd_m(step_m):g} m or more leaves fewer)"
-                    if is_close
-                    else ""
-                )
+            larger = f"{{step}}.gsd_m={_least_gsd_m(step_m):g} or more leaves fewer"
+            ctx.report(
+                CLOSE_CELLS,
+                subject=wall.name,
+                gsd_m=gsd_m,
+                finer=finer,
+                step_m=step_m,
+                measured=measured,
+                interpolated=filled,
+                empty=f", {empty:.0%} are empty" if empty >= _SHARE_WORTH_WORDS else "",
+                remedy=larger if is_close else "",
             )
 
 
@@ -207,10 +240,13 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
         n_measured = int(np.count_nonzero(wall.count))
         n_void = count_cells(wall.mask, SurfaceMask.VOID)
         if n_measured > VERTICES_MOST and n_void >= _VOID_WORTH_WORDS * wall.mask.size:
-            ctx.warn(
-                f"{wall.name}: surface tin spans no gap wider than about {SPAN_MOST_CELLS} cells "
-                f"({SPAN_MOST_CELLS * wall.frame.gsd_m:.3g} m) where more than {VERTICES_MOST} "
-                f"cells of a wall have points, here {n_measured}: raise gsd_m to close wider ones"
+            ctx.report(
+                WIDE_GAPS,
+                subject=wall.name,
+                n_cells=SPAN_MOST_CELLS,
+                gap_m=SPAN_MOST_CELLS * wall.frame.gsd_m,
+                n_most=VERTICES_MOST,
+                n_measured=n_measured,
             )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 from pydantic import Field
@@ -17,11 +17,22 @@ from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reas
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.scan import Unit
 
 _NAMED = 3
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
+LIMITED: Final = DiagnosticSpec(
+    code="cameras-limited",
+    severity="warning",
+    text="{note} ({n} photos, such as {subject})",
+    rank_by="n",
+)
+NOT_ORIENTED: Final = DiagnosticSpec(
+    code="photo-not-oriented",
+    severity="warning",
+    text="photo {subject} is not oriented: {status}",
+)
 
 
 class ReadCameras(Method):
@@ -105,10 +116,10 @@ class ReadCameras(Method):
                 "; without these files, photos are oriented by matching with the scan"
             )
         for note, of_photos in notes.items():
-            ctx.warn(f"{note} ({len(of_photos)} photos, such as {of_photos[0]})")
+            ctx.report(LIMITED, subject=of_photos[0], note=note, n=len(of_photos))
         for camera in cameras:
             if camera.status != "ok":
-                ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
+                ctx.report(NOT_ORIENTED, subject=camera.photo, status=camera.status)
         ctx.metric("n_photos", len(photos), "1")
         ctx.metric("n_oriented", n_oriented, "1")
         ctx.metric("n_refused", len(photos) - n_oriented, "1")

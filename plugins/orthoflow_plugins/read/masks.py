@@ -13,11 +13,24 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.images import PHOTO_SUFFIXES, decode_mask, encode_png
 from orthoflow.files.polygons import NamedPolygon, filled, read_polygons
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _ENDING: Final = "_mask"
 _POLYGONS: Final = (".geojson", ".json")
 _NAMED: Final = 3
+UNUSED: Final = DiagnosticSpec(
+    code="masks-of-no-photo",
+    severity="warning",
+    text="masks of no photo: {names}",
+    remedy="photos are found by their names",
+    rank_by="n",
+)
+NO_MASKS: Final = DiagnosticSpec(
+    code="files-are-no-masks",
+    severity="warning",
+    text="left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
+    rank_by="n",
+)
 
 
 class Masks:
@@ -96,12 +109,9 @@ class Masks:
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
         if unused:
-            ctx.warn(f"masks of no photo: {_named(unused)}; photos are found by their names")
+            ctx.report(UNUSED, n=len(unused), names=_named(unused))
         if self._others:
-            ctx.warn(
-                f"left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): "
-                f"{_named(self._others)}"
-            )
+            ctx.report(NO_MASKS, n=len(self._others), names=_named(self._others))
 
     def _picture(self, path: Path, photo: str, size: tuple[int, int]) -> NDArray[np.bool_]:
         self._taken.add(path.name)

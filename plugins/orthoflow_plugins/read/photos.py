@@ -54,7 +54,7 @@ from orthoflow.files.photo_files import (
 )
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
-from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.cameras import GivenByName
 from orthoflow_plugins.read.figures import ContactSheet
 from orthoflow_plugins.read.masks import Masks, beside_photos
@@ -62,6 +62,53 @@ from orthoflow_plugins.read.masks import Masks, beside_photos
 _PLAIN_BITS: Final = 8
 _NAMED: Final = 3
 _MOST_PROBLEMS: Final = 20
+NO_PHOTOS: Final = DiagnosticSpec(
+    code="files-are-no-photos",
+    severity="warning",
+    text="{n} of {n_files} files of the input {subject} are no photos (JPEG, PNG, TIFF, WebP, "
+    "HEIC) and were left out: {names}",
+    rank_by="n",
+)
+EXIF_DAMAGED: Final = DiagnosticSpec(
+    code="exif-damaged",
+    severity="warning",
+    text="the EXIF data of {photos} are damaged; what is readable was taken",
+    rank_by="n",
+)
+REMARK: Final = DiagnosticSpec(
+    code="photo-file-limited",
+    severity="warning",
+    text="{photos}: {remark}",
+    rank_by="n",
+)
+EXIF_IMPOSSIBLE: Final = DiagnosticSpec(
+    code="exif-impossible",
+    severity="warning",
+    text="{photos}: {doubt}: it is not used",
+    rank_by="n",
+)
+FOCAL_UNKNOWN: Final = DiagnosticSpec(
+    code="focal-length-unknown",
+    severity="warning",
+    text="the focal length of {photos} is unknown ({reason}, and no calibration): the orientation "
+    "has to find it, needs more ties for that and may refuse",
+    remedy="a calibration file helps",
+    rank_by="n",
+)
+NOT_CALIBRATED: Final = DiagnosticSpec(
+    code="calibration-without-photo",
+    severity="warning",
+    text="the calibration has no entry for {photos}; the others are calibrated",
+    remedy="add an entry",
+    rank_by="n",
+)
+UNUSED_ENTRIES: Final = DiagnosticSpec(
+    code="calibration-entries-unused",
+    severity="warning",
+    text="calibration entries that no photo takes: {names}",
+    remedy="the case of letters counts, and the first entry that matches holds",
+    rank_by="n",
+)
 
 
 class ReadPhotos(Method):
@@ -351,10 +398,8 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
             f"{_names(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
         )
     if others:
-        ctx.warn(
-            f"{len(others)} of {len(files.paths)} files of the input {files.name} are no photos "
-            f"(JPEG, PNG, TIFF, WebP, HEIC) and were left out: {_names(others)}"
-        )
+        counts = {"n": len(others), "n_files": len(files.paths)}
+        ctx.report(NO_PHOTOS, subject=files.name, names=_names(others), **counts)
     return sorted(_by_their_paths(sources), key=lambda source: source.name)
 
 
@@ -519,13 +564,14 @@ def _warn(
 ) -> None:
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
-        ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")
+        ctx.report(EXIF_DAMAGED, n=len(damaged), photos=_counted(damaged))
     for remark in dict.fromkeys(remark for item in read for remark in item.remarks):
-        ctx.warn(f"{_counted([x.photo.name for x in read if remark in x.remarks])}: {remark}")
+        names = [item.photo.name for item in read if remark in item.remarks]
+        ctx.report(REMARK, subject=remark, n=len(names), photos=_counted(names), remark=remark)
     doubts = dict.fromkeys(item.focal.doubt for item in read if item.focal.doubt)
     for doubt in doubts:
         doubted = [item.photo.name for item in read if item.focal.doubt == doubt]
-        ctx.warn(f"{_counted(doubted)}: {doubt}: it is not used")
+        ctx.report(EXIF_IMPOSSIBLE, n=len(doubted), photos=_counted(doubted), doubt=doubt)
     if calibration is not None:
         _warn_of_matches(ctx, read, calibration)
     unknown = [
@@ -535,11 +581,8 @@ def _warn(
     ]
     if unknown:
         reasons = Counter(item.focal.reason for item in read if item.photo.name in unknown)
-        ctx.warn(
-            f"the focal length of {_counted(unknown)} is unknown ({reasons.most_common(1)[0][0]}, "
-            "and no calibration): the orientation has to find it, needs more ties for that and "
-            "may refuse; a calibration file helps"
-        )
+        reason = reasons.most_common(1)[0][0]
+        ctx.report(FOCAL_UNKNOWN, n=len(unknown), photos=_counted(unknown), reason=reason)
 
 
 def _warn_of_matches(
@@ -547,14 +590,11 @@ def _warn_of_matches(
 ) -> None:
     without = [item.photo.name for item in read if item.photo.intrinsics is None]
     if without:
-        ctx.warn(f"the calibration has no entry for {_counted(without)}; the others are calibrated")
+        ctx.report(NOT_CALIBRATED, n=len(without), photos=_counted(without))
     used = {matching_pattern(calibration.patterns, item.whole or item.photo.name) for item in read}
     unused = [pattern for pattern in calibration.patterns if pattern not in used]
     if unused:
-        ctx.warn(
-            f"calibration entries that no photo takes: {_names(unused)}; the case of letters "
-            "counts, and the first entry that matches holds"
-        )
+        ctx.report(UNUSED_ENTRIES, n=len(unused), names=_names(unused))
 
 
 def _report_metrics(ctx: StepContext, photos: Photos) -> None:

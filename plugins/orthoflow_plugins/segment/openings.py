@@ -24,7 +24,15 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import (
+    Determinism,
+    DiagnosticSpec,
+    Method,
+    MethodParams,
+    MetricSpec,
+    Ports,
+    StepContext,
+)
 from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
 from orthoflow_plugins.segment.figures import CAPTION, outline_map
 from orthoflow_plugins.segment.image_edges import moved_to_edges
@@ -39,6 +47,26 @@ _FACE_FARTHEST_M: Final = 0.3
 # windows do. Shadows do not.
 _FILLED_LEAST: Final = 0.7
 _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_data"}
+NO_CLOUD: Final = DiagnosticSpec(
+    code="openings-without-cloud",
+    severity="warning",
+    text="without the cloud nothing tells an opening from a place that furniture hides, or one "
+    "that was looked through from one that gave nothing",
+    remedy="wire the cloud to {step}",
+)
+OTHER_SURFACE: Final = DiagnosticSpec(
+    code="wall-behind-its-plane",
+    severity="warning",
+    text="{subject}: most of it lies {behind_m:.2f} m behind its plane, so {what}",
+    rank_by="behind_m",
+)
+OTHER_CELLS: Final = DiagnosticSpec(
+    code="orthoimage-of-other-cells",
+    severity="warning",
+    text="{subject}: its orthoimage has other cells than its depth, so sides are measured by "
+    "depth alone",
+    remedy="use the same gsd_m for both",
+)
 
 
 class SegmentOpenings(Method):
@@ -132,10 +160,7 @@ class SegmentOpenings(Method):
         if inputs.cloud is not None:
             inputs.cloud.require_points(2)
         else:
-            ctx.warn(
-                "without the cloud an opening looks like a place that furniture hides, and "
-                "one that was looked through like one that gave nothing: wire it"
-            )
+            ctx.report(NO_CLOUD)
         rule = AreaRule(
             behind_m=params.behind_m,
             width_least_m=params.width_least_m,
@@ -173,10 +198,8 @@ def _found_on(inputs: SegmentOpenings.In, place: int, rule: AreaRule, ctx: StepC
     relief = relief_of(wall, lines, rule)
     if relief.face_m:
         is_other = relief.face_m < -_FACE_FARTHEST_M
-        ctx.warn(
-            f"{wall.name}: most of it lies {-relief.face_m:.2f} m behind its plane, so "
-            + ("it is another surface, with no openings" if is_other else "openings begin there")
-        )
+        what = "it is another surface, with no openings" if is_other else "openings begin there"
+        ctx.report(OTHER_SURFACE, subject=wall.name, behind_m=-relief.face_m, what=what)
         if is_other:
             return _Found(wall=wall, openings=(), n_unbounded=0)
     grey = _grey(inputs.orthoimages, wall, relief, ctx)
@@ -241,10 +264,7 @@ def _grey(
     if image is None or set(image.sources) <= {"cloud"}:
         return None
     if not image.frame.has_cells_of(wall.frame):
-        ctx.warn(
-            f"{wall.name}: its orthoimage has other cells than its depth, so sides are placed by "
-            "depth alone"
-        )
+        ctx.report(OTHER_CELLS, subject=wall.name)
         return None
     step = relief.step
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, dtype=np.float32)

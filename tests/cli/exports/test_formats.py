@@ -35,6 +35,7 @@ GIVEN: Final[Mapping[str, object]] = {
     "language": "de",
     "light": "90,20",
     "base_url": "https://example.org/room",
+    "figure_format": "pdf",
 }
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from orthoflow.cli.exports import results as module
 from orthoflow.cli.exports.choices import Choices
+from tests.report_runs import compared_run
 
 
 class Cells(SimpleNamespace):
@@ -22,32 +23,27 @@ class Cells(SimpleNamespace):
         return SimpleNamespace(address=address)
 
 
-@pytest.mark.parametrize(
-    ("cell", "n_written", "said"),
-    [
-        (None, 3, "3 figures, 1 curve and the graph"),
-        (None, 1, "1 figure, 1 curve and the graph; 2 left out, damaged or more than a drawing"),
-        ("b", 1, "1 figure and the graph"),
-    ],
-)
-def test_figures_that_could_not_be_written_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cell: str | None, n_written: int, said: str
-) -> None:
-    asked = []
+def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    n_figures = sum(len(cell.figures) for cell in run.cells.values())
+    for suffix in ("svg", "pdf", "png"):
+        folder = tmp_path / suffix
+        told = module.export_figures(run, folder, Choices(figure_format=suffix))
+        assert told == f"{n_figures} figures, the plan of photos and the graph"
+        assert (folder / f"photos_and_walls.{suffix}").stat().st_size > 1000
+    pages = list((tmp_path / "pdf").glob("*/*.pdf"))
+    assert pages
+    assert all(page.read_bytes().startswith(b"%PDF") for page in pages)
+    # The same figures are pictures otherwise.
+    assert len(list((tmp_path / "svg").glob("*/*.png"))) == len(pages)
 
-    def write_figures(_run: object, folder: Path, addresses: Any) -> int:
-        asked.append((folder.is_dir(), tuple(addresses)))
-        return n_written
 
-    monkeypatch.setattr("orthoflow.records.runs.figure_files", lambda _, addresses: addresses)
-    monkeypatch.setattr("orthoflow.report.write_figures", write_figures)
-    curves = {"01_a.svg": b"<svg/>"}
-    monkeypatch.setattr("orthoflow.report.curves.curve_files", lambda _: curves)
-    told = module.export_figures(Cells(), tmp_path / "out", Choices(cell=cell))  # type: ignore[arg-type]
-    assert told == said
-    assert asked == [(True, (cell,) if cell else ("a", "b", "c"))]
-    written = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("curves/*")}
-    assert written == ({} if cell else curves)
+def test_of_one_cell_its_figures_alone_are_written(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    told = module.export_figures(run, tmp_path / "out", Choices(cell="check@plane=fine"))
+    n_figures = len(run.cells["check@plane=fine"].figures)
+    assert told.startswith(f"{n_figures} figure")
+    assert not (tmp_path / "out" / "photos_and_walls.svg").exists()
 
 
 @pytest.mark.parametrize(

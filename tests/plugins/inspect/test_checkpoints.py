@@ -137,7 +137,7 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
     (said,) = ctx.warnings
     assert said.startswith(
         f"3 of 4 check points count nowhere: P1 (2 mm below {image.name}), "
-        f"P2 (1.2 m left of {image.name}), P3 (250 mm before {image.name}, beyond its buffer); "
+        f"P2 (1.2 m left of {image.name}), P3 (250 mm before {image.name}, beyond its buffer): "
     )
     assert "margin_m" in said
 
@@ -154,7 +154,7 @@ def test_points_that_are_no_targets_are_not_helped_by_larger_walls(tmp_path: Pat
     (said,) = ctx.warnings
     assert said == (
         "1 of 2 check points count nowhere: P1 (no black and white quadrant target was recognised "
-        f"on {image.name}); measure them in an orthoimage"
+        f"on {image.name}): measure them in an orthoimage"
     )
 
 
@@ -167,11 +167,10 @@ def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
     image = inspect_scenes.displaced(0, 0)
     metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
     assert metrics["n_outliers_iterated_capped"] == 5
-    (said,) = ctx.warnings
-    assert said == (
-        "the iterated rule for outliers ends at its cap, a quarter of the points "
-        "(n_outliers_iterated_capped 5), though more lie beyond twice the RMS of the rest: the "
-        "residuals are of two kinds, which the rule cannot part; compare n_outliers_once"
+    (said,) = ctx.diagnostics
+    assert (said.code, said.values["numbers"]) == (
+        "outlier-rule-capped",
+        "n_outliers_iterated_capped 5",
     )
     off[12:] = off[:8]
     metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.missed_points import missed_points, said_of_missed
+from orthoflow_plugins.inspect.missed_points import missed_points, ways_to_count, with_reasons
 
 from tests import inspect_scenes
 from tests.inspect_scenes import BUFFER_M, GSD_M, SHAPE, points_at
@@ -53,11 +53,9 @@ def test_a_point_lies_beside_the_nearest_picture(
 
 def test_four_points_are_named_and_the_rest_is_counted() -> None:
     reasons = {f"P{k}": "2 mm below wall" for k in range(6)}
-    said = said_of_missed(reasons, 9)
-    assert said.startswith("6 of 9 check points count nowhere: P0 (2 mm below wall), P1 (")
-    assert "P3 (2 mm below wall) and 2 more, as the log says; " in said
-    assert said.endswith(" or let margin_m of raster.grid make walls larger")
-    four = said_of_missed(dict([*reasons.items()][:4]), 9)
-    assert "P3 (2 mm below wall); measure" in four
-    assert "margin_m" not in said_of_missed({"P0": "nothing like it was recognised on below"}, 1)
-    assert said_of_missed({}, 9) == ""
+    said = with_reasons(reasons)
+    assert said.startswith("P0 (2 mm below wall), P1 (")
+    assert said.endswith("P3 (2 mm below wall) and 2 more, as the log says")
+    assert with_reasons(dict([*reasons.items()][:4])).endswith("P3 (2 mm below wall)")
+    assert "margin_m" in ways_to_count(reasons)
+    assert "margin_m" not in ways_to_count({"P0": "nothing like it was recognised on below"})

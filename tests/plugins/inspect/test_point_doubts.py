@@ -67,7 +67,7 @@ def test_three_points_tell_another_raster_where_nine_tenths_of_what_they_are_off
     off = np.array([24.0, -32.0]) + 40.0 * np.sqrt(1.0 / share**2 - 1.0) / size * turned
     warnings, metrics = said(tmp_path, points_at(surveyed()[:n_points], pixels=places + off))
     assert metrics["rms_mm"] == pytest.approx(1e3 * GSD_M * 40.0 / share)
-    assert [("laid otherwise" in warning) for warning in warnings] == [True] * is_told
+    assert [("placed otherwise" in warning) for warning in warnings] == [True] * is_told
 
 
 @pytest.mark.parametrize("off_cells", [[3.0, 4.0], [-12.0, 9.0], [11.4, 15.2]])
@@ -82,7 +82,7 @@ def test_an_orthoimage_that_is_off_by_cells_is_a_result_and_no_doubt(
 def test_scattered_blunders_are_no_other_raster(tmp_path: Path) -> None:
     off = 40.0 * np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
     warnings, _ = said(tmp_path, points_at(surveyed(), pixels=PLACES + off))
-    assert not any("laid otherwise" in warning for warning in warnings)
+    assert not any("placed otherwise" in warning for warning in warnings)
 
 
 def test_points_in_another_unit_are_told(tmp_path: Path) -> None:
@@ -119,9 +119,9 @@ def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> Non
     ("factor", "aside", "told"),
     [
         (1.03, 30.0, "measured on cells of about"),
-        (1.015, 30.0, "laid otherwise"),
+        (1.015, 30.0, "placed otherwise"),
         (0.97, 30.0, "measured on cells of about"),
-        (1.0, 15.0, "laid otherwise"),
+        (1.0, 15.0, "placed otherwise"),
     ],
 )
 def test_cells_of_another_size_are_so_by_two_hundredths(

@@ -224,7 +224,9 @@ def test_lenses_that_all_photos_confuse_with_their_pose_are_named() -> None:
     assert correlation_notes(block, photos(), cofactors) == []
     correlate(2, 5, 0, 0.96)
     scale = np.linspace(1.0, 3.0, 20)
-    (note,) = correlation_notes(block, photos(), cofactors * np.outer(scale, scale))
-    assert note.startswith(
-        "the focal of the lens of a.png and the distance of its photos correlate by 0.960"
+    ((photo, (spec, values)),) = correlation_notes(
+        block, photos(), cofactors * np.outer(scale, scale)
     )
+    assert (photo, spec.code) == ("a.png", "lens-correlated-with-pose")
+    assert (values["parameter"], values["pose"]) == ("focal", "distance")
+    assert values["correlation"] == pytest.approx(0.96)

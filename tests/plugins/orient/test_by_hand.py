@@ -132,7 +132,7 @@ def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size
         if found.status == "ok":
             assert error_share(found) < 3.0
             assert cameras.ties.role.tolist() == [0] * 7 + [int(TieRole.REJECTED)]
-            assert any("left out of them, as they contradict" in text for text in warnings)
+            assert any("contradict the others and are left out" in text for text in warnings)
         else:
             assert "measured by hand contradict" in found.status
     # Far off, the blunder is plain.
@@ -306,9 +306,10 @@ def test_a_pose_by_hand_knows_what_it_was_found_from() -> None:
     np.testing.assert_array_equal(estimate.agreeing, agreeing)
     np.testing.assert_array_equal(found.start.agreeing, agreeing)
     assert (estimate.limit, estimate.source) == (3.5, "calibration")
-    assert estimate.notes[0] == "oriented by ties measured by hand alone"
+    (first, _), (second, values) = estimate.notes
+    assert (first.code, second.code) == ("photo-oriented-by-hand", "ties-by-hand-contradict")
     u, v = seen.pixels_photo[hand[2]] - 0.5
-    assert estimate.notes[1].endswith(f"contradict the others: (u {u:.0f}, v {v:.0f})")
+    assert values == {"n": 1, "places": f"(u {u:.0f}, v {v:.0f})"}
     # Without each of them in turn less is known than with all.
     assert len(estimate.without_one) == agreeing.sum()
     sure = np.trace(estimate.resection.covariance)

@@ -308,22 +308,21 @@ def test_the_side_of_a_wall_is_asked_where_it_is_known_and_tied() -> None:
 
 
 def test_limits_of_good_orientations_are_said() -> None:
-    def said(**changes: Any) -> list[str]:
-        return warnings_for(candidate(**changes))
+    def said(**changes: Any) -> list[tuple[str, Any]]:
+        return [(spec.code, values) for spec, values in warnings_for(candidate(**changes))]
 
-    assert said(source="none") == [
-        "neither calibration nor EXIF says its focal length, which was estimated"
-    ]
+    assert said(source="none") == [("focal-length-estimated", {})]
     counts = candidate(agreeing=in_quarter(0, 2)).quadrant_counts
     assert counts[0] == 2
     assert max(counts) > 20
-    assert "another 2: more than 10 times as many" in said(agreeing=in_quarter(0, 2))[0]
+    [(code, values)] = said(agreeing=in_quarter(0, 2))
+    assert (code, values["n_most"], values["n_least"]) == ("ties-crowded", max(counts), 2)
     assert max(candidate(agreeing=in_quarter(0, 3)).quadrant_counts) <= 30
     assert said(agreeing=in_quarter(0, 3)) == []
     ratio = candidate().hull_ratio
     assert said(params=params(min_hull_ratio=ratio / 1.51)) == []
     covers = said(params=params(min_hull_ratio=ratio / 1.49))
-    assert covers == [f"the control covers {ratio:.0%} of the part that shows the walls"]
+    assert covers == [("control-covers-little", {"share": ratio})]
     nowhere = candidate(error=None)
     assert (nowhere.hull_ratio, nowhere.worst_in_quarter_m(0)) == (0.0, 0.0)
     assert math.isinf(nowhere.search_radius_px)

@@ -166,12 +166,11 @@ def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() ->
     residuals = np.array([[0.3, 0.4], [6.0, 8.0], [30.0, 40.0], [np.nan, np.nan]])
     near = np.array([0.5, 3.4, 3.4, np.nan])
     assert given_poses._disagreement(seen, near, residuals) == ()
-    (note,) = given_poses._disagreement(seen, np.array([0.5, 3.6, 3.4, np.nan]), residuals)
-    assert note.startswith("1 of its 4 ties measured by hand disagree with the given pose")
-    assert "by up to 10.0 px" in note
-    (note,) = given_poses._disagreement(seen, np.array([0.5, 3.6, 9.0, np.nan]), residuals)
-    assert note.startswith("2 of its 4 ties")
-    assert "by up to 50.0 px: measure at least 6" in note
+    for second, n_off, longest_px in ((3.4, 1, 10.0), (9.0, 2, 50.0)):
+        normalised = np.array([0.5, 3.6, second, np.nan])
+        ((spec, values),) = given_poses._disagreement(seen, normalised, residuals)
+        assert spec.code == "pose-against-ties"
+        assert values == {"n": n_off, "n_ties": 4, "longest_px": longest_px, "n_least": 6}
 
 
 def test_without_walls_ties_are_as_they_are() -> None:

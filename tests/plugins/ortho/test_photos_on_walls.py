@@ -11,6 +11,7 @@ from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
 from orthoflow_plugins.ortho.photos_on_walls import warn_of_heads
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import Camera, Photo, Photos
 from orthoflow.sdk import StepContext
@@ -33,18 +34,17 @@ def posed(*turns_deg: float) -> list[tuple[Photo, Camera]]:
     return list(zip(photos, cameras, strict=True))
 
 
-def said(folder: Path, *turns_deg: float, sign: float = 1.0) -> list[str]:
+def said(folder: Path, *turns_deg: float, sign: float = 1.0) -> list[Diagnostic]:
     ctx: StepContext = context(folder)
     warn_of_heads(sign * scenes.walls(scenes.frame()).up, posed(*turns_deg), ctx)
-    return ctx.warnings
+    return ctx.diagnostics
 
 
 def test_a_scan_whose_up_is_down_is_told_by_its_photos(tmp_path: Path) -> None:
-    (warning,) = said(tmp_path, 0.0, 10.0, -20.0, 180.0, sign=-1.0)
-    assert warning.startswith("3 of 4 photos stand on their heads")
-    assert "set up of read.scan to z" in warning
-    (warning,) = said(tmp_path, 180.0)
-    assert "set up of read.scan to -z" in warning
+    (told,) = said(tmp_path, 0.0, 10.0, -20.0, 180.0, sign=-1.0)
+    assert (told.values["n_down"], told.values["n_photos"], told.values["opposite"]) == (3, 4, "z")
+    (told,) = said(tmp_path, 180.0)
+    assert told.values["opposite"] == "-z"
 
 
 @pytest.mark.parametrize(
@@ -73,4 +73,4 @@ def test_methods_that_lay_photos_tell_it(
         method.Params(),
         ctx,
     )
-    assert any("stand on their heads" in warning for warning in ctx.warnings)
+    assert "photos-upside-down" in [one.code for one in ctx.diagnostics]

@@ -123,32 +123,28 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
         ],
         "laser",
     )
-    empty, coarse, close, gaps = listener.warnings
-    assert empty == "empty: no point lies within its buffer"
-    assert coarse == (
-        "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
-        "apart; 33% of the cells have a point, 0% are interpolated, 67% are empty "
-        "(gsd_m = 0.019 m or more leaves fewer)"
-    )
-    assert close == (
-        "close: cells of gsd_m = 0.005 m lie on points about 0.0034 m apart; "
-        "33% of the cells have a point, 33% are interpolated, 33% are empty "
-        "(gsd_m = 0.0051 m or more leaves fewer)"
-    )
-    # An uneven scan leaves many cells to be interpolated, however close its points lie elsewhere.
-    assert gaps.startswith("gaps: cells of gsd_m = 0.005 m lie on points about 0.003 m")
-    assert gaps.endswith("17% are interpolated, 50% are empty")
+    empty, *fine = listener.context.diagnostics
+    assert (empty.code, empty.subject) == ("wall-without-points", "empty")
+    assert [(one.subject, one.values["measured"], one.values["interpolated"]) for one in fine] == [
+        ("coarse", pytest.approx(1 / 3), 0.0),
+        ("close", pytest.approx(1 / 3), pytest.approx(1 / 3)),
+        # An uneven scan leaves many cells to be interpolated, however close its points lie
+        # elsewhere.
+        ("gaps", pytest.approx(1 / 3), pytest.approx(1 / 6)),
+    ]
+    assert ["gsd_m=0.019" in fine[0].remedy, "gsd_m=0.0051" in fine[1].remedy] == [True, True]
+    assert fine[2].remedy == ""
 
 
 def test_cells_that_are_advised_are_no_longer_too_fine(listener: Listener) -> None:
     step_m = 0.003_37  # asks for 0.005055 m, whose nearest number of two digits is what is given
     reporting.warn(listener.context, [WallRaster(wall=wall([[1]]), scan_step_m=step_m)], "laser")
-    [said] = listener.warnings
-    [advised] = re.findall(r"\(gsd_m = ([0-9.]+) m", said)
+    [said] = listener.context.diagnostics
+    [advised] = re.findall(r"gsd_m=([0-9.]+)", said.remedy)
     assert float(advised) == 0.0051
     assert step_m <= 2 / 3 * float(advised)
     # Of cells that are not empty nothing is said of empty ones.
-    assert "empty" not in said
+    assert "empty" not in said.text
 
 
 def emptiness(
@@ -262,11 +258,8 @@ def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
     closed = wall([[1, 1], [1, 1], [0, 0]], mask=[[1, 1], [1, 1], [2, 2]])
     small = wall([[1, 1], [1, 0]])
     reporting.warn_of_wide_gaps(listener.context, [large, closed, small])
-    (said,) = listener.warnings
-    assert said == (
-        "wall 0: surface tin spans no gap wider than about 512 cells (2.56 m) where more than 3 "
-        "cells of a wall have points, here 4: raise gsd_m to close wider ones"
-    )
+    (said,) = listener.context.diagnostics
+    assert (said.subject, said.values["gap_m"], said.values["n_measured"]) == ("wall 0", 2.56, 4)
 
 
 @pytest.mark.parametrize(("n_void", "is_told"), [(1, False), (3, True)])

@@ -117,7 +117,7 @@ def test_photos_without_focal_length_are_taken_with_a_warning(tmp_path: Path, re
     assert read.warnings == (
         "the focal length of 5 photos (0.jpg, 1.jpg, 2.jpg ...) is unknown (no EXIF focal length, "
         "and no calibration): the orientation has to find it, needs more ties for that and may "
-        "refuse; a calibration file helps"
+        "refuse: a calibration file helps"
     )
     # Of three each is named.
     read(*(tmp_path / name for name in list(files)[:3]))
@@ -562,7 +562,7 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
     assert (
         "the calibration has no entry for photo c.jpg; the others are calibrated" in read.warnings
     )
-    assert "calibration entries that no photo takes: B.jpg; the case" in read.warnings
+    assert "calibration entries that no photo takes: B.jpg: the case" in read.warnings
     assert "the focal length of photo c.jpg is unknown" in read.warnings
 
 

@@ -177,7 +177,7 @@ def test_another_axis_is_told_with_the_setting(tmp_path: Path) -> None:
     (said,) = ctx.warnings
     assert said == (
         "y looks like the axis that points up, not z: 96% of the surfaces are level or upright by "
-        "it, 37% by z: set up of read.scan to y, or to -y where floors come out as ceilings"
+        "it, 37% by z: {step}.up=y, or -y where floors come out as ceilings"
     )
     for right in ("y", "-y"):
         warn_of_up(fallen, right, ctx)
@@ -312,9 +312,9 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
     }
     thick, apart = ctx.warnings
     assert thick.startswith(
-        "the cloud is thicker than its scan step: across surfaces, in pieces of about 10 cm, its "
-        "points scatter by 3.1 mm (95 % within 12.5 mm), and along them the nearest other point is "
-        "2.0 mm away: planes and depths"
+        "the cloud is thicker than its point spacing: across surfaces, in pieces of about 10 cm, "
+        "its points scatter by 3.1 mm (95 % within 12.5 mm), and along them the nearest other "
+        "point is 2.0 mm away: planes and depths"
     )
     assert apart == (
         "the scans disagree: where two show one surface they lie 9.4 mm apart across it (median), "

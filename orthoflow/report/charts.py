@@ -1,0 +1,260 @@
+"""Charts by matplotlib in one style, at the width of a journal's column: for pages and as files."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.foreign_text import shown
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
+
+# Two columns of a journal are 85 mm wide each.
+COLUMN_INCHES: Final = 85.0 / 25.4
+_DPI: Final = 300
+# Distinguished by people who see few colours, and by their strokes where there are none
+# (Okabe and Ito 2008).
+COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
+_STROKES: Final = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+_LOGARITHMIC_RATIO: Final = 20.0
+# An axis that begins near 0 begins there: half of it would show a difference too large.
+_NEAR_ZERO: Final = 0.6
+# Of a viewing direction, of the plan; and of how many photos names can be read.
+_ARROW_SHARE: Final = 0.06
+_NAMED_PHOTOS: Final = 60
+# Any: matplotlib's own types name every setting that it has.
+_STYLE: Final[Mapping[Any, Any]] = {
+    "font.size": 8.0,
+    "font.family": "DejaVu Sans",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#d4d9de",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.0,
+    "errorbar.capsize": 2.0,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "savefig.dpi": _DPI,
+    # The same numbers give the same bytes, and text stays text in PDF.
+    "svg.hashsalt": "orthoflow",
+    "pdf.fonttype": 42,
+    "text.parse_math": False,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChartPoint:
+    """One point of a line.
+
+    Attributes:
+        x: along the axis.
+        y: across.
+        spread: half the length of its bar; NaN for none.
+        is_filled: it stands out, as that of the baseline does.
+        is_joined: a line leads to it from the point before.
+    """
+
+    x: float
+    y: float
+    spread: float = math.nan
+    is_filled: bool = False
+    is_joined: bool = True
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw in the style of all charts, whatever the user's own settings of matplotlib are."""
+    import matplotlib as mpl  # noqa: PLC0415 - pages without charts need none
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
+def line_chart(
+    lines: Mapping[str, Sequence[ChartPoint]],
+    *,
+    below: str,
+    beside: str,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    suffix: ChartFormat = "svg",
+) -> bytes:
+    """Draw lines with bars over one axis.
+
+    Args:
+        lines: name -> points, in the order of x; as many as `COLOURS` are distinguished.
+        below: label of the axis along.
+        beside: label of the axis across, with its unit.
+        bounds: that values across cannot lie beyond, e.g. 0 and 1 of shares.
+        suffix: format of the file.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+
+    every = [point for points in lines.values() for point in points]
+    xs = sorted({point.x for point in every})
+    with styled():
+        figure = Figure(figsize=(COLUMN_INCHES, 0.75 * COLUMN_INCHES), layout="constrained")
+        axes = figure.subplots()
+        is_logarithmic = xs[0] > 0 and xs[-1] / xs[0] >= _LOGARITHMIC_RATIO
+        if is_logarithmic:
+            axes.set_xscale("log")
+        for index, (name, points) in enumerate(lines.items()):
+            _draw_line(axes, points, index, name=shown(name), bounds=bounds)
+        _limit(axes, every, bounds)
+        axes.set_xlabel(shown(f"{below}{' (logarithmic)' if is_logarithmic else ''}"))
+        axes.set_ylabel(shown(beside), wrap=True)
+        if any(lines):
+            figure.legend(loc="outside upper left", ncols=1)
+        return saved(figure, suffix)
+
+
+def _draw_line(
+    axes: Axes,
+    points: Sequence[ChartPoint],
+    index: int,
+    *,
+    name: str,
+    bounds: tuple[float, float],
+) -> None:
+    colour = COLOURS[index % len(COLOURS)]
+    x, y = (np.array([getattr(point, key) for point in points]) for key in ("x", "y"))
+    # NaN breaks the line before a point that nothing leads to.
+    breaks = [place for place, point in enumerate(points) if place and not point.is_joined]
+    axes.plot(
+        np.insert(x, breaks, math.nan),
+        np.insert(y, breaks, math.nan),
+        color=colour,
+        linestyle=_STROKES[index % len(_STROKES)],
+        label=name or "_",
+        zorder=2,
+    )
+    spread = np.array([point.spread for point in points])
+    if np.isfinite(spread).any():
+        low, high = np.clip([y - spread, y + spread], *bounds)
+        axes.errorbar(
+            x, y, yerr=np.array([y - low, high - y]), fmt="none", ecolor=colour, zorder=2.5
+        )
+    fills = [colour if point.is_filled else "white" for point in points]
+    axes.scatter(x, y, c=fills, edgecolors=colour, s=16, zorder=3)
+
+
+def _limit(axes: Axes, points: Sequence[ChartPoint], bounds: tuple[float, float]) -> None:
+    spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
+    low = max(min(p.y - s for p, s in zip(points, spreads, strict=True)), bounds[0])
+    high = min(max(p.y + s for p, s in zip(points, spreads, strict=True)), bounds[1])
+    margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
+    begin = 0.0 if 0.0 <= low < _NEAR_ZERO * high else low - margin
+    axes.set_ylim(begin, high + margin)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanWall:
+    """A wall from above: its corners (4, 2), metres."""
+
+    name: str
+    corners_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanPhoto:
+    """A photo from above: where it was taken (2,), metres, and which way it looks (2,)."""
+
+    name: str
+    foot_m: NDArray[np.float64]
+    look: NDArray[np.float64]
+
+
+def plan_chart(
+    walls: Sequence[PlanWall],
+    photos: Sequence[PlanPhoto],
+    *,
+    labels: tuple[str, str],
+    suffix: ChartFormat = "svg",
+) -> bytes:
+    """Draw walls and photos from above, to scale.
+
+    Args:
+        walls: as lines, each with its name.
+        photos: as dots with an arrow where they look; names where there is room.
+        labels: of both axes.
+        suffix: format of the file.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+
+    every = np.vstack([*(wall.corners_m for wall in walls), *(photo.foot_m for photo in photos)])
+    span = float(np.ptp(every, axis=0).max()) or 1.0
+    with styled():
+        figure = Figure(figsize=(1.5 * COLUMN_INCHES, 1.2 * COLUMN_INCHES), layout="constrained")
+        axes = figure.subplots()
+        for index, wall in enumerate(walls):
+            ring = np.vstack([wall.corners_m, wall.corners_m[:1]])
+            axes.plot(*ring.T, color=COLOURS[0], linewidth=1.6)
+            place, turn = wall.corners_m.mean(axis=0), index % 2
+            _name(axes, wall.name, place, colour=COLOURS[0], above=bool(turn))
+        feet = np.array([photo.foot_m for photo in photos]).reshape(-1, 2)
+        looks = _ARROW_SHARE * span * np.array([photo.look for photo in photos]).reshape(-1, 2)
+        axes.quiver(
+            *feet.T, *looks.T, angles="xy", scale_units="xy", scale=1, color=COLOURS[1], width=0.004
+        )
+        axes.scatter(feet[:, 0], feet[:, 1], s=14, color=COLOURS[5], zorder=3)
+        for photo in _with_room(photos, span):
+            _name(axes, photo.name, photo.foot_m, colour=COLOURS[5], above=False)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.08)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+        return saved(figure, suffix)
+
+
+def _with_room(photos: Sequence[PlanPhoto], span_m: float) -> Iterator[PlanPhoto]:
+    """Photos whose names lie on no other one's; of many none is named."""
+    taken: list[NDArray[np.float64]] = []
+    for photo in photos if len(photos) <= _NAMED_PHOTOS else ():
+        room_m = np.array([0.16, 0.03]) * span_m
+        if all(np.any(np.abs(photo.foot_m - other) > room_m) for other in taken):
+            taken.append(photo.foot_m)
+            yield photo
+
+
+def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: str, above: bool) -> None:
+    axes.annotate(
+        shown(name),
+        (float(place[0]), float(place[1])),
+        xytext=(3, 4 if above else -8),
+        textcoords="offset points",
+        fontsize=6.5,
+        color=colour,
+    )
+
+
+def saved(figure: Figure, suffix: ChartFormat) -> bytes:
+    """Write a figure, without the date: the same figure gives the same bytes."""
+    stream = io.BytesIO()
+    undated: dict[str, dict[str, Any]] = {
+        "svg": {"Date": None},
+        "pdf": {"CreationDate": None},
+        "png": {},
+    }
+    figure.savefig(stream, format=suffix, metadata=undated[suffix])
+    return stream.getvalue()
+
+
+def as_image(svg: bytes) -> str:
+    """Return an SVG file as a data URI for an image of a page."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(svg).decode('ascii')}"
