@@ -50,8 +50,8 @@ _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_
 NO_CLOUD: Final = DiagnosticSpec(
     code="openings-without-cloud",
     severity="warning",
-    text="without the cloud nothing tells an opening from a place that furniture hides, or one "
-    "that was looked through from one that gave nothing",
+    text="without the cloud an opening looks like a place that furniture hides, and one that was "
+    "looked through like one that gave nothing",
     remedy="wire the cloud to {step}",
 )
 OTHER_SURFACE: Final = DiagnosticSpec(

@@ -214,13 +214,8 @@ def test_points_of_pure_black_are_told(tmp_path: Path, *, n_black: int, is_told:
     ctx = scenes.context(tmp_path)
     inputs = PointcloudDirect.In(walls=walls, cloud=dataclasses.replace(cloud, rgb=rgb))
     PointcloudDirect().run(inputs, PointcloudDirect.Params(), ctx)
-    told = [
-        text
-        for text in ctx.warnings
-        if f"{n_black} points of the cloud" in text and "set skip_below_grey to 10" in text
-    ]
-    assert bool(told) == is_told
-    assert len(ctx.warnings) == len(told)
+    told = [(one.code, one.values["n_black"], one.values["grey"]) for one in ctx.diagnostics]
+    assert told == ([("points-black", n_black, 10)] if is_told else [])
 
 
 def test_specks_of_pure_black_paint_no_cell_and_are_reported(tmp_path: Path) -> None:
