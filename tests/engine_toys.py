@@ -415,4 +415,19 @@ class Sketch(Means):
         ctx.metric("dots", 1, "1")
         return super().run(inputs, params, ctx)
 
+class wrong_type(Work):
+    id = "work.wrong_type"
+    def run(self, inputs, params, ctx):
+        return self.Out(numbers=Strangers())
+
+class wrong_out(Work):
+    id = "work.wrong_out"
+    def run(self, inputs, params, ctx):
+        return inputs.numbers
+
+class bad_param(Work):
+    id = "work.bad_param"
+    def run(self, inputs, params, ctx):
+        ctx.metric("nan", float("nan"), "1")
+
 """
