@@ -1,11 +1,11 @@
-"""The folder `products/`, `walls.json` with the walls to deliver, and metrics as rows."""
+"""The folder `products/`, and metrics as rows."""
 
 from __future__ import annotations
 
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
@@ -18,11 +18,10 @@ from orthoflow_provenance.paths import colliding, files_below, path_below
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.journal import cell_file_name
-from orthoflow.errors import InputError, StoreError
-from orthoflow.files.sidecars import read_sidecar, write_json
+from orthoflow.errors import StoreError
 from orthoflow.foreign_text import csv_text
 from orthoflow.geometry.threads import in_order
-from orthoflow.products import JsonValue, OrthoMask
+from orthoflow.records.deliverables import write_walls_json
 
 # As of fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
 _ROUNDING: Final = 1e-6
@@ -115,128 +114,6 @@ def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
     """Write rows with a header; numbers with every digit that they have."""
     text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
     path.write_text(text, encoding="utf-8", newline="")
-
-
-WALLS_FILE: Final = "walls.json"
-_ORTHO: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.json")
-_DEPTH: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_depth\.json")
-# An image of which less is painted is no view of its wall.
-_LEAST_PAINTED_SHARE: Final = 0.5
-
-
-def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
-    """Write `walls.json` into the products of a run; nothing where it gave no orthoimages.
-
-    Of several combinations the one that was run last counts, as for drawings.
-
-    Args:
-        products: folder in which the files of all cells lie.
-        cells: of the run, in order.
-    """
-    pictured = [
-        cell
-        for cell in cells
-        if cell.status == "ok"
-        and cell.inputs
-        and any(output.type_name == "orthoimages" for output in cell.outputs.values())
-    ]
-    if not pictured:
-        return
-    folder = products / cell_file_name(pictured[-1].address)
-    images = {number: content for number, _, content in _sidecars(folder, _ORTHO)}
-    paths = {number: path for number, path, _ in _sidecars(folder, _ORTHO)}
-    walls: list[dict[str, JsonValue]] = []
-    for number, content in images.items():
-        image = paths[number].with_suffix(".tif").relative_to(products).as_posix()
-        error = paths[number].with_name(paths[number].name.replace("_ortho.json", "_error.tif"))
-        walls.append(_told(number, content, image, is_of_photos=error.exists()))
-    walls += _included(products, cells, images)
-    walls.sort(key=_rank)
-    write_json(products / WALLS_FILE, {"walls": list(walls)})
-
-
-def _sidecars(
-    folder: Path, pattern: re.Pattern[str]
-) -> Iterator[tuple[int, Path, dict[str, object]]]:
-    for path in sorted(folder.glob("*.json")):
-        if found := pattern.fullmatch(path.name):
-            try:
-                yield int(found[1]), path, read_sidecar(path)
-            except InputError:
-                continue
-
-
-def _told(
-    number: int, content: Mapping[str, object], image: str, *, is_of_photos: bool
-) -> dict[str, JsonValue]:
-    """What is said of one orthoimage."""
-    counts = content.get("mask_counts")
-    counts = counts if isinstance(counts, dict) else {}
-    total = sum(counts.values()) or 1
-    painted = float(counts.get(str(int(OrthoMask.PAINTED)), 0)) / total
-    accuracy = content.get("accuracy")
-    accuracy = accuracy if isinstance(accuracy, dict) else {}
-    median = accuracy.get("expected_mm_median")
-    reason = f"{painted:.0%} painted"
-    if painted < _LEAST_PAINTED_SHARE:
-        recommended, reason = False, f"only {reason}"
-    elif is_of_photos and not accuracy.get("assessed"):
-        recommended, reason = False, f"{reason}, accuracy not checked: no tie lies on this wall"
-    else:
-        recommended = True
-        if isinstance(median, float) and math.isfinite(median):
-            reason += f", expected error {median:.1f} mm"
-    size_m2 = float(str(content.get("gsd_m", 0.0))) ** 2 * total
-    return {
-        "number": number,
-        "name": str(content.get("name", f"wall {number}")),
-        "kind": _kind(str(content.get("name", "wall"))),
-        "recommended": recommended,
-        "reason": reason,
-        "area_m2": round(size_m2, 3),
-        "painted_share": round(painted, 4),
-        "expected_mm_median": median if isinstance(median, float) else None,
-        "n_check_points": accuracy.get("n_check_points", 0),
-        "orthoimage": image,
-    }
-
-
-def _included(
-    products: Path, cells: Sequence[RecordedCell], images: Mapping[int, object]
-) -> Iterator[dict[str, JsonValue]]:
-    """Surfaces that a wall of these images shows already."""
-    found: dict[int, int] = {}
-    for cell in cells:
-        for number, _, content in _sidecars(products / cell_file_name(cell.address), _DEPTH):
-            included = content.get("includes_walls")
-            if number in images and isinstance(included, list):
-                found |= {int(other): number for other in included}
-    for number, wall in found.items():
-        if number not in images:
-            yield {
-                "number": number,
-                "name": f"wall {number}",
-                "kind": "wall",
-                "recommended": False,
-                "reason": f"already included in wall {wall}",
-                "area_m2": None,
-                "painted_share": None,
-                "expected_mm_median": None,
-                "n_check_points": 0,
-                "orthoimage": None,
-            }
-
-
-def _kind(name: str) -> str:
-    """The first word of a wall's name: wall, floor, ceiling, or what its method calls it."""
-    return name.split(" ", maxsplit=1)[0] or "wall"
-
-
-def _rank(wall: Mapping[str, JsonValue]) -> tuple[bool, float, int]:
-    """Recommended ones first, of these the largest painted area."""
-    area, share = wall["area_m2"], wall["painted_share"]
-    painted = area * share if isinstance(area, float) and isinstance(share, float) else 0.0
-    return not wall["recommended"], -painted, int(str(wall["number"]))
 
 
 PRODUCTS_FOLDER: Final = "products"
