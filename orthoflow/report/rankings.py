@@ -56,13 +56,14 @@ class Value:
 
 
 def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
-    """Mark the best and the worst of each group; a group whose values are all alike has neither.
+    """Mark the best and the worst of each group; a group whose values are all equal has neither.
 
-    A value whose distance from the best is not above both their standard deviations together (in
-    quadrature), or where one of them has no repeats, or repeats of one value, not above a hundredth
-    of the best (repeats or not a tenth of a memory, three tenths of a time), or just of rounding,
-    is marked as near the best and never as worst; the best is then only among the best, too. The
-    worst is marked where every other value is as far from it, and where nobody of its group found
+    Groups with a value of a single run are not ranked: on another machine, or with another seed,
+    another may be the best. A value whose distance from the best is not above both their standard
+    deviations together (in quadrature), or where one of them has repeats of one value, not above a
+    hundredth of the best (a tenth of a memory, three tenths of a time), or just of rounding, is
+    marked as near the best and never as worst; the best is then only among the best, too. The worst
+    is marked where every other value is as far from it, and where nobody of its group found
     nothing, which is worse; costs, which a method may just not have, are ranked all the same. What
     sums up fewer items than another of its group is not ranked: who refuses the difficult photos
     has smaller errors of the rest.
@@ -85,7 +86,7 @@ def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
         for index in [index for index in members if values[index].n_items < most]:
             members.remove(index)
             marked[index] = replace(values[index], mark=Mark.FEWER)
-        if not members:
+        if not members or any(math.isnan(values[index].spread) for index in members):
             continue
         scores = {index: badness(values[index].sort, sense) for index in members}
         best = values[min(members, key=scores.__getitem__)]

@@ -15,7 +15,7 @@ def marks(*values: Value, sense: Sense = Sense.LESS) -> list[str]:
     return [value.mark.name for value in rank(values, sense)]
 
 
-def of(sort: float, spread: float = math.nan, group: str = "") -> Value:
+def of(sort: float, spread: float = 0.0, group: str = "") -> Value:
     return Value(text=str(sort), sort=sort, spread=spread, group=group)
 
 
@@ -28,7 +28,7 @@ def test_the_smallest_is_best_and_the_largest_is_worst() -> None:
 
 def test_who_sums_up_fewer_photos_is_not_ranked() -> None:
     def over(sort: float, n_items: float, group: str = "") -> Value:
-        return Value(text="x", sort=sort, n_items=n_items, group=group)
+        return Value(text="x", sort=sort, spread=0.0, n_items=n_items, group=group)
 
     assert marks(over(7.0, 2), over(9.0, 3), over(11.0, 3)) == ["FEWER", "BEST", "WORST"]
     assert marks(over(7.0, 2), over(9.0, 3)) == ["FEWER", "NONE"]
@@ -39,6 +39,17 @@ def test_who_sums_up_fewer_photos_is_not_ranked() -> None:
         "WORST",
     ]
     assert marks(of(7.0), over(9.0, 3)) == ["BEST", "WORST"]
+
+
+def test_single_runs_are_not_ranked() -> None:
+    single = of(3.0, math.nan)
+    assert marks(of(1.0, 0.1), single, of(9.0, 0.1)) == ["NONE", "NONE", "NONE"]
+    # Those of other data have repeats.
+    assert marks(of(1.0, 0.1, "a"), of(9.0, 0.1, "a"), replace(single, group="b")) == [
+        "BEST",
+        "WORST",
+        "NONE",
+    ]
 
 
 def test_a_ratio_is_best_at_one_and_as_bad_at_half_as_at_double() -> None:
@@ -59,10 +70,10 @@ def test_what_is_alike_has_neither_and_nobody_leads_in_what_several_share() -> N
     [
         (0.3, 0.4, ["NEAR", "NEAR"]),
         (0.3, 0.39, ["BEST", "NONE"]),
-        (math.nan, 0.5, ["NEAR", "NEAR"]),
-        (0.5, math.nan, ["NEAR", "NEAR"]),
-        (math.nan, 0.49, ["BEST", "NONE"]),
-        (math.nan, math.nan, ["BEST", "NONE"]),
+        (0.0, 0.5, ["NEAR", "NEAR"]),
+        (0.5, 0.0, ["NEAR", "NEAR"]),
+        (0.0, 0.49, ["BEST", "NONE"]),
+        (0.0, 0.0, ["BEST", "NONE"]),
     ],
 )
 def test_a_value_within_both_spreads_of_the_best_is_near_it(
@@ -74,7 +85,7 @@ def test_a_value_within_both_spreads_of_the_best_is_near_it(
 
 @pytest.mark.parametrize(
     ("spread", "worst_spread", "worst"),
-    [(0.3, 0.4, "NONE"), (0.3, 0.39, "WORST"), (math.nan, 0.5, "NONE")],
+    [(0.3, 0.4, "NONE"), (0.3, 0.39, "WORST"), (0.0, 0.5, "NONE")],
 )
 def test_a_value_within_both_spreads_of_another_is_not_worst(
     spread: float, worst_spread: float, worst: str
@@ -145,7 +156,7 @@ def test_errors_of_both_signs_are_as_far_apart_as_their_sizes() -> None:
 
 
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
-    for spread in (math.nan, 0.01):
+    for spread in (0.0, 0.01):
         times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
         found = rank(times, Sense.LESS, "s")
         assert [value.mark.name for value in found] == ["NEAR", "NEAR", "NONE", "WORST"]
