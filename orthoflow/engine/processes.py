@@ -6,6 +6,7 @@ the system has that, spawned elsewhere.
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -66,19 +67,26 @@ def start_step(task: Task) -> tuple[BaseProcess, Connection]:
     )
     ours, theirs = context.Pipe(duplex=False)
     arguments = (task, theirs, _variables(task))
+    failure: Exception | None = None
     with theirs, _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
         # A server that somebody killed is noticed by its silence, and started anew.
         for _ in range(2):
             process = context.Process(target=run_step, args=arguments, name=task.address)
-            with suppress(OSError, EOFError):
+            try:
                 process.start()
+            except (OSError, EOFError) as error:
+                failure = error
+            else:
                 return process, ours
     ours.close()
-    raise StepFailedError(
-        f"no process could be started for {task.who}: the machine has too little memory or allows "
-        f"too few processes"
+    is_of_files = isinstance(failure, OSError) and failure.errno in (errno.EMFILE, errno.ENFILE)
+    why = (
+        "too many files are open: raise the limit (`ulimit -n`)"
+        if is_of_files
+        else "the machine has too little memory or allows too few processes"
     )
+    raise StepFailedError(f"no process could be started for {task.who}: {why}") from failure
 
 
 def ask_to_end(process: BaseProcess) -> None:

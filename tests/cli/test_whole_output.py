@@ -468,7 +468,7 @@ TARGETS = (*FORMATS, None)
     [
         (
             {"cell": "a"},
-            {*FORMATS} - {"csv", "prov", "ro-crate", "stac"},
+            {*FORMATS} - {"csv", "prov", "ro-crate", "stac", "tables"},
             "--step belongs to --to colmap",
         ),
         ({"license_text": ""}, {"ro-crate"}, "--license belongs to --to ro-crate"),

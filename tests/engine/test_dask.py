@@ -46,12 +46,6 @@ steps:
   third: {use: work.noise, in: {numbers: second.numbers}}
 """
 
-ROWS = """
-steps:
-  first: {use: make.rows, params: {count: 6}}
-  told: {use: tell.sums, in: {rows: first.rows}}
-"""
-
 
 @contextmanager
 def cluster(
@@ -141,16 +135,6 @@ def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     )
 
 
-def test_idle_workers_share_the_items_of_a_step(office: Office) -> None:
-    outcome, _ = office.run(ROWS)
-    alone = office.world.run(ROWS, into="alone", executor="inline")
-    told, whole = outcome.results["told"], alone.results["told"]
-    assert told.outputs == whole.outputs
-    assert told.metrics == whole.metrics
-    assert "part 2 of 2 (row3 to row5)" in told.log
-    assert "part " not in whole.log
-
-
 def test_workers_of_its_own_take_no_more_cores_than_there_are(office: Office) -> None:
     slow = "use: work.slow, in: {numbers: first.numbers}, params: {steps: 5, amount: "
     steps = "  first: {use: make.range}\n"
@@ -184,33 +168,6 @@ def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
     said = [result.error_message for name, result in outcome.results.items() if name != "first"]
     assert sorted("needed more memory" in text for text in said) == [False, True]
     assert not running
-
-
-def test_workers_that_share_one_core_share_no_step(office: Office) -> None:
-    fresh = World(folder=office.world.folder / "one-core", site=office.world.site)
-    fresh.folder.mkdir()
-    outcome = fresh.run(ROWS, executor="dask", jobs=2, cores=1)
-    assert outcome.status == "ok"
-    assert "part " not in outcome.results["told"].log
-
-
-def test_a_part_whose_worker_is_killed_runs_again(office: Office) -> None:
-    killed: set[int] = set()
-
-    def listen(event: RunEvent) -> None:
-        if isinstance(event, CellProgress) and event.text == "row1" and not killed:
-            killed.update(worker.pid for worker in office.cluster.workers.values())
-            os.kill(min(killed), signal.SIGKILL)
-
-    world = office.world
-    address = office.cluster.scheduler_address
-    plan = world.plan(
-        ROWS, sets=("told.wait_s=0.3",), executor="dask", scheduler=address, force=("told",)
-    )
-    outcome = execute(plan, world.folder / "part-lost", world.store, listen)
-    alone = world.run(ROWS, into="whole", executor="inline", force=("told",))
-    assert killed
-    assert outcome.results["told"].outputs == alone.results["told"].outputs
 
 
 def test_steps_fail_on_workers_as_they_do_here(office: Office) -> None:

@@ -164,25 +164,6 @@ def a_call(task: Task, **more: Any) -> Any:
     return call
 
 
-class Calls:
-    """A method that says by which way it was called."""
-
-    def run(self, inputs: Any, params: Any, ctx: Any) -> object:
-        return ("run", inputs, params, ctx)
-
-    def join(self, inputs: Any, parts: Any, params: Any, ctx: Any) -> object:
-        return ("join", inputs, parts, params, ctx)
-
-
-def test_a_method_runs_as_a_whole_or_joins_its_parts() -> None:
-    call = a_call(a_task(), _context="ctx")
-    method: Any = Calls()
-    assert call._compute(method, "in", (), "params") == ("run", "in", "params", "ctx")
-    assert call._compute(method, "in", ("a", "b"), "params") == (
-        *("join", "in", ("a", "b"), "params", "ctx"),
-    )
-
-
 def test_processor_time_is_without_loading_and_looking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker.time, "process_time", lambda: 10.0)
     monkeypatch.setattr(worker, "children_processor_s", lambda: 4.0)
