@@ -261,7 +261,7 @@ KNOWN: Final = {
         target="FIGURE",
         file="a.bmp",
         content=b"BM" + bytes(200),
-        words="is a BMP file: expected JPEG, PNG or TIFF",
+        words="is BMP, which is not read: convert it",
     ),
     # Scans as text.
     "a line of 60 MB": Known(
