@@ -24,7 +24,7 @@ DEEPER: Final = 257
 _PLAIN_SHARE: Final = 0.98
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
-_TONE_SAMPLE: Final = 1_000_000
+_TONE_SAMPLE: Final = 40_000
 # Smaller ones are not judged.
 _TONE_CELLS_MIN: Final = 2000
 

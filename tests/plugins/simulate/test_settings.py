@@ -82,13 +82,14 @@ def test_records_of_rooms_as_they_always_were_do_not_change(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     _, _, usual, _ = planned(monkeypatch, tmp_path)
-    later = {"decoration", "design_seed", "photo_exposure_share", "n_passers_by"}
+    later = {"decoration", "design_seed", "photo_exposure_share", "n_passers_by", "turn_deg"}
     assert set(usual) == set(Params.model_fields) - later
     changed = {
         "decoration": "drawn",
         "design_seed": 7,
         "photo_exposure_share": 0.2,
         "n_passers_by": 3,
+        "turn_deg": 12.0,
     }
     _, rng, settings, _ = planned(monkeypatch, tmp_path, **changed)
     assert {name: settings[name] for name in later} == changed
