@@ -184,8 +184,8 @@ NOT_COMPARED: Final = DiagnosticSpec(
 NOT_TRACED: Final = DiagnosticSpec(
     code="truth-not-traced",
     severity="warning",
-    text="displacements are not traced where {names} painted: the cameras have no oriented photo of "
-    "that name",
+    text="displacements are not traced where {names} painted: the cameras have no oriented photo "
+    "of that name",
     rank_by="n",
 )
 
