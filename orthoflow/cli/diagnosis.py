@@ -125,6 +125,7 @@ LIBRARIES: Final = (
         module="open3d",
         use="comparators of open3d; the default methods work without it",
     ),
+    Library(distribution="fonttools", module="fontTools", use="fonts of the system in sheets"),
     Library(distribution="ezdxf", module="ezdxf", use="CAD drawings: --to dxf"),
     Library(distribution="reportlab", module="reportlab", use="sheets: --to sheet"),
     Library(
