@@ -154,7 +154,7 @@ def open_file(path: Path) -> BufferedReader:
 
 @contextmanager
 def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Iterator[None]:
-    """Say what is wrong with a file that is opened and read in here, as an `InputError`.
+    """State what is wrong with a file that is opened and read in here, as an `InputError`.
 
     Args:
         path: the file.

@@ -149,7 +149,7 @@ class _DatabaseLock:
 
 
 def file_lock(path: Path, descriptor: int) -> FileLock:
-    """Give the lock of a file.
+    """Return the lock of a file.
 
     Args:
         path: of the file.

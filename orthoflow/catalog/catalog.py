@@ -168,7 +168,7 @@ class Catalog:
     broken: tuple[BrokenPlugin, ...] = ()
 
     def method(self, method_id: str) -> MethodEntry:
-        """Give a method that can be loaded.
+        """Return a method that can be loaded.
 
         Raises:
             WorkflowError: nobody brings a method of that id.
@@ -190,7 +190,7 @@ class Catalog:
         return entry
 
     def product_class(self, type_name: str) -> type[Product]:
-        """Give the class of a product type.
+        """Return the class of a product type.
 
         Raises:
             PluginError: nobody brings the type, several do, or it fails to import.
@@ -221,7 +221,7 @@ class Catalog:
         return cls
 
     def publisher(self, type_name: str) -> Publisher | None:
-        """Give what writes the files of a product type; None when there are none to write.
+        """Return what writes the files of a product type; None when there are none to write.
 
         Raises:
             PluginError: nobody brings the type, several do, or its publisher fails to import.

@@ -209,7 +209,7 @@ def _describe_failure(
 
 
 def _way_out(entry: EntryPoint, error: BaseException) -> str:
-    """Say who names a module that does not exist; nothing of any other failure."""
+    """State who names a module that does not exist; nothing of any other failure."""
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing is None or not f"{entry.module}.".startswith(f"{missing}."):
         return ""

@@ -38,7 +38,7 @@ class DistributionInfo:
 
 
 def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
-    """Say where an entry point comes from, without importing it."""
+    """State where an entry point comes from, without importing it."""
     code = package_path(entry_point.module)
     folder = code if code is not None and code.is_dir() else None
     distribution = entry_point.dist

@@ -126,7 +126,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
 
 
 def product_complaint(cls: type[Product]) -> str:
-    """Say which name in the class of a product is none of its fields; empty when all are."""
+    """State which name in the class of a product is none of its fields; empty when all are."""
     if not hasattr(cls, "__dataclass_fields__"):
         return f"{cls.__qualname__} must be a frozen dataclass"
     known = dict.fromkeys(_names_within(cls, set()))

@@ -15,7 +15,7 @@ _LONGEST_NAME: Final = 200
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Give the known name most like another, or nothing when none is near.
+    """Return the known name most like another, or nothing when none is near.
 
     >>> nearest("hugh2d", ["hough2d", "ransac"])
     'hough2d'
@@ -28,7 +28,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Give ` (did you mean X?)` for the nearest known name, or nothing when none is near.
+    """Return ` (did you mean X?)` for the nearest known name, or nothing when none is near.
 
     >>> did_you_mean("gsd", ["gsd_m", "buffer_m"])
     ' (did you mean gsd_m?)'
@@ -40,7 +40,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def describe_error(error: BaseException) -> str:
-    r"""Give class and message of an error in one line.
+    r"""Return class and message of an error in one line.
 
     >>> describe_error(ValueError("no such\n  plane"))
     'ValueError: no such plane'

@@ -87,7 +87,7 @@ class Surroundings:
 
 
 def look_around(path: str, methods: str) -> Surroundings:
-    """Say what a worker sees: runs on each before it gets a task."""
+    """State what a worker sees: runs on each before it gets a task."""
     try:
         seen = Path(path).read_text(encoding="utf-8")
     except OSError as error:
@@ -122,7 +122,7 @@ def run_attempt(order: Order) -> str:
 
 
 def describe_loss(who: str, times: int) -> str:
-    """Say that a task was given up because workers were lost under it."""
+    """State that a task was given up because workers were lost under it."""
     lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
     return f"{who} was given up: {lost}; the logs of the workers may say why"
 

@@ -46,7 +46,7 @@ class FileDigests:
         self._is_dirty = False
 
     def digest_all(self, paths: Iterable[Path]) -> tuple[FileRef, ...]:
-        """Give the digests of files, in their order; large new files are read in parallel.
+        """Return the digests of files, in their order; large new files are read in parallel.
 
         Raises:
             InputError: a file cannot be read.
@@ -54,7 +54,7 @@ class FileDigests:
         return tuple(in_order(self.digest, paths, threads=4))
 
     def digest(self, path: Path) -> FileRef:
-        """Give the digest of one file.
+        """Return the digest of one file.
 
         Raises:
             InputError: the file cannot be read, or has a name that a record cannot take.
@@ -137,7 +137,7 @@ def _identity(state: os.stat_result) -> str:
 
 
 def file_sha256(path: Path) -> str:
-    """Give the SHA-256 of a file as 64 hexadecimal digits.
+    """Return the SHA-256 of a file as 64 hexadecimal digits.
 
     Raises:
         OSError: the file cannot be read.
@@ -147,7 +147,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _read_memo(memo: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Give identity -> digest, and digest -> path."""
+    """Return identity -> digest, and digest -> path."""
     try:
         text = memo.read_text(encoding="utf-8")
         content = parse_json(text) if is_checked(text) else None

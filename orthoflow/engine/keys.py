@@ -138,7 +138,7 @@ def input_digest(files: Sequence[RecordedFile]) -> str:
 
 
 def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -> CellKey:
-    """Give the key of a cell whose inputs are known.
+    """Return the key of a cell whose inputs are known.
 
     Args:
         cell: the cell.

@@ -430,7 +430,7 @@ def _reason_of_silence(run: _Running) -> OrthoflowError:
 
 
 def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
-    """Say how a process ended that left no result.
+    """State how a process ended that left no result.
 
     Args:
         who: method and distribution, as `Task.who` has them.
@@ -450,7 +450,7 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
 
 
 def describe_memory(who: str, n_bytes: int) -> StepFailedError:
-    """Say that a step was stopped for want of memory."""
+    """State that a step was stopped for want of memory."""
     return StepFailedError(
         f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
         f"stopped); give it less data or coarser parameters"
@@ -458,7 +458,7 @@ def describe_memory(who: str, n_bytes: int) -> StepFailedError:
 
 
 def describe_timeout(who: str, limit_s: float) -> StepFailedError:
-    """Say that a step took longer than its workflow allows."""
+    """State that a step took longer than its workflow allows."""
     return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
 
 

@@ -250,7 +250,7 @@ class LoadingMeter:
             return self._processor_s
 
     def clock_s(self) -> float:
-        """Give seconds as `time.perf_counter`, but stand still while something is loaded."""
+        """Return seconds as `time.perf_counter`, but stand still while something is loaded."""
         with self._lock:
             return time.perf_counter() - self.total_s
 

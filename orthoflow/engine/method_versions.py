@@ -30,7 +30,7 @@ def methods_text(methods: Mapping[str, MethodFacts]) -> str:
 
 
 def misfit(methods: str) -> str:
-    """Say in what the methods installed here differ from those of a plan; empty if nowhere."""
+    """State in what the methods installed here differ from those of a plan; empty if nowhere."""
     planned = json.loads(methods)
     try:
         here = json.loads(_methods_here(tuple(planned)))

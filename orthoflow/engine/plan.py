@@ -409,7 +409,7 @@ def _product_targets(
 
 
 def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
-    """Say what changed since the most similar earlier result of the same method.
+    """State what changed since the most similar earlier result of the same method.
 
     Args:
         key: of the cell.

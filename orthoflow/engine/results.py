@@ -92,7 +92,7 @@ class CellResult(CellOutcome):
 
 
 def result_to_json(result: CellResult) -> str:
-    """Give a result as JSON text."""
+    """Return a result as JSON text."""
     content = _codec().dump_python(result, mode="json")
     text = json.dumps({"format": FORMAT, **content}, allow_nan=False, ensure_ascii=False)
     return with_digest(text)

@@ -239,12 +239,12 @@ class _Run:
                 self._take(end)
 
     def outcome(self) -> RunOutcome:
-        """Give what the run left, in the order of the plan."""
+        """Return what the run left, in the order of the plan."""
         self._journal.write(RunWent(event="ended", time=now()))
         return self._outcome_of(item.cell.address for item in self._plan.cells)
 
     def so_far(self) -> RunOutcome:
-        """Give what there is, without cells that were asked to stop."""
+        """Return what there is, without cells that were asked to stop."""
         return self._outcome_of(
             address
             for item in self._plan.cells
@@ -526,7 +526,7 @@ class _TaskMaker:
     run_id: str
 
     def make(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
-        """Give the task of a cell.
+        """Return the task of a cell.
 
         Args:
             cell: the cell.
@@ -581,7 +581,7 @@ def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
 def _executor_of(
     plan: RunPlan, scratch: Path, tell: Tell, is_asked_to_stop: Callable[[], bool]
 ) -> Executor:
-    """Give the executor that the options of a run name.
+    """Return the executor that the options of a run name.
 
     Args:
         plan: of the run.

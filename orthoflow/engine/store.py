@@ -197,7 +197,7 @@ class Store:
         self._found_damaged: dict[str, str] = {}
 
     def file_digests(self) -> FileDigests:
-        """Give the memory of input files' digests; call its `save` when done."""
+        """Return the memory of input files' digests; call its `save` when done."""
         return FileDigests(self.folder / "digests.json")
 
     @contextlib.contextmanager
@@ -362,7 +362,7 @@ class Store:
         return not self.damage(name, again=again)
 
     def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
-        """Say which part of an object is damaged, and set it aside; empty when it is sound.
+        """State which part of an object is damaged, and set it aside; empty when it is sound.
 
         Args:
             name: of the object: digest of a product, or SHA-256 of a figure.
@@ -432,7 +432,7 @@ class Store:
         return TakenResult(result=result)
 
     def damage_of_result(self, key: str) -> str:
-        """Say what makes a result useless, and set it aside; empty when all of it is there.
+        """State what makes a result useless, and set it aside; empty when all of it is there.
 
         Raises:
             StoreError: it cannot be set aside.
@@ -567,7 +567,7 @@ class Store:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Give the store of a folder, if there is one: to look for it makes none."""
+    """Return the store of a folder, if there is one: to look for it makes none."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 
@@ -660,7 +660,7 @@ class Failures:
 
     @classmethod
     def of_store(cls, store_folder: Path) -> Failures:
-        """Give those that a store keeps."""
+        """Return those that a store keeps."""
         return cls(store_folder / "failures")
 
     def remember(self, key: str, sentence: str) -> None:
@@ -676,7 +676,7 @@ class Failures:
             self._file(key).unlink()
 
     def sentence(self, key: str) -> str:
-        """Say how the cell failed; empty when it did not, or when nobody knows any more."""
+        """State how the cell failed; empty when it did not, or when nobody knows any more."""
         try:
             text = read_whole(self._file(key), _LARGEST_FILE)
             content = parse_json(text) if is_checked(text) else None

@@ -342,7 +342,7 @@ def run_task(
 
 
 def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
-    """Give the result of a cell that failed."""
+    """Return the result of a cell that failed."""
     # Of a file all problems come at once, a line each.
     said = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
@@ -356,7 +356,7 @@ def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellRes
 
 
 def blank_result(task: Task) -> CellResult:
-    """Give a result with everything that is known before a task runs."""
+    """Return a result with everything that is known before a task runs."""
     return CellResult(
         status="ok",
         key=task.key,
@@ -418,7 +418,7 @@ class _News:
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """Say what is compiled; when that is over, what was said before."""
+        """State what is compiled; when that is over, what was said before."""
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 

@@ -112,7 +112,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """Give the content of a calibration file."""
+    """Return the content of a calibration file."""
     lines = [
         "# Pixels as OpenCV counts them: the centre of the first pixel is (0, 0).",
         "# distortion: k1, k2, p1, p2, k3. The first entry that matches a photo's name holds.",
@@ -150,7 +150,7 @@ def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
 def lens_for(
     calibration: CalibratedLenses, photo_name: str, width: int, height: int
 ) -> Intrinsics | FisheyeLens | None:
-    """Give the calibrated lens of a photo; None when no entry matches its name.
+    """Return the calibrated lens of a photo; None when no entry matches its name.
 
     Args:
         calibration: the calibrated lenses.
@@ -242,7 +242,7 @@ _FIELDS_ABOVE: Final = len(_Lens.model_fields) - 1
 
 
 def _lens(given: Mapping[str, Any], terms: tuple[float, ...]) -> Intrinsics | FisheyeLens:
-    """Give the lens of an entry, in our convention."""
+    """Return the lens of an entry, in our convention."""
     pixels = {key: given[key] for key in _REQUIRED}
     pixels |= {key: pixels[key] + HALF_PIXEL for key in ("cx", "cy")}
     if not given["model"]:
@@ -353,7 +353,7 @@ def _place(entry: Entry, location: Sequence[int | str]) -> tuple[Position, str, 
 
 
 def _sentence(error: ErrorDetails, value: Value) -> str:
-    """Say what pydantic found wrong with a field, and the way out."""
+    """State what pydantic found wrong with a field, and the way out."""
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return message

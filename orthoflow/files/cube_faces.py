@@ -102,7 +102,7 @@ class PanoramaFace:
 def faces_of(
     panorama: bytes, stem: str, width: int, used: NDArray[np.bool_] | None = None
 ) -> tuple[PanoramaFace, ...]:
-    """Give the faces of a panorama as photos `<stem>_<face>.png`.
+    """Return the faces of a panorama as photos `<stem>_<face>.png`.
 
     Args:
         panorama: the file's bytes.
@@ -411,7 +411,7 @@ class FisheyeFace:
 def fisheye_faces(
     photo: bytes, stem: str, lens: FisheyeLens, used: NDArray[np.bool_] | None = None
 ) -> tuple[FisheyeFace, ...]:
-    """Give what a fisheye's photo shows as photos `<stem>_<face>.png`.
+    """Return what a fisheye's photo shows as photos `<stem>_<face>.png`.
 
     Args:
         photo: the file's bytes.

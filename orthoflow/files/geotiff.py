@@ -129,7 +129,7 @@ class GridPlace:
 
 
 def local_crs_wkt(name: str) -> str:
-    """Give the WKT of the coordinate system of a wall, by its name."""
+    """Return the WKT of the coordinate system of a wall, by its name."""
     return _LOCAL_CRS_WKT.format(re.sub(r"[^\w .,()-]", "_", name, flags=re.ASCII))
 
 
@@ -149,7 +149,7 @@ def require_map_crs(crs: str) -> None:
 
 
 def epsg_of(map_crs: str | None) -> int | None:
-    """Give the EPSG code of a map's coordinate system; None for `site`, and for any other text.
+    """Return the EPSG code of a map's coordinate system; None for `site`, and for any other text.
 
     >>> epsg_of("EPSG:25832"), epsg_of("site"), epsg_of(None)
     (25832, None, None)
@@ -160,7 +160,7 @@ def epsg_of(map_crs: str | None) -> int | None:
 
 
 def epsg_wkt(epsg: int) -> str:
-    """Give the WKT of an EPSG code; empty where PROJ does not know it."""
+    """Return the WKT of an EPSG code; empty where PROJ does not know it."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
@@ -353,7 +353,7 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
 
 
 def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0) -> str:
-    """Give the world file of a wall's raster, for programs that read no GeoTIFF tags.
+    """Return the world file of a wall's raster, for programs that read no GeoTIFF tags.
 
     Six lines: step along a row, two rotations, step down a column, and the centre of the first
     pixel.

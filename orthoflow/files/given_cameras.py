@@ -115,7 +115,7 @@ class GivenCamera:
     note: str = ""
 
     def of_face(self, face: str) -> GivenCamera:
-        """Give the camera of a face of the cube that a fisheye's photo becomes."""
+        """Return the camera of a face of the cube that a fisheye's photo becomes."""
         if not isinstance(self.lens, FisheyeLens) or self.rotation is None:
             return self
         problem = problem_of(self.lens)
@@ -297,7 +297,7 @@ def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.f
 
 
 def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
-    """Give a lens that can be one.
+    """Return a lens that can be one.
 
     Raises:
         InputError: it cannot.

@@ -153,7 +153,7 @@ class _Document:
         return len(self.nodes)
 
     def finished(self, root: dict[str, JsonValue]) -> bytes:
-        """Give the file."""
+        """Return the file."""
         n_images = len(self.images)
         sampler = {"magFilter": _LINEAR, "minFilter": _TRILINEAR}
         document: dict[str, JsonValue] = {
@@ -258,7 +258,7 @@ class WallMesh:
 
 
 def flat_mesh(frame: WallFrame) -> WallMesh:
-    """Give the rectangle of a wall."""
+    """Return the rectangle of a wall."""
     places = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float32)
     return WallMesh(
         vertices=_lifted(frame, places, np.zeros(4)),
@@ -268,7 +268,7 @@ def flat_mesh(frame: WallFrame) -> WallMesh:
 
 
 def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
-    """Give the surface of a wall; its rectangle where nothing of its depth is known.
+    """Return the surface of a wall; its rectangle where nothing of its depth is known.
 
     Nodes are means of cells, at most `LONGEST_NODES` along a side. Triangles with a node of unknown
     depth are left out; steps become slopes one node wide.

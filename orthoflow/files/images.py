@@ -160,7 +160,7 @@ def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def grey_cells(values: NDArray[np.floating]) -> Cells:
-    """Give the picture of `stretch_to_grey` part by part, with NaN for what is not shown.
+    """Return the picture of `stretch_to_grey` part by part, with NaN for what is not shown.
 
     Of a raster (rows, cols) of more than 64 million cells the percentiles are those of some rows.
     """
@@ -195,7 +195,7 @@ def _stretched(
 def preview_png(
     image: NDArray[np.uint8], shown: NDArray[np.bool_], *, longest_side_px: int = PREVIEW_SIDE_PX
 ) -> bytes:
-    """Give a small PNG of a raster, transparent where nothing is shown.
+    """Return a small PNG of a raster, transparent where nothing is shown.
 
     Args:
         image: (rows, cols) grey or (rows, cols, 3) RGB.
@@ -206,7 +206,7 @@ def preview_png(
 
 
 def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
-    """Give the PNG of `preview_png` of a raster that is made part by part, never as a whole."""
+    """Return the PNG of `preview_png` of a raster that is made part by part, never as a whole."""
     return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
 
 
@@ -216,14 +216,14 @@ def preview_webp(
     *,
     longest_side_px: int = PREVIEW_SIDE_PX,
 ) -> bytes:
-    """Give the picture of `preview_png` as lossy WebP."""
+    """Return the picture of `preview_png` as lossy WebP."""
     return cells_webp(shown.shape, _cells_of(image, shown), longest_side_px=longest_side_px)
 
 
 def cells_webp(
     shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
 ) -> bytes:
-    """Give the WebP of `preview_webp` of a raster that is made part by part, never as a whole.
+    """Return the WebP of `preview_webp` of a raster that is made part by part, never as a whole.
 
     Where it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
     """
@@ -233,7 +233,7 @@ def cells_webp(
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
-    """Give an encoded image as WebP whose longest side is at most so many pixels.
+    """Return an encoded image as WebP whose longest side is at most so many pixels.
 
     Raises:
         InputError: the bytes are no image.

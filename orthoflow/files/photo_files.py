@@ -99,7 +99,7 @@ def photo_format(encoded: bytes) -> str | None:
 
 
 def unreadable(encoded: bytes) -> str:
-    """Say what a file is that cannot be read as a photo, and the way out; empty where it can."""
+    """State what a file is that cannot be read as a photo, and the way out; empty where it can."""
     kind = photo_format(encoded)
     if kind is None:
         return (
@@ -662,7 +662,7 @@ def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) -> str:
-    """Say that a value cannot be; empty when it can, or is absent."""
+    """State that a value cannot be; empty when it can, or is absent."""
     shortest, longest = possible_mm
     if value_mm is None or shortest <= value_mm <= longest:
         return ""

@@ -360,7 +360,7 @@ def _publish_raster(
 
 
 def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
-    """Give what previews are made of; of deep images part by part."""
+    """Return what previews are made of; of deep images part by part."""
     return lambda part: (eight_bits(image.rgb[part]), shown[part])
 
 

@@ -116,7 +116,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
 
 
 def shown_value(value: object) -> str:
-    """Give what a sidecar holds for a message, cut where it is long."""
+    """Return what a sidecar holds for a message, cut where it is long."""
     text = repr(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]} ..."
 
@@ -189,7 +189,7 @@ def frame_of_raster(
 
 
 def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
-    """Give where a published GeoTIFF lies, and the sidecar beside it that says so.
+    """Return where a published GeoTIFF lies, and the sidecar beside it that says so.
 
     Raises:
         InputError: one of them cannot be read.
@@ -259,7 +259,7 @@ def numbers(values: NDArray[np.generic]) -> JsonValue:
 
 
 def number(value: float | None) -> JsonValue:
-    """Give a number, or None for what is absent or not finite."""
+    """Return a number, or None for what is absent or not finite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
@@ -337,7 +337,7 @@ class OrthoFile:
         return self._read(slice(0, rows), shape)
 
     def bands(self, n_rows: int) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
-        """Give colours and what is shown, so many rows at a time from the top.
+        """Return colours and what is shown, so many rows at a time from the top.
 
         Raises:
             InputError: the file cannot be read.

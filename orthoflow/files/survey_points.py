@@ -181,7 +181,7 @@ class _Table:
             raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
 
     def rows(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Give line and cells of each row that has a cell for every column."""
+        """Return line and cells of each row that has a cell for every column."""
         names = ",".join(self.required)
         text = text_of_file(
             self.path, MOST_BYTES, f"a CSV file of {self.content} with the columns {names}"
@@ -212,7 +212,7 @@ class _Table:
             self.add(line, f"only the names of the columns, no {self.content}")
 
     def numbers(self, line: int, cells: Mapping[str, str], keys: Collection[str]) -> list[float]:
-        """Give finite numbers; NaN for what is none."""
+        """Return finite numbers; NaN for what is none."""
         found = []
         for key in keys:
             cell = cells[key]

@@ -126,7 +126,7 @@ class Problems(Protocol):
 
 
 def plain(value: Value) -> JsonValue:
-    """Give a value without positions."""
+    """Return a value without positions."""
     if isinstance(value, Text):
         return value.value
     if isinstance(value, Listing):
@@ -135,7 +135,7 @@ def plain(value: Value) -> JsonValue:
 
 
 def describe(value: Value) -> str:
-    """Say what a value is, for messages: `the text "a"`, `a list`, `a mapping`, `5`."""
+    """State what a value is, for messages: `the text "a"`, `a list`, `a mapping`, `5`."""
     if isinstance(value, Listing):
         return "a list"
     if isinstance(value, Table):
@@ -144,7 +144,7 @@ def describe(value: Value) -> str:
 
 
 def describe_scalar(value: object) -> str:
-    """Say what a plain value is, for messages.
+    """State what a plain value is, for messages.
 
     >>> describe_scalar("0.003"), describe_scalar(0.003), describe_scalar(None)
     ('the text "0.003"', '0.003', 'nothing')
@@ -258,7 +258,7 @@ class _LimitedParser(Parser):
 
     # Any: as in ruamel.yaml.
     def get_event(self) -> Any:
-        """Give the next event.
+        """Return the next event.
 
         Raises:
             _UnreadableError: the document is too large or too deep.
@@ -297,7 +297,7 @@ _OPENED: Final = {
 
 
 def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
-    """Say what the parser stumbled over where it was written, not where it was noticed."""
+    """State what the parser stumbled over where it was written, not where it was noticed."""
     problem, context = str(error.problem or ""), str(error.context or "")
     noticed = _mark_position(error.problem_mark)
     words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
@@ -416,7 +416,7 @@ class _Converter:
         return ScalarNode(_TAG + "float", meant, before.start_mark, behind.end_mark)
 
     def _key(self, node: Node, position: Position, path: str) -> tuple[str, bool]:
-        """Give a key and whether it is text."""
+        """Return a key and whether it is text."""
         if not isinstance(node, ScalarNode):
             self.log.add(position, path, "a key must be text, got a list or mapping")
             return "?", True

@@ -19,7 +19,7 @@ _BAND_CELLS: Final = 1 << 24
 
 
 def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """Give a zeroed array of a raster that is small enough; an `Allocate`."""
+    """Return a zeroed array of a raster that is small enough; an `Allocate`."""
     del name
     return np.zeros(shape, dtype=dtype)
 

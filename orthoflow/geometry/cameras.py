@@ -76,7 +76,7 @@ class ViewingCamera:
         )
 
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
-        """Give the same camera in a world whose origin is at (3,) of this one.
+        """Return the same camera in a world whose origin is at (3,) of this one.
 
         With survey coordinates of 10^6 m, project offsets through the shifted camera: the sum
         R x + t of large numbers would lose what float32 offsets keep.

@@ -46,7 +46,7 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Give an inlined function as Python runs it, for a few single calls."""
+    """Return an inlined function as Python runs it, for a few single calls."""
     return cast("Callable[..., Any]", getattr(kernel, "py_func", kernel))
 
 
@@ -158,7 +158,7 @@ class _Compilation(event.Listener):
         self._n_begun = 0
 
     def on_start(self, event: event.Event) -> None:
-        """Say what is compiled, and how many were in this process.
+        """State what is compiled, and how many were in this process.
 
         How many there will be nobody knows: what a step needs hangs on its data.
         """
@@ -170,7 +170,7 @@ class _Compilation(event.Listener):
         tell(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
-        """Say that it is there."""
+        """State that it is there."""
         self._depth -= 1
         if self._depth == 0:
             tell("")

@@ -240,7 +240,7 @@ _Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _kinds(
     some: AdjustedPoints, lengths_m: Sequence[Sequence[float] | NDArray[np.float64]]
 ) -> Iterator[tuple[list[_Direction], list[NDArray[np.float64]]]]:
-    """Give the directions of each kind of shared error, and its correlations (n, n) by part."""
+    """Return the directions of each kind of shared error, and its correlations (n, n) by part."""
     apart_m = np.linalg.norm(some.places[:, None] - some.places, axis=2)
     correlations = [
         np.sum([np.exp(-apart_m / length_m) for length_m in part], axis=0) for part in lengths_m
@@ -277,7 +277,7 @@ def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give the larger of two covariances (p, p), along each axis in which the first is one."""
+    """Return the larger of two covariances (p, p), along each axis in which the first is one."""
     root = _root(plain)
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ spread @ inverse.T)
@@ -287,7 +287,7 @@ def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[
 
 
 def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give R (p, p) with R R' the covariance, or a little more where rounding left it none."""
+    """Return R (p, p) with R R' the covariance, or a little more where rounding left it none."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:

@@ -53,7 +53,7 @@ def cell_values(
     intensity: NDArray[np.float32] | None = None,
     rgb: Colours | None = None,
 ) -> CellValues:
-    """Give values in the form that kernels are compiled for."""
+    """Return values in the form that kernels are compiled for."""
     return CellValues(
         depth_m,
         np.empty(0, dtype=np.float32) if intensity is None else intensity,
@@ -85,7 +85,7 @@ def interpolate(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Give cells what their surroundings hold, linear between them.
+    """Return cells what their surroundings hold, linear between them.
 
     A cell that lends nothing takes what lies around it on one surface: its own where its depth is
     known, else that of the nearest points, among equally near ones that of the point nearest the

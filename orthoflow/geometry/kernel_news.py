@@ -12,7 +12,7 @@ _listeners: list[Hear] = []
 
 @contextmanager
 def heard_by(hear: Hear) -> Iterator[None]:
-    """Tell a function of the kernels that are compiled while the block runs, in any thread.
+    """Report a function of the kernels that are compiled while the block runs, in any thread.
 
     Args:
         hear: gets `compiling NAME (3 so far)` when one is begun, and nothing, an empty text, when

@@ -76,7 +76,7 @@ class LensFreedom:
 
 
 def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
-    """Give how far a lens that nobody calibrated may be from one without any errors.
+    """Return how far a lens that nobody calibrated may be from one without any errors.
 
     Args:
         longer_px: longer side of its photos.
@@ -109,7 +109,7 @@ class Linear:
 
 
 def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
-    """Give a camera's values of what is free of the lens, the focal length as its logarithm."""
+    """Return a camera's values of what is free of the lens, the focal length as its logarithm."""
     values = {
         "focal": math.log(camera.fx),
         "aspect": math.log(camera.fy / camera.fx),
@@ -127,7 +127,7 @@ def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]
 
 
 def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom) -> ViewingCamera:
-    """Give a camera after a step (6 + free,) of an adjustment."""
+    """Return a camera after a step (6 + free,) of an adjustment."""
     moves = dict(zip(lens.names, step[POSE_PARAMETERS:].tolist(), strict=True))
     scale = _factor(moves.get("focal", 0.0))
     distortion = camera.distortion.copy()

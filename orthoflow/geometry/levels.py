@@ -30,26 +30,26 @@ _TONE_CELLS_MIN: Final = 2000
 
 
 def eight_bits(colours: Colours) -> NDArray[np.uint8]:
-    """Give colours in 8 bits: themselves, or 16 bits rounded."""
+    """Return colours in 8 bits: themselves, or 16 bits rounded."""
     if colours.dtype == np.uint8:
         return colours.view(np.uint8)
     return ((colours.astype(np.uint32) + DEEPER // 2) // DEEPER).astype(np.uint8)
 
 
 def sixteen_bits(colours: Colours) -> NDArray[np.uint16]:
-    """Give colours in 16 bits: themselves, or 8 bits times 257, of which nothing is lost."""
+    """Return colours in 16 bits: themselves, or 8 bits times 257, of which nothing is lost."""
     if colours.dtype == np.uint16:
         return colours.view(np.uint16)
     return colours.astype(np.uint16) * np.uint16(DEEPER)
 
 
 def in_levels(colours: Colours, level: Level) -> Colours:
-    """Give colours in 8 or in 16 bits."""
+    """Return colours in 8 or in 16 bits."""
     return eight_bits(colours) if level is np.uint8 else sixteen_bits(colours)
 
 
 def level_of(colours: Colours) -> Level:
-    """Say in which bits colours are."""
+    """State in which bits colours are."""
     return np.uint16 if colours.dtype == np.uint16 else np.uint8
 
 

@@ -101,7 +101,7 @@ def find_discs(
     first: int,
     end: int,
 ) -> None:
-    """Tell about which cells of some rows a disc holds a cell of the set.
+    """Report which cells of some rows a disc holds a cell of the set.
 
     Args:
         distances: (rows, cols + 2 radius) of `find_distances_down`, with columns more on both

@@ -180,7 +180,7 @@ def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
 
 
 def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
-    """Give the depth buffer of an empty world."""
+    """Return the depth buffer of an empty world."""
     return DepthBuffer(
         nearest=np.full((1, 1), np.inf, dtype=np.float32),
         reduction=float(max(camera.width, camera.height)),

@@ -33,17 +33,17 @@ class Plane:
         return points_world @ self.normal - self.offset_m
 
     def flipped(self) -> Plane:
-        """Give the same plane seen from the other side."""
+        """Return the same plane seen from the other side."""
         return Plane(normal=-self.normal, offset_m=-self.offset_m)
 
     def towards(self, viewpoint_world: NDArray[np.float64]) -> Plane:
-        """Give the same plane with its normal on the side of a viewpoint (3,)."""
+        """Return the same plane with its normal on the side of a viewpoint (3,)."""
         signed_m = float(viewpoint_world @ self.normal) - self.offset_m
         return self if signed_m >= 0.0 else self.flipped()
 
 
 def plane_through(points_world: NDArray[np.float64]) -> Plane:
-    """Give the plane through three points (3, 3); its normal follows the right-hand rule.
+    """Return the plane through three points (3, 3); its normal follows the right-hand rule.
 
     Raises:
         GeometryError: the points coincide or lie on one line.

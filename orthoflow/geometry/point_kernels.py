@@ -17,7 +17,7 @@ class Offsets(NamedTuple):
 
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
-    """Give arrays, mapped files among them, in the one form that kernels are compiled for."""
+    """Return arrays, mapped files among them, in the one form that kernels are compiled for."""
     views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
     for view in views:
         view.flags.writeable = False

@@ -197,7 +197,7 @@ def _close_up(entries: Entries, slot: int, after: int) -> int:
 
 @inlined
 def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Tell whether a thread owns a cell; owners are a power of two."""
+    """Return whether a thread owns a cell; owners are a power of two."""
     return (cell >> _RUN_SHIFT) & (owners - 1) == owner
 
 
@@ -221,7 +221,7 @@ def take_values(
     first: int,
     end: int,
 ) -> None:
-    """Give some cells the values of the points that won them.
+    """Return some cells the values of the points that won them.
 
     Args:
         winners: (cells,) of `WINNER`.

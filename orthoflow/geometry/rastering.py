@@ -48,7 +48,7 @@ def entries_inside(
     rows: slice | None = None,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> Iterator[Entries]:
-    """Give the points inside a slab, chunk by chunk, in their order.
+    """Return the points inside a slab, chunk by chunk, in their order.
 
     The yielded arrays are overwritten by the next chunk. Blocks of points whose box lies beside
     the slab are not read.
@@ -157,7 +157,7 @@ def topmost_points(
 
 
 def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
-    """Give cells that nobody has won yet."""
+    """Return cells that nobody has won yet."""
     winners = np.empty(n_cells, dtype=WINNER)
     in_parts(partial(kernels.empty_cells, winners), n_cells, threads=threads)
     return winners

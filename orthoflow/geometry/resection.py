@@ -136,7 +136,7 @@ def stated(
     groups: NDArray[np.intp] | None = None,
     soft_limit: float = math.inf,
 ) -> Resection:
-    """Say how good the camera is that `fitted` found, with the same arguments as `adjust`.
+    """State how good the camera is that `fitted` found, with the same arguments as `adjust`.
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -178,7 +178,7 @@ def fitted(
     lens: LensFreedom | None = None,
     soft_limit: float = math.inf,
 ) -> ViewingCamera:
-    """Give the camera that `adjust` finds, without saying how good it is.
+    """Return the camera that `adjust` finds, without saying how good it is.
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -190,7 +190,7 @@ def fitted(
 def first_step(
     seen: SeenPoints, camera: ViewingCamera, lens: LensFreedom, *, soft_limit: float = math.inf
 ) -> NDArray[np.float64]:
-    """Give how an adjustment of more unknowns would first change a camera (6 + free,).
+    """Return how an adjustment of more unknowns would first change a camera (6 + free,).
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -201,7 +201,7 @@ def first_step(
 
 
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
-    """Tell how points fit a camera, each against its own expected deviation."""
+    """Report how points fit a camera, each against its own expected deviation."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
     linear = linearised(near, seen.points_world - middle, LensFreedom())

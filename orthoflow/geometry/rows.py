@@ -18,7 +18,7 @@ class Rows:
         return len(next(iter(_arrays(self).values())))
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
-        """Give some of the things; views for a slice."""
+        """Return some of the things; views for a slice."""
         return replace(self, **{name: array[chosen] for name, array in _arrays(self).items()})
 
     @classmethod

@@ -277,7 +277,7 @@ class _Renderer:
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
     def look_back(self, cells: NDArray[np.int64], points: NDArray[np.float64]) -> None:
-        """Tell which cells (n,), surface points (3, n), a viewer sees or an object hides."""
+        """Report which cells (n,), surface points (3, n), a viewer sees or an object hides."""
         ways = np.broadcast_to(self._normal, points.shape)
         before = self._rays.objects.cast(points, ways).rectangle >= 0
         self._behind_object[cells[before]] = True

@@ -120,7 +120,7 @@ class Scene:
         return self.centre[:, None, :] + a + b
 
     def only(self, chosen: NDArray[np.bool_]) -> Scene:
-        """Give the chosen rectangles (r,) alone, with their holes."""
+        """Return the chosen rectangles (r,) alone, with their holes."""
         place = np.cumsum(chosen) - 1
         holes = chosen[self.hole_rectangle]
         kept = {name: getattr(self, name)[chosen] for name in _PER_RECTANGLE.split()}

@@ -82,7 +82,7 @@ class Slab:
         return self.frame.width * self.frame.height
 
     def over(self, rows: slice) -> Slab:
-        """Give the slab over some rows of the raster."""
+        """Return the slab over some rows of the raster."""
         frame = self.frame
         corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
         part = replace(frame, origin_world=corner, height=rows.stop - rows.start)

@@ -47,7 +47,7 @@ class Intrinsics:
 
     @classmethod
     def of(cls, camera: ViewingCamera, *, source: str = "calibration") -> Self:
-        """Give the interior orientation of a camera."""
+        """Return the interior orientation of a camera."""
         return cls(
             width=camera.width,
             height=camera.height,
@@ -65,7 +65,7 @@ class Intrinsics:
         rotation: NDArray[np.float64] | None = None,
         translation: NDArray[np.float64] | None = None,
     ) -> ViewingCamera:
-        """Give the camera with this lens at a pose; without one, at the origin of its own axes.
+        """Return the camera with this lens at a pose; without one, at the origin of its own axes.
 
         Args:
             rotation: (3, 3), camera_from_world.
@@ -191,7 +191,7 @@ class TieWall:
 
     @classmethod
     def of(cls, wall: Wall) -> Self:
-        """Give what ties say of a rastered wall."""
+        """Return what ties say of a rastered wall."""
         frame = wall.frame
         return cls(
             name=wall.name,
@@ -297,7 +297,7 @@ class Ties(Product):
         _require_photos("ties", self.photo_names, others)
 
     def number(self, wall: int) -> int:
-        """Give the number of a wall for people: the place of its plane in `planes.json`."""
+        """Return the number of a wall for people: the place of its plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
@@ -332,7 +332,7 @@ class Camera:
     sigma_wall_m: float | None = None
 
     def viewing(self) -> ViewingCamera:
-        """Give the camera that projects.
+        """Return the camera that projects.
 
         Raises:
             ProductError: the photo is not oriented.

@@ -192,7 +192,7 @@ class Planes(Product):
             )
 
     def to_payload(self) -> Payload:
-        """Give the planes as arrays and JSON; what all planes share is said once."""
+        """Return the planes as arrays and JSON; what all planes share is said once."""
         payload = super().to_payload()
         if self.side_from:
             return payload
@@ -209,7 +209,7 @@ class Planes(Product):
         )
 
     def turned(self, index: int) -> Planes:
-        """Give the planes with one seen from its other side."""
+        """Return the planes with one seen from its other side."""
         corners, parts = self.corners.copy(), self.part_corners
         # From behind, right is left: the top-left corner of one side is the other's top-right.
         corners[index] = corners[index, ::-1]
@@ -228,7 +228,7 @@ class Planes(Product):
         )
 
     def plane(self, index: int) -> Plane:
-        """Give one of the planes, 0 the one with the largest support."""
+        """Return one of the planes, 0 the one with the largest support."""
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:

@@ -85,7 +85,7 @@ class Product:
     tolerances: ClassVar[Mapping[str, Tolerance]] = {}
 
     def to_payload(self) -> Payload:
-        """Give the product as named arrays and JSON; arrays are not copied."""
+        """Return the product as named arrays and JSON; arrays are not copied."""
         arrays: dict[str, Array] = {}
         metadata = _encode_fields(self, "", arrays)
         return Payload(
@@ -249,7 +249,7 @@ def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:
 
 
 def _of_kind(hint: object, value: object, name: str) -> object:
-    """Give a stored value that its field can hold; whoever seals a record may store any.
+    """Return a stored value that its field can hold; whoever seals a record may store any.
 
     Raises:
         ProductError: it is of another kind.

@@ -255,11 +255,11 @@ class Layers(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def number(self, wall: int) -> int:
-        """Give the number of a wall for people: the place of its plane in `planes.json`."""
+        """Return the number of a wall for people: the place of its plane in `planes.json`."""
         return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
 
     def name(self, wall: int) -> str:
-        """Give the name of a wall by its index."""
+        """Return the name of a wall by its index."""
         known = wall < len(self.names)
         return self.names[wall] if known else plane_name("wall", self.number(wall))
 

@@ -196,7 +196,7 @@ def _distance(
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
-    """Tell a value that lies in a list by the name and the unit that stand beside it."""
+    """Report a value that lies in a list by the name and the unit that stand beside it."""
     way = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
     for part in way[:-1]:
@@ -486,7 +486,7 @@ class RunComparison:
 
     @property
     def of_shared_steps(self) -> str:
-        """Say of which steps rows that `shared` leaves are; nothing where both runs have all."""
+        """State of which steps rows that `shared` leaves are; nothing where both runs have all."""
         n_shared = sum(row.is_shared for row in self.cells)
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
@@ -674,7 +674,7 @@ def _way(
     varied: Collection[str],
     telling: Mapping[tuple[str, str], Collection[str]] | None,
 ) -> tuple[object, ...]:
-    """Say what a cell stands for without the names of its variants.
+    """State what a cell stands for without the names of its variants.
 
     Args:
         run: that it belongs to.

@@ -126,7 +126,7 @@ def port_type(product: RecordedProduct) -> str:
 
 
 def value_text(value: JsonValue) -> JsonValue:
-    """Give a setting as a scalar."""
+    """Return a setting as a scalar."""
     if isinstance(value, bool | int | float | str):
         return value
     return json.dumps(value, ensure_ascii=False)
@@ -410,7 +410,7 @@ class _Crate:
     author: str
 
     def graph(self) -> Iterator[Entity]:
-        """Give all entities, the descriptor and the root first."""
+        """Return all entities, the descriptor and the root first."""
         yield {
             "@id": METADATA_FILE,
             "@type": "CreativeWork",
@@ -701,7 +701,7 @@ class _Crate:
 
 
 def _how_to_read(record: RunRecord) -> str:
-    """Say how somebody who has the crate alone looks at the record and checks the files."""
+    """State how somebody who has the crate alone looks at the record and checks the files."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
     source = "the input files" if given else "it alone"

@@ -46,7 +46,7 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Give what belongs to each dataset of a run, what all share included, as a run of its own.
+    """Return what belongs to each dataset of a run, what all share included, as a run of its own.
 
     Their products are read from the record of the whole run.
     """

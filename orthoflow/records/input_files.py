@@ -154,7 +154,7 @@ class LaidOutInputs:
         return self._folders[-1]
 
     def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
-        """Give the found files of an input under their recorded names, in the recorded order.
+        """Return the found files of an input under their recorded names, in the recorded order.
 
         Raises:
             StoreError: the disk refuses.
@@ -178,7 +178,7 @@ class LaidOutInputs:
 
 @contextmanager
 def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
-    """Give the input files that lie in a record as files, as long as the context lasts.
+    """Return the input files that lie in a record as files, as long as the context lasts.
 
     Args:
         run: the run.

@@ -71,7 +71,7 @@ class MetricRow:
 
 
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
-    """Give what the method reported and then what the engine measured (time and memory).
+    """Return what the method reported and then what the engine measured (time and memory).
 
     Cells without a result have no rows: their cost is not comparable with that of a result.
     """

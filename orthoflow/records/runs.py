@@ -95,7 +95,7 @@ class Run:
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
-        """Give the run with its record held open, for whoever reads often.
+        """Return the run with its record held open, for whoever reads often.
 
         To open a record is to look at all of it: once for each of many datasets would be too often.
 
@@ -123,7 +123,7 @@ class Run:
         return {cell.address: cell for cell in self.record.cells}
 
     def cell(self, address: str) -> RecordedCell:
-        """Give one cell.
+        """Return one cell.
 
         Raises:
             ArgumentError: the run has no such cell.
@@ -139,7 +139,7 @@ class Run:
         return self.cells[address]
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
-        """Give a cell and all that it comes from, the nearest first."""
+        """Return a cell and all that it comes from, the nearest first."""
         waiting, seen = [address], {address}
         for name in waiting:
             # Grows while it is walked.
@@ -170,7 +170,7 @@ class Run:
         return tuple(row for cell in self.record.cells for row in cell_metrics(cell))
 
     def figure(self, address: str, name: str) -> RecordedFigure:
-        """Give one picture of a cell.
+        """Return one picture of a cell.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such picture.
@@ -184,7 +184,7 @@ class Run:
         return figures[name]
 
     def payload(self, address: str, port: str) -> Payload:
-        """Give an output as named arrays and JSON; needs no plugin.
+        """Return an output as named arrays and JSON; needs no plugin.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such output.
@@ -193,7 +193,7 @@ class Run:
         return next(self.payloads([(address, port)]))
 
     def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
-        """Give outputs, each an address and a port, one after the other; opens the record once.
+        """Return outputs, each an address and a port, one after the other; opens the record once.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such output.
@@ -233,7 +233,7 @@ class Run:
             )
 
     def product(self, address: str, port: str) -> Product:
-        """Give an output as an object of its product class.
+        """Return an output as an object of its product class.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such output.
@@ -293,7 +293,7 @@ def read_run(path: Path, *, later_name: str = "") -> Run:
 
 
 def find_record(path: str | Path) -> Path:
-    """Give the record file of a run folder; a file stands for itself.
+    """Return the record file of a run folder; a file stands for itself.
 
     Raises:
         ArgumentError: nothing is there, or the folder holds no finished run.

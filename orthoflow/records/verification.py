@@ -135,7 +135,7 @@ def read_signature(record: Path) -> Signature | None:
 
 
 def check_signature(record: Path, signer: Path) -> Signature:
-    """Give the signature of a record that was verified, if it is that of a signer.
+    """Return the signature of a record that was verified, if it is that of a signer.
 
     Args:
         record: the record file.

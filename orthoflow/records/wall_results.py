@@ -39,7 +39,7 @@ _TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
 
 @contextmanager
 def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
-    """Give a run that has the rasters that it published.
+    """Return a run that has the rasters that it published.
 
     Those beside the record are taken. Where none of its files is there, they are made of the walls
     and orthoimages that the record holds, in a folder that lasts as long as the block.
@@ -174,7 +174,7 @@ class RoomResults:
 
 
 def uncounted_points(run: Run) -> UncountedPoints | None:
-    """Say why none of the check points counts that a run was given.
+    """State why none of the check points counts that a run was given.
 
     Returns:
         None where it was given none, and where an inspection has counted some.
@@ -343,7 +343,7 @@ def _inspections(run: Run, address: str) -> Iterator[tuple[str, Inspection]]:
 
 
 def _numbered(inspection: Inspection, numbers: list[int]) -> Inspection:
-    """Give an inspection with numbers of walls in the place of places in `Walls`."""
+    """Return an inspection with numbers of walls in the place of places in `Walls`."""
     number_of = dict(enumerate(numbers))
     walls = [number_of.get(place, -1) for place in inspection.wall.tolist()]
     return replace(

@@ -405,7 +405,7 @@ class _CellRecorder:
     embed: bool
 
     def record(self, cell: Cell, result: CellResult) -> RecordedCell:
-        """Give what the record says of one cell."""
+        """Return what the record says of one cell."""
         return RecordedCell(
             **shared_fields(result, CellOutcome),
             address=cell.address,

@@ -99,7 +99,7 @@ class Combination:
         return tuple(cell for cell in first if cell.assignment or not self.assignment)
 
     def measured(self, step: str, metric: str) -> Measured | None:
-        """Give a metric of a step, None when the step did not report it."""
+        """Return a metric of a step, None when the step did not report it."""
         found = [
             (row, cell.environment)
             for cell in self.cells
@@ -218,7 +218,7 @@ def is_missing(cell: RecordedCell) -> bool:
 
 
 def combinations_of(run: Run) -> tuple[Combination, ...]:
-    """Give every combination of variants that the run has cells of, the baseline marked.
+    """Return every combination of variants that the run has cells of, the baseline marked.
 
     A combination that is part of a larger one (`plane=ransac` of `plane=ransac, orient=pnp`) is
     no row of its own.

@@ -527,7 +527,7 @@ class Origins:
         return Origins(environments=letters, data=places, legend=legend)
 
     def letters(self, one: Combination, environment: str) -> str:
-        """Give the sign of a value; empty when all values are of one kind."""
+        """Return the sign of a value; empty when all values are of one kind."""
         has_several = len(set(self.environments.values())) > 1
         letter = self.environments.get(environment, "?") if has_several else ""
         if len(set(self.data.values())) < 2:

@@ -64,7 +64,7 @@ def coarse_depths(depth_m: NDArray[np.float32]) -> CoarseDepths:
 def cursor_places(
     orthoimages: Sequence[Placed], walls: Sequence[Placed]
 ) -> list[dict[str, object]]:
-    """Say where the cells of each orthoimage lie in the world.
+    """State where the cells of each orthoimage lie in the world.
 
     Args:
         orthoimages: pictures of orthoimages.

@@ -78,7 +78,7 @@ class Curve:
 
 
 def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
-    """Give the drawings of a run, over its datasets where it has several, as files by name."""
+    """Return the drawings of a run, over its datasets where it has several, as files by name."""
     parts = parts_of(run)
     drawn = curves_over(parts) if len(parts) > 1 else curves(run)
     # What a record calls its steps and metrics may be no name of a file.
@@ -163,7 +163,7 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
 def _unswept(
     cells: Sequence[RecordedCell], step: str, parameter: str, found: Iterable[Sweep]
 ) -> list[Sweep]:
-    """Give each variant of a step that no sweep has, as one without a value.
+    """Return each variant of a step that no sweep has, as one without a value.
 
     Those that have the parameter all the same, at their default, are named by it.
     """

@@ -118,7 +118,7 @@ def _table(
     text: Callable[[Side], str],
     step_of: Mapping[str, str] | None = None,
 ) -> DifferenceTable:
-    """Say of things what differs, of those of a step once what is said alike."""
+    """State what differs between things, of those of a step once what is said alike."""
     steps = step_of or {}
     counts = DifferenceCounts.of(pairs)
     rows = []

@@ -55,7 +55,7 @@ def alike_environments(runs: Iterable[Run]) -> AlikeEnvironments:
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
-    """Say in one line where something was computed."""
+    """State in one line where something was computed."""
     commit = f", code at commit {environment.git_commit}" if environment.git_commit else ""
     return (
         f"Python {environment.python}, {environment.os}, {environment.cpu}, "
@@ -66,7 +66,7 @@ def environment_words(environment: RecordedEnvironment) -> str:
 def told_apart(
     environments: Sequence[RecordedEnvironment], used: Collection[str] | None = None
 ) -> dict[str, str]:
-    """Say where things were computed, with the packages in which each is unlike the first.
+    """State where things were computed, with the packages in which each is unlike the first.
 
     Args:
         environments: in the order of the texts.
@@ -84,7 +84,7 @@ def told_apart(
 
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
-    """Say in which packages an environment differs from another; empty where in none."""
+    """State in which packages an environment differs from another; empty where in none."""
     said = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     said += [f"no {name}" for name in others if name not in own]
     return f"; unlike the first with {first_few(said)}" if said else ""

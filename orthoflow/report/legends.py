@@ -30,7 +30,7 @@ def scale_bar(width_m: float) -> str:
 
 
 def round_length_m(most_m: float) -> float:
-    """Give the largest of 1, 2, 5, 10 ... that is no longer.
+    """Return the largest of 1, 2, 5, 10 ... that is no longer.
 
     >>> round_length_m(3.1), round_length_m(0.07)
     (2.0, 0.05)
@@ -40,7 +40,7 @@ def round_length_m(most_m: float) -> float:
 
 
 def length_words(length_m: float) -> str:
-    """Say a round length.
+    """State a round length.
 
     >>> length_words(0.05), length_words(2.0)
     ('5 cm', '2 m')
@@ -49,7 +49,7 @@ def length_words(length_m: float) -> str:
 
 
 def depth_gradient(colours: Sequence[Sequence[float]]) -> str:
-    """Give the colours of depth as an `<svg>` element, which a page holds once.
+    """Return the colours of depth as an `<svg>` element, which a page holds once.
 
     Args:
         colours: red, green and blue, 0 to 255, at equal distances.

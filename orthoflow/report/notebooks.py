@@ -94,7 +94,7 @@ class OpenedRun(Run):
         )
 
     def product(self, address: str, port: str, *, store: str | Path = ".orthoflow") -> Product:
-        """Give an output as an object of its product class.
+        """Return an output as an object of its product class.
 
         Args:
             address: of the cell.
@@ -130,7 +130,7 @@ class OpenedRun(Run):
     def orthoimage(
         self, number: int | None = None, *, cell: str | None = None, data: str | None = None
     ) -> WallImage:
-        """Give the orthoimage of a wall as an array with its frame.
+        """Return the orthoimage of a wall as an array with its frame.
 
         Args:
             number: of the wall, as in the names of its files; None for the first one.
@@ -369,7 +369,7 @@ class WallImage:
         return self.image.frame
 
     def to_xarray(self) -> Any:  # Any: of a library that need not be there
-        """Give an `xarray.DataArray` with x along the wall and y as heights, as the GeoTIFF has.
+        """Return an `xarray.DataArray` with x along the wall and y as heights, as the GeoTIFF has.
 
         Its coordinate `is_shown` (y, x) tells cells that are black from those that show nothing.
 

@@ -143,7 +143,7 @@ def draw_vectors(frame: WallFrame, vectors: Vectors, *, label: str, magnificatio
 
 
 def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float:
-    """Give a round number by which vectors are enlarged so that they can be seen."""
+    """Return a round number by which vectors are enlarged so that they can be seen."""
     known = lengths_m[np.isfinite(lengths_m).all(axis=1)]
     rms_m = float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else 0.0
     if rms_m == 0.0:

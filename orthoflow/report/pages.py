@@ -307,7 +307,7 @@ def write_whole(path: Path, text: str) -> None:
 
 @cache
 def environment() -> jinja2.Environment:
-    """Give the templates, with what all pages share."""
+    """Return the templates, with what all pages share."""
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,

@@ -383,7 +383,7 @@ def _alike(called: Mapping[str, RecordedCell], reference: str, own: str) -> str:
 
 
 def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
-    """Say in a sentence or two which combinations are shown to be better; empty without several.
+    """State in a sentence or two which combinations are shown to be better; empty without several.
 
     Args:
         over: the metrics.
@@ -439,7 +439,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
 
 
 def _not_shown(alike: Mapping[str, Sequence[str]]) -> str:
-    """Say who is not shown to differ from what it is compared with; empty without any."""
+    """State who is not shown to differ from what it is compared with; empty without any."""
     pairs = [
         f"{first_few(names, most=_NAMED)} against {against}" for against, names in alike.items()
     ]

@@ -103,7 +103,7 @@ def paper_files(run: Run) -> dict[str, str]:
 
 
 def _tidy(run: Run) -> Iterator[Sequence[Value]]:
-    """Give a header, then a row per combination and metric, with unit and better side."""
+    """Return a header, then a row per combination and metric, with unit and better side."""
     combinations, columns = _compared(run)
     factors = _factors(combinations)
     yield (

@@ -95,7 +95,7 @@ class Picture:
 
 
 def data_uri(content: bytes, media_type: str) -> str:
-    """Give the bytes of a file as a URI that carries them."""
+    """Return the bytes of a file as a URI that carries them."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 

@@ -99,7 +99,7 @@ def _told(run: Run) -> Iterator[PlaneTable]:
 
 
 def _viewpoint(planes: Planes) -> str:
-    """Say where the sides come from, and of how many planes each where they differ."""
+    """State where the sides come from, and of how many planes each where they differ."""
     counts = Counter(planes.side_source(index) for index in range(len(planes)))
     if not planes.side_from or len(counts) < 2:
         return planes.side_source(0) if planes.side_from else planes.viewpoint.replace("_", " ")

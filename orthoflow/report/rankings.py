@@ -160,7 +160,7 @@ def is_flag(unit: str) -> bool:
 
 
 def badness(value: float, sense: Sense) -> float:
-    """Give a number that is smaller the better the value is; signed errors count by their size.
+    """Return a number that is smaller the better the value is; signed errors count by their size.
 
     Raises:
         ValueError: the metric has no good side.

@@ -51,7 +51,7 @@ class Varied:
         return (*steps, *methods, *(".".join(parameter) for parameter in self.swept))
 
     def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
-        """Give the columns of a cell or combination; None where it has no part in one."""
+        """Return the columns of a cell or combination; None where it has no part in one."""
         variants = (assignment.get(step) for step in self.steps)
         numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
         methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
@@ -59,7 +59,7 @@ class Varied:
 
 
 def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
-    """Give a header, then a row per combination and repeat with every number of its cells.
+    """Return a header, then a row per combination and repeat with every number of its cells.
 
     What is not repeated stands in the row of the first repeat only.
     """
@@ -81,7 +81,7 @@ def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
 
 
 def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
-    """Give a header, then a row per metric and combination of what holds over all datasets.
+    """Return a header, then a row per metric and combination of what holds over all datasets.
 
     What nobody knows, p of two datasets say, is an empty cell.
     """

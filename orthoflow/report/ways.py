@@ -29,7 +29,7 @@ class Way:
 
 
 def ways(run: Run, prefix: str) -> tuple[Way, ...]:
-    """Give the combinations of a run, each cell with the first that it belongs to.
+    """Return the combinations of a run, each cell with the first that it belongs to.
 
     Args:
         run: the run.

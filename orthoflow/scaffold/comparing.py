@@ -34,7 +34,7 @@ _JUDGED: Final = {
 
 
 def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
-    """Give a workflow in which a method stands beside the shipped recipe's own of its kind.
+    """Return a workflow in which a method stands beside the shipped recipe's own of its kind.
 
     Args:
         method_id: the new method.

@@ -118,7 +118,7 @@ def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
 
 
 def taken_ports(catalog: Catalog, takes: Sequence[str]) -> KindPorts:
-    """Give a port of its name for each product type, all of them required."""
+    """Return a port of its name for each product type, all of them required."""
     imports: dict[str, set[str]] = {}
     for name in takes:
         module, class_name = _class_of(catalog, name)

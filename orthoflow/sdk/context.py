@@ -265,7 +265,7 @@ class StepContext:
     def allocate(
         self, port: str, name: str, shape: tuple[int, ...], dtype: DTypeLike
     ) -> NDArray[np.generic]:
-        """Give a zeroed array for an output too large to hold in memory twice.
+        """Return a zeroed array for an output too large to hold in memory twice.
 
         The array lies in a file of the scratch folder and is mapped into memory, so that it does
         not count against the memory of the step while it is filled.

@@ -12,7 +12,7 @@ _LONGEST_NAME_BYTES: Final = 200
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:
-    r"""Give a text as one printable line; of a longer one the beginning.
+    r"""Return a text as one printable line; of a longer one the beginning.
 
     >>> one_line("no\n  plane \x1b[31m at all")
     'no plane \\x1b[31m at all'

@@ -89,7 +89,7 @@ class ConformanceCase:
 
 
 def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
-    """Say in one sentence, and in which line, what stopped a run of the method."""
+    """State in one sentence, and in which line, what stopped a run of the method."""
     if isinstance(error, ExampleError):
         return str(error)
     trial = witness().trial
@@ -131,7 +131,7 @@ def conformance_cases(
     expected_failures: Mapping[str, str] | None = None,
     golden: Path | None = None,
 ) -> tuple[ConformanceCase, ...]:
-    """Give every check that applies to an installed method.
+    """Return every check that applies to an installed method.
 
     Args:
         method_id: e.g. `plane.flat`; found through the installed entry points.

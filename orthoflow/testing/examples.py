@@ -28,7 +28,7 @@ class ExampleError(OrthoflowError, LookupError):
 def example_inputs(
     method: type[Method], *, besides: Collection[str] = ()
 ) -> dict[str, Product | InputFiles]:
-    """Give what a method requires, from one scene: the photographed wall or the simulated room.
+    """Return what a method requires, from one scene: the photographed wall or the simulated room.
 
     A truth is given wherever a method takes it. A product type of a plugin is made by an installed
     method that gives it.
@@ -58,7 +58,7 @@ def _example_inputs(
 
 
 def example(type_name: str) -> Product | InputFiles:
-    """Give a small product of a type, the same in every process.
+    """Return a small product of a type, the same in every process.
 
     Raises:
         ExampleError: the type is a plugin's own, and no installed method makes one of the other
@@ -68,7 +68,7 @@ def example(type_name: str) -> Product | InputFiles:
 
 
 def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
-    """Give an example; `within` are the types whose examples are being made of it."""
+    """Return an example; `within` are the types whose examples are being made of it."""
     if type_name == "files":
         return _example_files()
     make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
@@ -113,7 +113,7 @@ def example_room(
     turned_deg: float = 0.0,
     shift_m: NDArray[np.float64] | None = None,
 ) -> tuple[PointCloud, Planes]:
-    """Give a box-shaped room whose planes are known exactly.
+    """Return a box-shaped room whose planes are known exactly.
 
     Args:
         seed: of noise and point positions; turning and shifting do not change them.
@@ -177,7 +177,7 @@ def _grey_cloud(
 
 
 def few_points(coordinates: NDArray[np.float64]) -> PointCloud:
-    """Give a cloud of the given offsets (n, 3) with every optional array present."""
+    """Return a cloud of the given offsets (n, 3) with every optional array present."""
     offsets = coordinates.astype(np.float32).reshape(-1, 3)
     count = len(offsets)
     return PointCloud(

@@ -248,7 +248,7 @@ class _Limit:
 
 
 def sample_of(product: Product) -> dict[str, Sample]:
-    """Give a sample of every array, and of the numbers in the metadata; bytes are left out.
+    """Return a sample of every array, and of the numbers in the metadata; bytes are left out.
 
     The bytes of a compressed picture all change when one pixel does.
     """
@@ -269,7 +269,7 @@ def sample_problem(
     *,
     numbers_stated: bool = True,
 ) -> str:
-    """Say what moved between two samples by more than a product's tolerances; empty for nothing.
+    """State what moved between two samples by more than a product's tolerances; empty for nothing.
 
     Args:
         before: of one product.

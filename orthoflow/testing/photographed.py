@@ -66,7 +66,7 @@ class TexturedWall:
     def depth_m(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Give the relief towards the viewer at metres from the top-left corner."""
+        """Return the relief towards the viewer at metres from the top-left corner."""
         wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4) + 0.4 * np.sin(
             5.0 * across_m + 1
         )
@@ -75,7 +75,7 @@ class TexturedWall:
     def grey(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Give the grey, 0..1."""
+        """Return the grey, 0..1."""
         total = np.zeros(np.broadcast(across_m, down_m).shape)
         for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
             at = [down_m / step + 8.0, across_m / step + 8.0]
@@ -86,7 +86,7 @@ class TexturedWall:
 def textured_wall(
     seed: int, *, origin_world: NDArray[np.float64] | None = None, gsd_m: float = GSD_M
 ) -> TexturedWall:
-    """Give a wall of 3 m x 2 m with 6 cm of relief; its plane goes through `origin_world`."""
+    """Return a wall of 3 m x 2 m with 6 cm of relief; its plane goes through `origin_world`."""
     rng = np.random.default_rng(seed)
     frame = WallFrame(
         origin_world=np.array([0.0, 0.0, SIZE_M[1]]) if origin_world is None else origin_world,
@@ -105,7 +105,7 @@ def textured_wall(
 
 
 def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Walls:
-    """Give the wall as the scan shows it: its contrast curve is not the photos', one window."""
+    """Return the wall as the scan shows it: its contrast curve is not the photos', one window."""
     frame = scene.frame
     across, down = places_of_cells(frame)
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Wall
 
 
 def places_of_cells(frame: WallFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give metres across and down, (rows, cols) each, of the centres of a raster's cells."""
+    """Return metres across and down, (rows, cols) each, of the centres of a raster's cells."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
@@ -148,7 +148,7 @@ def _cut_window(values: NDArray[np.float64], gsd_m: float) -> None:
 
 
 def cloud_of(scene: TexturedWall, *, spacing_m: float = 0.005) -> PointCloud:
-    """Give the wall as coloured points in a regular grid, a station before its middle."""
+    """Return the wall as coloured points in a regular grid, a station before its middle."""
     across, down = (
         places.ravel()
         for places in np.meshgrid(
@@ -182,7 +182,7 @@ def camera_before(
     towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
     roll: float = 0.0,
 ) -> ViewingCamera:
-    """Give a distorted camera; its places are metres from the wall's bottom-left corner."""
+    """Return a distorted camera; its places are metres from the wall's bottom-left corner."""
     corner = scene.frame.origin_world - [0.0, 0.0, SIZE_M[1]]
     rotation = looking_at(
         corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
@@ -207,7 +207,7 @@ def camera_before(
 def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
-    """Give what the camera sees, each pixel's centre traced; black beside the wall."""
+    """Return what the camera sees, each pixel's centre traced; black beside the wall."""
     return Photo(
         name=name,
         encoded=_picture(pickle.dumps((scene, camera))),
@@ -221,7 +221,7 @@ def photo_of(
 # Half a second each, and most tests of a method look at the same few.
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
-    """Give the picture of a scene and a camera, which are pickled so that equal ones share it."""
+    """Return the picture of a scene and a camera, which are pickled so that equal ones share it."""
     scene: TexturedWall
     camera: ViewingCamera
     scene, camera = pickle.loads(pickled)
@@ -259,7 +259,7 @@ def _rays_camera(pickled: bytes) -> NDArray[np.float64]:
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
-    """Give a photo's orientation as the product has it."""
+    """Return a photo's orientation as the product has it."""
     return Camera(
         photo=name,
         status="ok",
@@ -270,24 +270,24 @@ def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
 
 
 def photos(*items: Photo) -> Photos:
-    """Give some photos as a product."""
+    """Return some photos as a product."""
     return Photos(photos=items)
 
 
 def cameras(*items: Camera) -> Cameras:
-    """Give some orientations as a product."""
+    """Return some orientations as a product."""
     return Cameras(cameras=items)
 
 
 def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
-    """Give the camera turned by a small rotation vector (rad) and shifted (m)."""
+    """Return the camera turned by a small rotation vector (rad) and shifted (m)."""
     rotation = rotation_from_vector(np.array(vector[:3])) @ camera.rotation
     centre = camera.centre_world + np.array(vector[3:])
     return replace(camera, rotation=rotation, translation=-rotation @ centre)
 
 
 def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
-    """Give the RMS per coordinate of where pixels land on the wall's plane, found minus true."""
+    """Return the RMS per coordinate of where pixels land on the wall's plane, found minus true."""
     steps = np.linspace(20.0, 620.0, 9)
     pixels = np.array([(u, v) for u in np.linspace(20.0, 880.0, 9) for v in steps])
     landed = []
@@ -309,12 +309,12 @@ def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera)
 
 @cache
 def photographed_scene(gsd_m: float = 0.006) -> TexturedWall:
-    """Give the wall, its raster with cells of a given size."""
+    """Return the wall, its raster with cells of a given size."""
     return textured_wall(1, gsd_m=gsd_m)
 
 
 def photographing_cameras() -> Mapping[str, ViewingCamera]:
-    """Give the true cameras by photo name."""
+    """Return the true cameras by photo name."""
     scene = photographed_scene()
     return {
         "a.png": camera_before(scene),
@@ -343,7 +343,7 @@ def _cameras() -> Cameras:
 
 
 def settled_camera(camera: Camera) -> Camera:
-    """Give an orientation the same bits on every processor."""
+    """Return an orientation the same bits on every processor."""
     rotation, translation = (
         camera.rotation_camera_from_world,
         camera.translation_camera_from_world,

@@ -72,7 +72,7 @@ class Recognised:
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
-    """Say what files are, and what lies in folders, by looking into them.
+    """State what files are, and what lies in folders, by looking into them.
 
     Raises:
         InputError: a path leads nowhere, there are too many files, or a scan is damaged.
@@ -396,7 +396,7 @@ class _Drafting:
     recipe: Recipe
 
     def draft(self) -> Draft:
-        """Give the recipe with its inputs filled in, and a heading of its own."""
+        """Return the recipe with its inputs filled in, and a heading of its own."""
         shipped = shipped_workflow(self.recipe).read_text(encoding="utf-8")
         start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
         taken, left_out = self._assigned(inputs)

@@ -119,7 +119,7 @@ class ArrayDifference:
 
 
 def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
-    """Give indices that cut an array into blocks of at most about 8 MiB.
+    """Return indices that cut an array into blocks of at most about 8 MiB.
 
     Joined in order, the blocks' elements are the array's elements in C order. An array without
     elements has no blocks; a scalar has one, `()`.
@@ -144,12 +144,12 @@ def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
 
 
 def little_endian(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
-    """Give the dtype with its bytes in little-endian order."""
+    """Return the dtype with its bytes in little-endian order."""
     return dtype.newbyteorder("<")
 
 
 def byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
-    """Give the array's bytes: little-endian, C order, flat.
+    """Return the array's bytes: little-endian, C order, flat.
 
     A contiguous little-endian array is given whole and not copied, memory-mapped or not; any other
     is copied block by block.
@@ -316,7 +316,7 @@ def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
 
 
 def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Give a product's arrays with their names, sorted, without reading them.
+    """Return a product's arrays with their names, sorted, without reading them.
 
     Raises:
         RecordFormatError: the group is damaged.

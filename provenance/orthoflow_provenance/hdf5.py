@@ -230,7 +230,7 @@ class FileSink:
         return self._position
 
     def tell(self) -> int:
-        """Give the position."""
+        """Return the position."""
         return self._position
 
     def write(self, data: memoryview) -> int:
@@ -569,7 +569,7 @@ def _is_text(kind: h5py.h5t.TypeID) -> bool:
 
 
 def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
-    """Say whether values of a type lie in the dataset itself: numbers, bool, fixed text, rows."""
+    """Give whether values of a type lie in the dataset itself: numbers, bool, fixed text, rows."""
     type_class = kind.get_class()
     if type_class == h5py.h5t.COMPOUND:
         return all(_is_plain(kind.get_member_type(index)) for index in range(kind.get_nmembers()))

@@ -67,7 +67,7 @@ class _Place:
 
 
 def holds_control(text: str) -> bool:
-    """Say whether a text has control characters, separators of lines, or halves of letters."""
+    """Return whether a text has control characters, separators of lines, or halves of letters."""
     return not text.isprintable() and any(
         unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in text
     )
@@ -103,7 +103,7 @@ _PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
 
 
 def name_problem(name: str) -> str:
-    """Say why a name cannot be that of a file or folder on every system; empty when it can.
+    """State why a name cannot be that of a file or folder on every system; empty when it can.
 
     >>> name_problem("hall.e57"), name_problem(".."), name_problem("a/b")
     ('', 'is . or ..', 'holds / or a backslash')
@@ -112,7 +112,7 @@ def name_problem(name: str) -> str:
 
 
 def path_problem(path: str) -> str:
-    """Say why a relative path with `/` cannot be one below a folder; empty when it can.
+    """State why a relative path with `/` cannot be one below a folder; empty when it can.
 
     >>> path_problem("products/wall/a.tif"), path_problem("/etc/x"), path_problem("a/../b")
     ('', 'is absolute', 'has a part that is . or ..')
@@ -142,7 +142,7 @@ def path_below(folder: Path, path: str) -> Path:
 
 
 def colliding(paths: Iterable[str]) -> str:
-    """Give the first path that some system takes for one before it; empty when there is none.
+    """Return the first path that some system takes for one before it; empty when there is none.
 
     >>> colliding(["a.png", "b.png", "A.png"])
     'A.png'
@@ -290,7 +290,7 @@ def _path_of_folder(folder: Path, names: list[str], *, is_made: bool) -> Path:
 
 @contextmanager
 def _link_refused(parent: _Place, name: str, path: str) -> Iterator[None]:
-    """Say that a link stands there; which error the system gives for one depends on the flags."""
+    """State that a link stands there; which error the system gives for one depends on the flags."""
     try:
         yield
     except OSError as error:

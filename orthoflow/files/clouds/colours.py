@@ -64,7 +64,7 @@ def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArra
 
 
 def round_scale_m(largest_m: float) -> float:
-    """Give the next of 1, 2, 5, 10 ... mm, a scale that people read.
+    """Return the next of 1, 2, 5, 10 ... mm, a scale that people read.
 
     >>> round_scale_m(0.0031), round_scale_m(0.0), round_scale_m(0.09)
     (0.005, 0.001, 0.1)

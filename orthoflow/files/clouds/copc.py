@@ -263,7 +263,7 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
 
 
 def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
-    """Give the points of one node after the other."""
+    """Return the points of one node after the other."""
     begins = np.flatnonzero(np.append(True, np.diff(nodes.key) != 0))
     for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
         runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)

@@ -161,7 +161,7 @@ class DressedCloud:
         )
 
     def blocks(self, scan: int | None = None) -> Iterator[Points]:
-        """Give the chosen points in their order, of all scans or of one."""
+        """Return the chosen points in their order, of all scans or of one."""
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():

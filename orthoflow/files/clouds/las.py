@@ -43,7 +43,7 @@ def write_laz(path: Path, dressed: DressedCloud) -> int:
 
 # Any: laspy has no types.
 def las_record(laspy: Any, header: Any, points: Points) -> Any:
-    """Give points as laspy writes them under a header."""
+    """Return points as laspy writes them under a header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     record.x, record.y, record.z = points.world.T
     # LAS colours have 16 bits.
@@ -61,7 +61,7 @@ def las_record(laspy: Any, header: Any, points: Points) -> Any:
 
 
 def las_header(laspy: Any, dressed: DressedCloud) -> Any:
-    """Give the header of a cloud, without points."""
+    """Return the header of a cloud, without points."""
     cloud = dressed.cloud
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version=_VERSION)
     extra: list[tuple[str, type[np.generic], str]] = [

@@ -60,7 +60,7 @@ def colour_points(
     threads: int = 1,
     progress: Callable[[float, str], object] = lambda _share, _name: None,
 ) -> None:
-    """Give each point the colour of the photo that shows it best.
+    """Assign each point the colour of the photo that shows it best.
 
     A point is seen where no nearer point of the whole cloud lies before it, outliers left out.
     Of several photos that see it, the one with the most pixels per metre wins, away from its

@@ -93,7 +93,7 @@ def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> Non
 
 
 def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> Feature:
-    """Give an opening of a wall as a polygon, with all that is known of it.
+    """Return an opening of a wall as a polygon, with all that is known of it.
 
     Args:
         opening: it.

@@ -372,7 +372,7 @@ def _snapped(span: _Span, meets: Sequence[float]) -> _Span:
 
 
 def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
-    """Give lines the distance to the other side of their wall, where that is among them."""
+    """Return lines the distance to the other side of their wall, where that is among them."""
     for line in lines:
         middle = line.ends_m.mean(axis=0)
         found = []

@@ -142,7 +142,7 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def _axis_words(up: NDArray[np.float64]) -> str:
-    """Say which of the scan's axes heights count along, backwards or not."""
+    """State which of the scan's axes heights count along, backwards or not."""
     if up.shape != (3,):
         return "?"
     axis = int(np.argmax(np.abs(up)))

@@ -60,14 +60,14 @@ class Phrase:
     asides: tuple[Phrase, ...] = ()
 
     def text(self, language: Language = "en") -> str:
-        """Say it in a language."""
+        """State it in a language."""
         text = label(self.key, language, **self.values)
         more = ", ".join(item.text(language) for item in self.asides)
         return f"{text} ({more})" if more else text
 
 
 def accuracy_phrase(accuracy: object) -> Phrase:
-    """Say what `accuracy` of an orthoimage's sidecar holds."""
+    """State what `accuracy` of an orthoimage's sidecar holds."""
     told = accuracy if isinstance(accuracy, dict) else {}
     median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
     if told.get("assessed") is not True or not (

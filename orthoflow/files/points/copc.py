@@ -79,7 +79,7 @@ class Octree:
     spacing: float
 
     def chosen(self, wish: Wish) -> tuple[Node, ...]:
-        """Give the nodes with points that somebody asks for, in the order of the file.
+        """Return the nodes with points that somebody asks for, in the order of the file.
 
         The first level whose points are no farther apart than asked for is the last one. Where no
         node meets the box, the root is given, whose points tell where the cloud is.

@@ -206,7 +206,7 @@ def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
 
 
 def number_of(node: Any) -> float:
-    """Give the value of a number's node, whatever its type."""
+    """Return the value of a number's node, whatever its type."""
     scaled = getattr(node, "scaledValue", None)
     return float(node.value() if scaled is None else scaled())
 

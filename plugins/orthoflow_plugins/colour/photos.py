@@ -22,7 +22,7 @@ from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 
 class ColourPhotos(Method):
-    """Give each point the colour of the photo that shows it best.
+    """Assign each point the colour of the photo that shows it best.
 
     A point is seen where no nearer point of the whole cloud lies before it, outliers left out
     (the depth buffer of `ortho.dsm-backward`). Of several photos that

@@ -320,7 +320,7 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
 
 
 def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
-    """Say in words that a rule for outliers ran into its cap."""
+    """State in words that a rule for outliers ran into its cap."""
     capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)

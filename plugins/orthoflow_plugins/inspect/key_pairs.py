@@ -72,7 +72,7 @@ class KeyPairs:
 
 
 def no_pairs() -> KeyPairs:
-    """Give the pairs of pictures in which nothing was looked for."""
+    """Return the pairs of pictures in which nothing was looked for."""
     nothing = np.zeros((0, 2))
     return KeyPairs(places=nothing, shift=nothing, found=nothing, n_points=(0, 0), n_matched=0)
 

@@ -75,7 +75,7 @@ class PoseError:
 
 
 def true_camera(truth: Truth, photo: str) -> ViewingCamera:
-    """Give the true camera of a photo.
+    """Return the true camera of a photo.
 
     Raises:
         MethodError: the truth knows no such photo.
@@ -141,7 +141,7 @@ def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
 
 
 def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
-    """Say of each photo how far off it is, as JSON."""
+    """State of each photo how far off it is, as JSON."""
     return [
         {
             "photo": error.photo,
@@ -156,7 +156,7 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
-    """Say how many ties are wrong: of all that were matched, and of those that photos kept."""
+    """State how many ties are wrong: of all that were matched, and of those that photos kept."""
     ties = cameras.ties
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []

@@ -160,7 +160,7 @@ class PatchShifts(Rows):
 
 
 def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
-    """Give patches at (p, 2) whose displacements (p, 2) are known roughly."""
+    """Return patches at (p, 2) whose displacements (p, 2) are known roughly."""
     return PatchShifts(
         centre=centre,
         shift=shift,

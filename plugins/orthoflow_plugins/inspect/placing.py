@@ -24,7 +24,7 @@ _Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
-    """Give orthoimages whose `wall` counts in these walls.
+    """Return orthoimages whose `wall` counts in these walls.
 
     Those of other programs, and of walls rastered in another step, know the plane only.
 
@@ -47,7 +47,7 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
 
 
 def rows_of(raster: _Framed, rows: slice) -> _Framed:
-    """Give some rows of an orthoimage, a wall or a truth, on a frame of their own."""
+    """Return some rows of an orthoimage, a wall or a truth, on a frame of their own."""
     frame = raster.frame
     corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
     part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
@@ -61,7 +61,7 @@ def rows_of(raster: _Framed, rows: slice) -> _Framed:
 
 
 def in_files(ctx: StepContext, name: str) -> Allocate:
-    """Give arrays in files, for what many cells are wrong by, or take from elsewhere."""
+    """Return arrays in files, for what many cells are wrong by, or take from elsewhere."""
 
     def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
         return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
@@ -70,7 +70,7 @@ def in_files(ctx: StepContext, name: str) -> Allocate:
 
 
 def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> Wall:
-    """Give the wall of one of `on_walls`; one that lies on other cells is laid onto the image's.
+    """Return the wall of one of `on_walls`; one that lies on other cells is laid onto the image's.
 
     Orthoimages of other programs have grids of their own. Each of their cells takes what the
     nearest cell of the wall holds, its depth counted from the image's own plane, and an intensity

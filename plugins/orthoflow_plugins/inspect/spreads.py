@@ -108,7 +108,7 @@ class Spread:
 
 
 def in_file(values: NDArray[_Value], name: str, allocate: Allocate) -> NDArray[_Value]:
-    """Give a copy of an array that lies where `allocate` says."""
+    """Return a copy of an array that lies where `allocate` says."""
     kept: NDArray[_Value] = np.asarray(allocate(name, values.shape, values.dtype), values.dtype)
     kept[...] = values
     return kept

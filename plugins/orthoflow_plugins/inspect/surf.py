@@ -228,7 +228,7 @@ class _Comparison:
     threads: int
 
     def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
-        """Give the pairs of a wall; nothing more where they are too few to say anything."""
+        """Return the pairs of a wall; nothing more where they are too few to say anything."""
         if wall.intensity is None:
             raise MethodError(f"{wall.name} has no intensity to compare with")
         if not n_shown(image):

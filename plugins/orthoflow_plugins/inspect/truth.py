@@ -474,7 +474,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 
 
 def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:
-    """Say which cells are not traced to their pixels, though cameras are wired."""
+    """State which cells are not traced to their pixels, though cameras are wired."""
     if cameras is None:
         return
     known = {camera.photo for camera in cameras.cameras if camera.status == "ok"}

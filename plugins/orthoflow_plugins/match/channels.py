@@ -55,7 +55,7 @@ class Channels:
     known: NDArray[np.float32]
 
     def part(self, cells: tuple[slice, slice]) -> Channels:
-        """Give some rows and columns."""
+        """Return some rows and columns."""
         return Channels(
             values=np.ascontiguousarray(self.values[cells]),
             known=np.ascontiguousarray(self.known[cells]),
@@ -63,7 +63,7 @@ class Channels:
 
 
 def gradient_channels(grey: NDArray[np.float32]) -> Channels:
-    """Give the oriented gradients of a picture with NaN where nothing is known."""
+    """Return the oriented gradients of a picture with NaN where nothing is known."""
     import cv2
 
     gradient, known = _gradient(grey)
@@ -81,7 +81,7 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
-    """Give a picture itself, less its local mean, evened out; for bands that look alike."""
+    """Return a picture itself, less its local mean, evened out; for bands that look alike."""
     return colour_channels(grey[:, :, None])
 
 

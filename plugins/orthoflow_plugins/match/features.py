@@ -47,11 +47,11 @@ class Features(Rows):
     descriptors: NDArray[np.float32]
 
     def undescribed(self) -> Features:
-        """Give places and sizes without the descriptors, which are most of the bytes."""
+        """Return places and sizes without the descriptors, which are most of the bytes."""
         return replace(self, descriptors=self.descriptors[:, :0].copy())
 
     def strongest(self, n_most: int) -> Features:
-        """Give the first ones, without copying them."""
+        """Return the first ones, without copying them."""
         return Features(
             pixels=self.pixels[:n_most],
             sizes_px=self.sizes_px[:n_most],
@@ -60,7 +60,7 @@ class Features(Rows):
         )
 
     def scaled(self, factor: float) -> Features:
-        """Give the same key points in the image enlarged by a factor."""
+        """Return the same key points in the image enlarged by a factor."""
         return Features(
             pixels=self.pixels * factor,
             sizes_px=self.sizes_px * factor,

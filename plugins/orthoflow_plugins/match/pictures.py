@@ -88,7 +88,7 @@ def require_intensity(walls: Walls) -> None:
 
 
 def wall_picture(wall: Wall, *, clip_limit: float, void_margin_cells: int) -> WallPicture | None:
-    """Give a wall's intensity as a picture; None without intensity.
+    """Return a wall's intensity as a picture; None without intensity.
 
     Args:
         wall: the wall.
@@ -144,7 +144,7 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
 
 
 def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
-    """Give a photo's colours, (height, width, 3).
+    """Return a photo's colours, (height, width, 3).
 
     Raises:
         InputError: the file is no image.
@@ -160,7 +160,7 @@ def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
 
 
 def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Give a photo's grey (Rec. 601), (height, width); raises as `photo_rgb` does."""
+    """Return a photo's grey (Rec. 601), (height, width); raises as `photo_rgb` does."""
     import cv2
 
     return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -295,7 +295,7 @@ _Result = TypeVar("_Result")
 def one_by_one(
     function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
 ) -> Iterator[_Result]:
-    """Give a function's results item by item, several computed at once in threads.
+    """Return a function's results item by item, several computed at once in threads.
 
     OpenCV's own threads help little with pictures of this size: each worker gets its share of
     them, and the rest is Python's.

@@ -181,7 +181,7 @@ class PlacedWalls:
 
 
 def places_of(index: int, photo: Photo, walls: PlacedWalls, cores: int = 1) -> list[Placed]:
-    """Give the places on the walls where a photo may be, the best first.
+    """Return the places on the walls where a photo may be, the best first.
 
     Only the first may be clear. A photo of which no EXIF says how it was held is tried in all ways,
     unless a clear place is found as cameras are mostly held.

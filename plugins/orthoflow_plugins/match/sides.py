@@ -192,7 +192,7 @@ def _seen_sides(
 
 
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
-    """Say of which planes the side stays a guess, as the detector said of more of them."""
+    """State of which planes the side stays a guess, as the detector said of more of them."""
     named = sources or [planes.side_source(index) for index in range(len(planes))]
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:

@@ -195,7 +195,7 @@ def _slip(width: int) -> int:
 
 
 def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Channels:
-    """Give the structure of a picture (rows, cols, layers), NaN or not known where void."""
+    """Return the structure of a picture (rows, cols, layers), NaN or not known where void."""
     import cv2
 
     soft = []
@@ -248,7 +248,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
 def likely_places(
     rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int, roughly: bool = False
 ) -> list[Place]:
-    """Give the places of a wall that a photo may show, the likeliest first.
+    """Return the places of a wall that a photo may show, the likeliest first.
 
     Args:
         rgb: (height, width, 3) of the photo, taken roughly upright.
@@ -270,7 +270,7 @@ def likely_places(
 
 
 def closer(rgb: NDArray[np.uint8], wall: WallStructure, place: Place) -> Place:
-    """Give the likeliest place of a photo at the size of one that was found roughly."""
+    """Return the likeliest place of a photo at the size of one that was found roughly."""
     return _best_of_size(rgb, place.width_m / wall.wall.frame.gsd_m, wall.fine)
 
 

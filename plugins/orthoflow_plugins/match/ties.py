@@ -168,7 +168,7 @@ def ties_of(
 
 
 def _unmasked(piece: TiePiece, used: NDArray[np.bool_] | None) -> TiePiece:
-    """Give the ties of a photo whose pixels may be used."""
+    """Return the ties of a photo whose pixels may be used."""
     if used is None:
         return piece
     most = np.array(used.shape[::-1]) - 1
@@ -208,7 +208,7 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
 def ties_by_hand_alone(
     hand: Ties | None, photos: Photos, walls: Walls, ctx: StepContext
 ) -> Ties | None:
-    """Give the ties by hand where the walls show nothing that a photo could be matched with.
+    """Return the ties by hand where the walls show nothing that a photo could be matched with.
 
     Returns:
         None where the walls show something.

@@ -143,7 +143,7 @@ def trace_photo(
 
 
 def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None:
-    """Give how far the lens of a photo may be off that its first orientation estimated.
+    """Return how far the lens of a photo may be off that its first orientation estimated.
 
     Returns:
         None where it was calibrated, or given from elsewhere.
@@ -155,7 +155,7 @@ def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None
 
 
 def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]:
-    """Give a camera as a photo's ties alone have it, and the standard deviation of ln f.
+    """Return a camera as a photo's ties alone have it, and the standard deviation of ln f.
 
     Args:
         trace: of the photo.
@@ -357,7 +357,7 @@ def fitted_pose(
     camera: ViewingCamera,
     lens: _Known | None = None,
 ) -> ViewingCamera:
-    """Give the pose that points agree with, those left out that do not.
+    """Return the pose that points agree with, those left out that do not.
 
     Args:
         seen: the points.

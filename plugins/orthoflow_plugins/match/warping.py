@@ -97,13 +97,13 @@ class View:
     warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
-        """Give the photo's grey in the raster of a wall."""
+        """Return the photo's grey in the raster of a wall."""
         if index not in self.warped:
             self.warped[index] = warp_photo(self.grey, projection)
         return self.warped[index]
 
     def colours_on_wall(self, projection: Projection) -> NDArray[np.float32]:
-        """Give the photo's colours (rows, cols, 3) in the raster of a wall."""
+        """Return the photo's colours (rows, cols, 3) in the raster of a wall."""
         return warp_photo(self.colours(), projection)
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:

@@ -81,7 +81,7 @@ class Balance:
     def shown(
         self, index: int, colours: Colours, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> Colours:
-        """Give colours (n, 3) of a layer, in its cells at rows and columns (n,), as balanced."""
+        """Return colours (n, 3) of a layer, in its cells at rows and columns (n,), as balanced."""
         return lit(colours, self.log_gains(index, rows, columns))
 
     def log_gains(
@@ -349,7 +349,7 @@ class Exposures:
     nodes: NDArray[np.float64]
 
     def logs(self, index: int, light: BlockLight, radii: Radii | None) -> NDArray[np.float64]:
-        """Give what is added (rows, cols, 3) in the blocks of a layer's box."""
+        """Return what is added (rows, cols, 3) in the blocks of a layer's box."""
         rows, columns = (_hats(np.arange(size), size) for size in light.log_light.shape[:2])
         logs: NDArray[np.float64] = self.exposures[index] + np.einsum(
             "ri,cj,ijk->rck", rows, columns, self.nodes[index], optimize=True

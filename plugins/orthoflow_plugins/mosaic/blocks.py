@@ -48,7 +48,7 @@ class Blocks:
         )
 
     def within(self, box: Box) -> Blocks:
-        """Give the blocks of a box, counted from its first cell."""
+        """Return the blocks of a box, counted from its first cell."""
         rows = self.rows[box[0].start : box[0].stop + 1]
         columns = self.columns[box[1].start : box[1].stop + 1]
         return Blocks(rows=rows - rows[0], columns=columns - columns[0])

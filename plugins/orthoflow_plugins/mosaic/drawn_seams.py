@@ -71,7 +71,7 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
 def seams_of(
     polygons: Sequence[NamedPolygon], number: int, frame: WallFrame, sources: Sequence[str]
 ) -> DrawnSeams | None:
-    """Give the polygons of a wall in its cells; None where it has none.
+    """Return the polygons of a wall in its cells; None where it has none.
 
     Args:
         polygons: of all walls, in the metres of their GeoTIFFs.

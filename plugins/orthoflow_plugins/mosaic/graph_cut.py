@@ -67,7 +67,7 @@ class CutLabels:
 def cut_labels(
     layers: Sequence[Layer], wall: Wall | None, balance: Balance | None = None
 ) -> CutLabels:
-    """Give each cell the layer that a graph cut chooses, -1 where none paints it.
+    """Assign each cell the layer that a graph cut chooses, -1 where none paints it.
 
     Boykov, Veksler and Zabih 2001: each layer in turn may take over cells of the others where that
     lowers the sum of seam costs (colour difference of both layers on both sides, Kwatra et al.

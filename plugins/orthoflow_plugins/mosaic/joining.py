@@ -87,7 +87,7 @@ def preferences(
     balance: Balance | None = None,
     allocate: Allocate = in_memory,
 ) -> list[Preference]:
-    """Say by a rule how much each layer is preferred in rows of the wall, larger is more.
+    """State by a rule how much each layer is preferred in rows of the wall, larger is more.
 
     `best-view` is the layers' own quality: incidence, resolution, distance to the photo's border.
     `voronoi` prefers the layer whose painted area ends farthest off, so that seams lie in the
@@ -149,7 +149,7 @@ def joined(
     balance: Balance | None,
     allocate: Allocate,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Say what becomes of each cell of a wall, a large one band by band.
+    """State what becomes of each cell of a wall, a large one band by band.
 
     Args:
         painters: layers of the wall that paint something.
@@ -253,7 +253,7 @@ def _part(layer: Layer, rows: slice) -> Layer:
 
 
 def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]) -> Choice:
-    """Give each cell to the layer that is preferred there, the first of equals."""
+    """Assign each cell to the layer that is preferred there, the first of equals."""
     shape = layers[0].frame.shape
     best = np.zeros(shape, dtype=np.float32)
     rank = np.zeros(shape, dtype=np.uint8)
@@ -269,7 +269,7 @@ def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32
 
 
 def without_islands(choice: Choice, layers: Sequence[Layer], cells_min: int) -> Choice:
-    """Give small patches to the source that surrounds them, where it shows them as well.
+    """Return small patches to the source that surrounds them, where it shows them as well.
 
     A patch is connected over sides of cells. The source with the most cells about a cell takes
     it; what no larger patch's source shows stays as it is.

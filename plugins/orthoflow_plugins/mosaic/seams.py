@@ -482,7 +482,7 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
 
 
 def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
-    """Say in words why cells show nothing, where that is for want of photos."""
+    """State in words why cells show nothing, where that is for want of photos."""
     words = {
         OrthoMask.NONE: f"lie in no oriented photo ({_way_to_a_photo(cameras)})",
         OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too flatly (take "
@@ -500,7 +500,7 @@ def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None)
 
 
 def _way_to_a_photo(cameras: Cameras | None) -> str:
-    """Say what would fill cells of no oriented photo; one that was refused may lie there."""
+    """State what would fill cells of no oriented photo; one that was refused may lie there."""
     if cameras is None:
         return "see which are refused, or take one there"
     n_photos = len(cameras.cameras)
@@ -524,7 +524,7 @@ def _source_map(image: Orthoimage) -> bytes:
 
 
 def _caption(image: Orthoimage) -> str:
-    """Say which colour of `_source_map` stands for which source."""
+    """State which colour of `_source_map` stands for which source."""
     names = list(_NAMED_RGB)
     legend = ", ".join(
         f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)

@@ -338,7 +338,7 @@ def _estimate(
     known: tuple[BlockCovariance, NDArray[np.float64]],
     fitted: tuple[Misfit, _State, float],
 ) -> Estimate:
-    """Give a photo's part of the block as an orientation of its own."""
+    """Return a photo's part of the block as an orientation of its own."""
     (covariance, middle), (fit, state, limit) = known, fitted
     lens = block.lenses[block.lens_of[at]]
     columns = block.columns(at)

@@ -118,7 +118,7 @@ class Block:
         )
 
     def moved(self, cameras: tuple[ViewingCamera, ...], now: NDArray[np.float64]) -> Block:
-        """Give the block after an adjustment."""
+        """Return the block after an adjustment."""
         return replace(self, cameras=cameras, points=replace(self.points, now=now))
 
 
@@ -159,7 +159,7 @@ def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float6
 
 
 def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
-    """Give the covariance of a block after its adjustment.
+    """Return the covariance of a block after its adjustment.
 
     Args:
         block: as adjusted.
@@ -208,7 +208,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 def lenses_json(
     block: Block, photos: Sequence[Photo], covariance: NDArray[np.float64]
 ) -> JsonValue:
-    """Give each lens as it came out, with standard deviations where it was free."""
+    """Return each lens as it came out, with standard deviations where it was free."""
     entries: list[JsonValue] = []
     starts = block.column_starts[1]
     for index, lens in enumerate(block.lenses):

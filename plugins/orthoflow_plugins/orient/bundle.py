@@ -206,7 +206,7 @@ def _photo_ties(
 def _report_block(
     ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]
 ) -> dict[str, JsonValue]:
-    """Tell of the block as a whole; of its photos, each tells itself."""
+    """Report of the block as a whole; of its photos, each tells itself."""
     block, covariance = adjusted.block, adjusted.covariance
     for photo, (note, values) in correlation_notes(block, photos, covariance.cofactors):
         ctx.report(note, subject=photo, **values)

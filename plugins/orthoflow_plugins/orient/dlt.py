@@ -313,7 +313,7 @@ def _too_few(n_control: int, distortion: Distortion, least: int) -> str:
 
 
 def _too_flat(control: SeenPoints) -> str:
-    """Say that control lies too near a plane for eleven parameters; empty when it does not."""
+    """State that control lies too near a plane for eleven parameters; empty when it does not."""
     depth = relief(control.points_world)
     sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
     if depth.rms_m < _RELIEF_SIGMAS * sigma_m:

@@ -192,7 +192,7 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> Refusa
 
 
 def too_few(n_ties: int) -> str:
-    """Say why ties are too few for an orientation; empty when they suffice."""
+    """State why ties are too few for an orientation; empty when they suffice."""
     if n_ties < _MIN_TIES:
         return (
             f"{n_ties} ties with the walls, at least {_MIN_TIES} are needed: the photo "
@@ -202,7 +202,7 @@ def too_few(n_ties: int) -> str:
 
 
 def warnings_for(candidate: Candidate) -> list[Note]:
-    """Say what limits an orientation that is `ok`."""
+    """State what limits an orientation that is `ok`."""
     notes: list[Note] = []
     counts = candidate.quadrant_counts
     if max(counts) > _CROWDED_RATIO * min(counts):

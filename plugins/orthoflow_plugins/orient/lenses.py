@@ -73,7 +73,7 @@ class LensGroups:
 
 
 def lens_prior(photo: Photo) -> LensPrior:
-    """Give what is known of a photo's lens: its calibration, else EXIF, else what is usual."""
+    """Return what is known of a photo's lens: its calibration, else EXIF, else what is usual."""
     if photo.intrinsics is not None:
         return LensPrior(
             guesses=(photo.intrinsics,), freedom=LensFreedom(), source=photo.intrinsics.source
@@ -93,13 +93,13 @@ def lens_prior(photo: Photo) -> LensPrior:
 
 
 def intrinsics_of(resection: Resection, source: str) -> Intrinsics:
-    """Give the interior orientation after an adjustment; `source` is what it was known from."""
+    """Return the interior orientation after an adjustment; `source` is what it was known from."""
     was_estimated = resection.lens.sigmas.size or source == UNKNOWN
     return Intrinsics.of(resection.camera, source="estimated" if was_estimated else source)
 
 
 def focal_sigma(resection: Resection) -> float:
-    """Give the standard deviation of an adjusted ln(focal length); inf where it was held."""
+    """Return the standard deviation of an adjusted ln(focal length); inf where it was held."""
     if "focal" not in resection.lens.names:
         return math.inf
     column = POSE_PARAMETERS + resection.lens.names.index("focal")

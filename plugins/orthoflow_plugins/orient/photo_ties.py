@@ -66,7 +66,7 @@ class PhotoTies:
 
 
 def no_features() -> PhotoFeatures:
-    """Give none."""
+    """Return none."""
     return PhotoFeatures(
         pixels=np.empty((0, 2)), scale=1.0, descriptors=np.empty((0, 128), np.float32)
     )
@@ -105,7 +105,7 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
 
 
 def no_photo_ties() -> PhotoTies:
-    """Give none."""
+    """Return none."""
     none = np.empty(0, dtype=np.intp)
     return PhotoTies(
         photo=none,

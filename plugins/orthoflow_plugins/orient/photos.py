@@ -390,7 +390,7 @@ def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
 
 
 def refused(tied: TiedPhoto, reason: str) -> Oriented:
-    """Give a photo without an orientation."""
+    """Return a photo without an orientation."""
     n_ties = len(tied.chosen)
     return Oriented(
         camera=Camera(photo=tied.photo.name, status=reason),

@@ -122,7 +122,7 @@ def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
 
 
 def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
-    """Give the camera at the pose that solvePnP finds.
+    """Return the camera at the pose that solvePnP finds.
 
     Raises:
         GeometryError: it finds none.

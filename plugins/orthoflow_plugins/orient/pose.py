@@ -193,7 +193,7 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
 
 
 def no_pose(seen: SeenPoints) -> str:
-    """Say that a photo's ties contradict each other."""
+    """State that a photo's ties contradict each other."""
     return f"no pose agrees with enough of its {len(seen)} ties"
 
 
@@ -319,7 +319,7 @@ def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -
 
 
 def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
-    """Give the lens of one camera the pose of another."""
+    """Return the lens of one camera the pose of another."""
     return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 

@@ -113,7 +113,7 @@ def photo_numbers(candidate: Candidate) -> PhotoNumbers:
 
 
 def numbers_json(candidate: Candidate, numbers: PhotoNumbers) -> dict[str, JsonValue]:
-    """Give the numbers of an orientation as JSON."""
+    """Return the numbers of an orientation as JSON."""
     result = candidate.estimate.resection
     entry: dict[str, JsonValue] = {
         "n_control": numbers.n_control,
@@ -142,7 +142,7 @@ def numbers_json(candidate: Candidate, numbers: PhotoNumbers) -> dict[str, JsonV
 
 
 def residual_table(candidate: Candidate, numbers: PhotoNumbers) -> list[ResidualRow]:
-    """Give the rows of the table of residuals, control and check apart."""
+    """Return the rows of the table of residuals, control and check apart."""
     units = {"px": 1.0, "mm": numbers.pixel_mm}
     if candidate.gsd_m is not None:
         units["cell"] = numbers.pixel_mm / (1000.0 * candidate.gsd_m)
@@ -159,7 +159,7 @@ def residual_rows(
     residuals_px: NDArray[np.float64],
     units: Mapping[str, float],
 ) -> list[ResidualRow]:
-    """Give the rows of one photo and role.
+    """Return the rows of one photo and role.
 
     Args:
         photo: name of the photo.
@@ -212,7 +212,7 @@ def hand_over(
     found: Sequence[Oriented],
     details: dict[str, JsonValue] | None = None,
 ) -> Cameras:
-    """Give the product and tell the rest through the context.
+    """Return the product and tell the rest through the context.
 
     Args:
         ctx: takes warnings, metrics and figures.

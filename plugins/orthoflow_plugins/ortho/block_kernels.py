@@ -130,7 +130,7 @@ def judge_block(
     nodes: NDArray[np.float64],
     box: NDArray[np.float64],
 ) -> int:
-    """Tell whether a photo surely sees all known cells of a block, so that none need be asked.
+    """Return whether a photo surely sees all known cells of a block, so that none need be asked.
 
     What counts for a cell is monotonous over the block or nearly linear, so that the nodes at the
     lowest and the highest depth bound it. The rays to the camera are known to be free of relief.
@@ -218,7 +218,7 @@ def _bounds(
 def _bound_cloud(
     buffer: DepthBuffer, left: float, right: float, upper: float, lower: float
 ) -> tuple[float, float]:
-    """Give the nearest and the farthest depth in a part of a photo."""
+    """Return the nearest and the farthest depth in a part of a photo."""
     nearest, farthest = np.float32(np.inf), np.float32(0.0)
     per_pixel = 1.0 / buffer.reduction
     for row in range(int(upper * per_pixel), int(lower * per_pixel) + 1):
@@ -280,7 +280,7 @@ class BlockRoom(NamedTuple):
 
 @compiled
 def room_for_blocks(relief: Relief, visible: TileVisibility) -> BlockRoom:
-    """Give the room that `look_at_unoccluded_block` needs for the blocks of a tile."""
+    """Return the room that `look_at_unoccluded_block` needs for the blocks of a tile."""
     return BlockRoom(
         relief.depth.reshape(relief.depth.size),
         visible.u.reshape(visible.u.size),

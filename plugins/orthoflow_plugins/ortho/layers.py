@@ -95,7 +95,7 @@ class LayerStack:
         )
 
     def allocator(self, wall: int) -> Allocate:
-        """Give what gives the arrays of the next layer; a large one lies in files."""
+        """Return what gives the arrays of the next layer; a large one lies in files."""
         prefix = f"{wall}.{len(self.painted)}"
 
         def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:

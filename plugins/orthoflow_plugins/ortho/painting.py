@@ -163,7 +163,7 @@ class _Brush:
         return np.empty((0, 0), dtype=np.uint8)
 
     def _blank_visibility(self, rows: int, columns: int) -> TileVisibility:
-        """Give arrays for a tile that this thread has used before: fresh memory takes time."""
+        """Return arrays for a tile that this thread has used before: fresh memory takes time."""
         if not hasattr(self._scratch, "floats"):
             side = TILE_CELLS + 2 * (self._rule.erosion_cells + 1)
             self._scratch.floats = np.empty((3, side * side), dtype=np.float32)

@@ -165,7 +165,7 @@ def layers_of_photos(
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
-    """Say in which bits photos are laid onto walls: 16 where any of them has more than 8.
+    """State in which bits photos are laid onto walls: 16 where any of them has more than 8.
 
     The others are taken times 257 then, so that white stays white and nothing is lost.
     """

@@ -62,7 +62,7 @@ class Painters:
     is_left_out: NDArray[np.bool_] | None = None
 
     def entries(self, slab: Slab, *, threads: int, rows: slice | None = None) -> Iterator[Entries]:
-        """Give those inside a slab, chunk by chunk (`entries_inside`)."""
+        """Return those inside a slab, chunk by chunk (`entries_inside`)."""
         from orthoflow.geometry.rastering import entries_inside
 
         return entries_inside(
@@ -166,7 +166,7 @@ def _on_top(
     threads: int,
     wanted: slice | None = None,
 ) -> Iterator[_TopPoints]:
-    """Give the points on the topmost surface, of all cells or of those that are wanted."""
+    """Return the points on the topmost surface, of all cells or of those that are wanted."""
     width = slab.frame.width
     wanted = wanted or slice(0, slab.n_cells)
     rows = slice(wanted.start // width, -(-wanted.stop // width))

@@ -363,7 +363,7 @@ def _require_paint(layers: list[Layer]) -> None:
 def _report(
     ctx: StepContext, layers: list[Layer], names: Sequence[str], seconds: NDArray[np.float64]
 ) -> None:
-    """Tell how much is painted, filled and void, and of each wall what would fill more."""
+    """Report how much is painted, filled and void, and of each wall what would fill more."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     n_filled = sum(_n_filled(layer) for layer in layers)

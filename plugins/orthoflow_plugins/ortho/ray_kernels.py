@@ -55,7 +55,7 @@ class Eye(NamedTuple):
 
 @kernel_part
 def eye_of(view: WallView, relief: Relief) -> Eye:
-    """Give the camera of a photo as rays need it."""
+    """Return the camera of a photo as rays need it."""
     return Eye(view.row, view.column, view.height_m, view.tolerance_m, 1.0 / relief.step_m)
 
 

@@ -80,7 +80,7 @@ def _allocated(
 def view_of(
     camera: ViewingCamera, surface: Surface, params: VisibilityParams, *, is_exact: bool = False
 ) -> WallView:
-    """Give a camera in the axes of a wall; survey coordinates lose nothing on the way.
+    """Return a camera in the axes of a wall; survey coordinates lose nothing on the way.
 
     Args:
         camera: of the photo.

@@ -97,7 +97,7 @@ class FoundPlane:
         return Claim(self.raster.slab(), np.concatenate([[tolerance_m], grown]))
 
     def as_proposed(self, up: NDArray[np.float64]) -> FoundPlane:
-        """Give it back as its detector proposed it, with the rectangle that was found for it."""
+        """Return it back as its detector proposed it, with the rectangle that was found for it."""
         plane = self.candidate.plane
         if float(plane.normal @ self.raster.plane.normal) < 0.0:
             plane = plane.flipped()

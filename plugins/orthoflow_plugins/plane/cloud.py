@@ -130,7 +130,7 @@ class PreparedCloud:
         return (self.grid.low_m + steps * extent) @ self.grid.basis
 
     def claim_in_turn(self, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
-        """Give each point to the nearest of some slabs (k, 12) that hold it, the first of equals.
+        """Assign each point to the nearest of some slabs (k, 12) that hold it, the first of equals.
 
         In float64, unlike `slab_kernels.assign_points`; all slabs have the same (5,) bounds.
         """
@@ -187,7 +187,7 @@ class Search:
         return self._free
 
     def claim(self, claim: Claim) -> None:
-        """Give a plane its points, but for those that an earlier one has and is nearer to."""
+        """Return a plane its points, but for those that an earlier one has and is nearer to."""
         self.taken.append(claim)
         slabs = np.array([item.slab for item in self.taken])
         self.n_points -= claim_slab(self.cloud.sample.points, self.claims, slabs, claim.bounds_m)
@@ -295,7 +295,7 @@ def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
 
 
 def boxed(offsets_m: NDArray[np.float64]) -> BlockedPoints:
-    """Give points (m, 3) of a sample in blocks."""
+    """Return points (m, 3) of a sample in blocks."""
     offsets = read_only(*np.ascontiguousarray(offsets_m.T, dtype=np.float32))
     return blocked(offsets, box_blocks(offsets, parts=1).boxes)
 

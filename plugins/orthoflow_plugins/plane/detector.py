@@ -242,7 +242,7 @@ def leans_as_asked(
     constraint: Constraint,
     max_tilt_deg: float,
 ) -> NDArray[np.bool_]:
-    """Tell which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
+    """Report which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
     tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
     if constraint == "any":
         return np.ones(len(normals), dtype=bool)

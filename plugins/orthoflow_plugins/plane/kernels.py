@@ -57,7 +57,7 @@ def blocked(offsets: Offsets, boxes: NDArray[np.float32]) -> BlockedPoints:
 
 
 def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
-    """Give a piece of the points that starts at a block."""
+    """Return a piece of the points that starts at a block."""
     blocks = slice(piece.start // BLOCK_POINTS, -(-piece.stop // BLOCK_POINTS))
     return BlockedPoints(points.x[piece], points.y[piece], points.z[piece], points.boxes[blocks])
 

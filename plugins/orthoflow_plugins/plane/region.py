@@ -269,7 +269,7 @@ class RegionProposer:
         self._barred.add(self._last)
 
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
-        """Give each point to the plane of its region instead of the plane it is near.
+        """Assign each point to the plane of its region instead of the plane it is near.
 
         A region belongs to the plane that most of its points are near, if more than half of them
         are near any; the claims of the cloud say which those are.

@@ -312,7 +312,7 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
 
 
 def _now(ctx: StepContext) -> tuple[float, float]:
-    """Give seconds by the clock, and by the processor."""
+    """Return seconds by the clock, and by the processor."""
     return ctx.clock_s(), ctx.processor_s()
 
 

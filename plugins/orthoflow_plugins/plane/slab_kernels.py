@@ -88,7 +88,7 @@ def claim_slab(
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
 ) -> int:
-    """Give the points of the last slab to it, unless an earlier slab that has them is nearer.
+    """Return the points of the last slab to it, unless an earlier slab that has them is nearer.
 
     As `assign_points` with all slabs would, but in float64, like `sum_cells`.
 
@@ -176,7 +176,7 @@ def assign_points(
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
 ) -> None:
-    """Give each point to the nearest slab that holds it.
+    """Assign each point to the nearest slab that holds it.
 
     Args:
         points: (n,) offsets in blocks.
@@ -480,7 +480,7 @@ def _take_nearer(
     owner: NDArray[np.int32],
     nearest: NDArray[np.float32],
 ) -> None:
-    """Give those points of a block to a slab that it holds and no earlier one is nearer to."""
+    """Return those points of a block to a slab that it holds and no earlier one is nearer to."""
     find_m = np.float32(bounds[k, 0])
     left, right = np.float32(bounds[k, 1]), np.float32(bounds[k, 2])
     top, bottom = np.float32(bounds[k, 3]), np.float32(bounds[k, 4])

@@ -128,7 +128,7 @@ def measure_thickness(
 def row_points(
     planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
 ) -> RowPoints | None:
-    """Give the scan row that most of the first plane's points are on, None without rows."""
+    """Return the scan row that most of the first plane's points are on, None without rows."""
     members = prepared.sample.index[plane_of_sample == 0]
     if cloud.row is None or not len(members):
         return None

@@ -111,7 +111,7 @@ def place_keys(
 
 @kernel_part
 def _new_row(brick: int, bricks: NDArray[np.int32], n_used: NDArray[np.int64]) -> np.int32:
-    """Give a brick that has no points yet the next row of a table."""
+    """Return a brick that has no points yet the next row of a table."""
     row = np.int32(n_used[0])
     n_used[0] += 1
     bricks[brick] = row
@@ -198,7 +198,7 @@ def _place_steps(
 def _voxel(
     key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Give the number of the voxel with a key of `place_keys`, a new one if it had none."""
+    """Return the number of the voxel with a key of `place_keys`, a new one if it had none."""
     brick, voxel = key // VOXELS, key % VOXELS
     row = bricks[brick]
     if row < 0:
@@ -342,7 +342,7 @@ def merge_moments(
 
 @kernel_part
 def _known_voxel(key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Give the number of the voxel with a key of `place_keys`, -1 if it has none."""
+    """Return the number of the voxel with a key of `place_keys`, -1 if it has none."""
     slot = bricks[key // VOXELS] if key >= 0 else -1
     return numbers[slot, key % VOXELS] if slot >= 0 else -1
 
@@ -373,7 +373,7 @@ def claim_voxels(
     owners: NDArray[np.int8],
     claims: NDArray[np.int8],
 ) -> None:
-    """Give each point to the plane that owns its voxel; owners (voxels,) are -1 for none."""
+    """Assign each point to the plane that owns its voxel; owners (voxels,) are -1 for none."""
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     flat = bricks.reshape(bricks.size)
     for start in range(0, points.x.size, BLOCK_POINTS):
@@ -391,7 +391,7 @@ _SWEEPS_MOST: Final = 3
 
 @kernel_part
 def voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Give the number of the voxel at a place, -1 where none is."""
+    """Return the number of the voxel at a place, -1 where none is."""
     if a < 0 or b < 0 or c < 0:
         return -1
     p, q, r = a >> 3, b >> 3, c >> 3

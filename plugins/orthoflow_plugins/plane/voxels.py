@@ -180,7 +180,7 @@ class SurfaceVoxels:
         return found
 
     def claim(self, cloud: PreparedCloud, owners: NDArray[np.int8]) -> None:
-        """Give the points of a cloud to the planes that own (m,) their voxels."""
+        """Return the points of a cloud to the planes that own (m,) their voxels."""
         frame = plan_frame(self.grid)
 
         def give(_part: int, piece: slice) -> None:

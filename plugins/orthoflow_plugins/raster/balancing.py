@@ -54,7 +54,7 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Give the cloud with intensities as if all scans had been taken alike.
+    """Return the cloud with intensities as if all scans had been taken alike.
 
     Points on a wall are corrected by the incidence on it, all others are left as they are. Where
     no two scans overlap the cloud stays as it is, and that is said.

@@ -139,7 +139,7 @@ def _find_specks(
     first_row: int,
     end_row: int,
 ) -> None:
-    """Tell the specks among the cells of some rows.
+    """Report the specks among the cells of some rows.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.

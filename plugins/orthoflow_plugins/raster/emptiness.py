@@ -84,7 +84,7 @@ class Sight:
 def emptiness_of(
     wall: Wall, slab: Slab, sight: Sight, *, free_m: float = math.inf, threads: int
 ) -> Emptiness:
-    """Tell why cells of a wall are empty.
+    """Report why cells of a wall are empty.
 
     Args:
         wall: the wall.

@@ -358,7 +358,7 @@ def _log_cuts(
     *,
     margin_m: float,
 ) -> None:
-    """Say what of a wall lies beyond its rectangle because what adjoins it runs askew."""
+    """State what of a wall lies beyond its rectangle because what adjoins it runs askew."""
     for index, frame in frames.items():
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - margin_m

@@ -37,7 +37,7 @@ NO_MAP: Final = DiagnosticSpec(
 def mapped(
     frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
 ) -> dict[int, WallFrame]:
-    """Give the grids of level planes a place in a map; the others stay in their planes.
+    """Return the grids of level planes a place in a map; the others stay in their planes.
 
     Args:
         frames: grid of each plane by its index.

@@ -137,7 +137,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 
 
 def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
-    """Tell what limits the walls: what the cloud lacks, and cells finer than its points."""
+    """Report what limits the walls: what the cloud lacks, and cells finer than its points."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -233,7 +233,7 @@ def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int
 
 
 def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
-    """Tell which gaps the surface tin leaves open on large walls."""
+    """Report which gaps the surface tin leaves open on large walls."""
     from orthoflow_plugins.raster.nets import SPAN_MOST_CELLS, VERTICES_MOST
 
     for wall in walls:
@@ -251,7 +251,7 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
 
 
 def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float64]) -> None:
-    """Tell in numbers what the walls hold.
+    """Report in numbers what the walls hold.
 
     Args:
         ctx: of the step.

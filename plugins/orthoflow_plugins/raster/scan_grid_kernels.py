@@ -110,7 +110,7 @@ def recover_between(
 def take_means(
     cells: NDArray[np.int64], sums: Sums, is_void: NDArray[np.bool_], values: CellValues
 ) -> None:
-    """Give some void cells the mean of what triangles laid into them, if any did.
+    """Return some void cells the mean of what triangles laid into them, if any did.
 
     Args:
         cells: flat indices.

@@ -40,7 +40,7 @@ _INK: Final = (40, 40, 40)
 
 
 def plan_view_png(cloud: PointCloud) -> bytes:
-    """Give a PNG of the cloud seen from above, brighter where it is denser (logarithmic)."""
+    """Return a PNG of the cloud seen from above, brighter where it is denser (logarithmic)."""
     step = max(1, len(cloud) // _PLAN_SAMPLE)
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
     plan = offsets.astype(np.float64) @ basis_from_up(cloud.up)[:2].T
@@ -59,7 +59,7 @@ def plan_view_png(cloud: PointCloud) -> bytes:
 
 
 def polar_view_png(cloud: PointCloud) -> bytes | None:
-    """Give a PNG of the intensity over the rows and columns of the scan with most points.
+    """Return a PNG of the intensity over the rows and columns of the scan with most points.
 
     This is what the scanner saw, by its own angles (Figure 2 of markiewicz2015): straight edges are
     curved. Where the station is known, up is up and left is left. None where the cloud has no grid

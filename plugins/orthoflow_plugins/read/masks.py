@@ -104,7 +104,7 @@ class Masks:
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:
-        """Say which masks are of no photo, and which files are no masks."""
+        """State which masks are of no photo, and which files are no masks."""
         unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]

@@ -356,7 +356,7 @@ def _inside_e57(path: Path) -> list[_Source]:
 
 
 def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
-    """Give a photo with its mask, where it has one."""
+    """Return a photo with its mask, where it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
     own = (

@@ -97,7 +97,7 @@ def _is_in_photo(tie: MeasuredTie, photos: Mapping[str, Photo]) -> bool:
 
 
 def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
-    """Say why a tie is in no photo."""
+    """State why a tie is in no photo."""
     photo = photos.get(tie.photo)
     if photo is None:
         near = difflib.get_close_matches(tie.photo, photos, n=1)

@@ -127,7 +127,7 @@ def _face_m(depths_m: NDArray[np.float32], behind_m: float) -> float:
 
 
 def open_areas(relief: Relief, rule: AreaRule) -> Iterator[Area]:
-    """Give the areas large and wide enough, from the largest."""
+    """Return the areas large and wide enough, from the largest."""
     import cv2
 
     neck = cv2.getStructuringElement(cv2.MORPH_RECT, (_NECK_CELLS, _NECK_CELLS))

@@ -43,7 +43,7 @@ class SightLines:
     def over(
         self, tiles: NDArray[np.bool_], shape: tuple[int, int], step: int
     ) -> NDArray[np.bool_]:
-        """Give tiles as cells of the wall's raster (rows, cols), of every nth row and column."""
+        """Return tiles as cells of the wall's raster (rows, cols), of every nth row and column."""
         rows, columns = (np.arange(0, count, step) // self.side for count in shape)
         return tiles[np.ix_(rows, columns)]
 

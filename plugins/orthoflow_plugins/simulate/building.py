@@ -79,7 +79,7 @@ class SceneDraft:
     planes: list[TruePlane] = field(default_factory=list)
 
     def finished(self, *, spectral_gap: float) -> Scene:
-        """Give the scene, its origin at (0, 0, 0).
+        """Return the scene, its origin at (0, 0, 0).
 
         Args:
             spectral_gap: 0 when the laser sees the patterns of the photos, 1 when other ones.

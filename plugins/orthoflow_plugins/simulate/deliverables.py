@@ -71,7 +71,7 @@ class Delivery:
 
 
 def cloud_of(delivery: Delivery) -> PointCloud:
-    """Give the cloud; a shift of the world changes its origin and its stations, nothing else."""
+    """Return the cloud; a shift of the world changes its origin and its stations, nothing else."""
     points = delivery.scan.points
     in_room = (points.x, points.y, points.z)
     x, y, z = (_turned_axis(row, in_room) for row in delivery.world_from_room)
@@ -98,7 +98,7 @@ def truth_of(
     shots: tuple[Shot, ...],
     parameters: Mapping[str, JsonValue],
 ) -> Truth:
-    """Give the truth; planes come in the order of their numbers of points.
+    """Return the truth; planes come in the order of their numbers of points.
 
     Args:
         delivery: the scanned room.

@@ -164,7 +164,7 @@ def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Give the scene as each photo finds it, with people before the main wall; none without any.
+    """Return the scene as each photo finds it, with people before the main wall; none without any.
 
     Each is there in every other photo, somewhere along the wall and 0.5 to 1.4 m before it, and
     keeps its clothes.
@@ -261,7 +261,7 @@ def calibrated(photos: Photos, calibration: Calibration) -> Photos:
 
 
 def calibration_of(shots: tuple[Shot, ...], *, is_known: bool) -> Calibration:
-    """Give the calibration of the one camera; empty when it is not known or there is no photo."""
+    """Return the calibration of the one camera; empty when it is not known or there is no photo."""
     if not (shots and is_known):
         return Calibration(patterns=(), intrinsics=())
     return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(shots[0].camera),))
@@ -272,7 +272,7 @@ def true_cameras(
     world_from_room: NDArray[np.float64],
     shift_world_m: NDArray[np.float64],
 ) -> Cameras:
-    """Give the true orientations in the world.
+    """Return the true orientations in the world.
 
     Args:
         shots: the photos, room frame.
