@@ -67,20 +67,19 @@ def common_points(run: Run) -> tuple[CommonPoints, ...]:
     Raises:
         RecordError: the record is damaged.
     """
-    groups: dict[tuple[str, ...], dict[str, Inspection]] = defaultdict(dict)
+    groups: dict[tuple[str, ...], list[tuple[str, str]]] = defaultdict(list)
     for cell in run.record.cells:
         for port, output in cell.outputs.items():
             if output.type_name == Inspection.type_name and output.embedded:
                 conditions = (cell.assignment.get(DATA, ""), cell.assignment.get(SEED, ""))
-                key = (cell.step, port, *conditions, str(cell.repeat))
-                found = Inspection.from_payload(run.payload(cell.address, port))
-                groups[key][cell.address] = found
-    return tuple(
-        row
-        for key, inspections in groups.items()
-        if len(inspections) > 1
-        for row in over_common_points(inspections, step=key[0])
-    )
+                groups[cell.step, port, *conditions, str(cell.repeat)].append((cell.address, port))
+    compared = {key: places for key, places in groups.items() if len(places) > 1}
+    payloads = run.payloads([place for places in compared.values() for place in places])
+    rows: list[CommonPoints] = []
+    for (step, *_), places in compared.items():
+        found = {cell: Inspection.from_payload(next(payloads)) for cell, _ in places}
+        rows += over_common_points(found, step=step)
+    return tuple(rows)
 
 
 def over_common_points(
