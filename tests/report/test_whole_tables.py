@@ -115,9 +115,10 @@ def test_numbers_may_have_fewer_digits() -> None:
 
 
 def marks(sense: Sense, *values: tuple[float, ...], groups: str = "") -> list[str]:
+    """Rank values of repeats, each with its spread; with none, all repeats gave the value."""
     found = rank(
         [
-            Value(sort=value[0], spread=value[1] if len(value) > 1 else math.nan, group=group)
+            Value(sort=value[0], spread=value[1] if len(value) > 1 else 0.0, group=group)
             for value, group in zip(values, groups or "a" * len(values), strict=True)
         ],
         sense,
@@ -144,6 +145,12 @@ def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
     assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "NONE"]
     assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["NEAR", "NEAR", "WORST"]
     assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["NEAR", "NEAR", "NONE"]
+
+
+def test_nothing_is_ranked_beside_a_single_run() -> None:
+    assert marks(Sense.LESS, (2, math.nan), (9, math.nan)) == ["NONE", "NONE"]
+    assert marks(Sense.LESS, (2, 0.1), (9, math.nan)) == ["NONE", "NONE"]
+    assert marks(Sense.LESS, (2, 0.1), (9, 0.1)) == ["BEST", "WORST"]
 
 
 def test_badness_grows_as_values_get_worse() -> None:
