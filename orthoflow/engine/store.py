@@ -71,7 +71,7 @@ from orthoflow.engine.objects import (
 from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.foreign_text import parse_json
-from orthoflow.products.product import JsonValue, Payload, Product
+from orthoflow.products.product import Payload, Product
 from orthoflow.sdk.lines import one_line
 
 # Made together when a store is first used. The last one is what a store is known by: a git
@@ -282,23 +282,6 @@ class Store:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error
             raise DamageError(f"{damaged} ({error})") from error
         return cls.from_payload(Payload(**shared_fields(stored, Payload)))
-
-    def product_metadata(self, digest: str) -> Mapping[str, JsonValue]:
-        """What a product holds besides its arrays, which are not read.
-
-        Raises:
-            DamageError: it is not there, or is damaged.
-        """
-        from orthoflow_provenance.arrays import read_product_metadata  # noqa: PLC0415 - as above
-
-        path = self.product_file(digest)
-        try:
-            if path is not None:
-                return read_product_metadata(path)
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
-            if isinstance(error, OSError) and error.errno in SHORTAGES:
-                raise StoreError(f"cannot read {path}: {error.strerror}") from error
-        raise DamageError(f"the store {self.folder} has no sound product {digest}")
 
     def product_file(self, digest: str) -> Path | None:
         """The HDF5 file of a product, None when it is not there or is damaged."""

@@ -32,11 +32,3 @@ def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     matrices[:, 1, 0], matrices[:, 1, 2] = z, -x
     matrices[:, 2, 0], matrices[:, 2, 1] = -y, x
     return matrices
-
-
-def rotation_from_quaternion(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) of a unit quaternion (4,) = (w, x, y, z)."""
-    w, vector = quaternion[0], quaternion[1:]
-    cross = cross_matrix(vector)
-    rotation: NDArray[np.float64] = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
-    return rotation

@@ -43,10 +43,12 @@ _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
 _JOINED_SHARE: Final = 0.97
-# Rooms, or sets of ties, whose errors are compared with what is stated of them.
-_SAME_PLANE_M: Final = 0.02
-_NO_VARIANCE: Final = 1e-30
+# Seeds of rooms, or sets of ties, whose errors are compared with what is stated of them.
 _DRAWS: Final = (2, 3, 4)
+# A plane farther from a true one is another plane.
+_SAME_PLANE_M: Final = 0.02
+# In the place of a variance of zero, so that its error counts as far too large.
+_NO_VARIANCE: Final = 1e-30
 # The RMS over what is drawn is known to an eighth; our own methods have 0.82 to 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
@@ -100,7 +102,7 @@ def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
         corners = truth.corners[nearest]
         places = np.vstack([corners, corners.mean(axis=0)])
         off_m = places @ found.normal[index] - found.offset[index]
-        # Of a level method that finds the floor as the ceiling nothing is said here.
+        # What is no plane of the room is not judged here.
         if np.abs(off_m).max() < _SAME_PLANE_M:
             at = np.column_stack([places, -np.ones(len(places))])
             variances = np.einsum("ij,jk,ik->i", at, found.covariance[index], at)

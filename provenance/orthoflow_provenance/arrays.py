@@ -283,18 +283,6 @@ def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
         return read_payload(open_group(file, PRODUCT_GROUP), map_arrays=map_arrays)
 
 
-def read_product_metadata(path: Path) -> Mapping[str, JsonValue]:
-    """Read what `write_product_file` wrote, without the arrays.
-
-    Raises:
-        RecordFormatError: the file is damaged, of another format or a newer one.
-        OSError: the file cannot be opened.
-    """
-    with safe_open(path) as file:
-        check_format(file, PRODUCT_FORMAT)
-        return _metadata(open_group(file, PRODUCT_GROUP))
-
-
 def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
     """Read a product from its group in a file that `safe_open` opened.
 

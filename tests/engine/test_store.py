@@ -281,7 +281,7 @@ def test_a_disk_that_cannot_be_read_is_no_damage(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ref = store.put_product(heights("low"))
-    assert store.product_metadata(ref.digest)["note"] == "low"
+    assert store.get_product(ref.digest, Heights).note == "low"
 
     for error, told in (
         (OSError(errno.EMFILE, "Too many open files"), StoreError),
@@ -289,10 +289,10 @@ def test_a_disk_that_cannot_be_read_is_no_damage(
         (KeyError("metadata"), DamageError),
     ):
         monkeypatch.setattr(
-            "orthoflow_provenance.arrays.read_product_metadata", Mock(side_effect=error)
+            "orthoflow_provenance.arrays.read_product_file", Mock(side_effect=error)
         )
         with pytest.raises(told) as caught:
-            store.product_metadata(ref.digest)
+            store.get_product(ref.digest, Heights)
         assert isinstance(caught.value, DamageError) is (told is DamageError)
 
 

@@ -1,4 +1,4 @@
-"""Rotation vectors, quaternions and cross products against scipy's and numpy's."""
+"""Rotation vectors and cross products against scipy's and numpy's."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ from orthoflow_provenance.arrays import (
     payload_digest,
     read_payload,
     read_product_file,
-    read_product_metadata,
     write_product_file,
 )
 from orthoflow_provenance.document import RecordFormatError
@@ -55,7 +54,6 @@ def test_a_product_comes_back_from_its_file(
     assert stored.digest == digest == payload_digest(payload) == payload_digest(stored)
     assert (stored.type_name, stored.encoding_version) == ("walls", 1)
     assert (stored.metadata, stored.mapped) == (metadata, is_mapped)
-    assert read_product_metadata(path) == metadata
     assert stored.arrays.keys() == arrays.keys()
     for name, array in arrays.items():
         assert stored.arrays[name].dtype == array.dtype.newbyteorder("<")
