@@ -34,4 +34,4 @@ def test_files_that_are_named_are_there(name: str) -> None:
 def test_the_changelog_is_of_this_version_and_read_in_two_minutes() -> None:
     newest = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1]
     assert newest.startswith(orthoflow.__version__)
-    assert len(newest.split()) < 700  # one page
+    assert len(newest.split()) < 700, "more than one page"
