@@ -230,12 +230,18 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
+    from orthoflow.files.geotiff import name_run
     from orthoflow.records.wall_results import with_files
 
-    if not target.takes_rasters:
-        return target.load()(run, folder, chosen)
-    with with_files(run, lambda said: say_error(f"note: {said}")) as whole:
-        return target.load()(whole, folder, chosen)
+    if target.takes_rasters:
+        with with_files(run, lambda said: say_error(f"note: {said}")) as whole:
+            said = target.load()(whole, folder, chosen)
+    else:
+        said = target.load()(run, folder, chosen)
+    for path in folder.rglob("*"):
+        if path.is_file():
+            name_run(path, run.record.run_id)
+    return said
 
 
 def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:

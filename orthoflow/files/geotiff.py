@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import math
+import mmap
 import re
 import sys
 import warnings
@@ -40,7 +41,11 @@ _LOCAL_CRS_WKT: Final = (
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 SITE_CRS: Final = "site"
+# Stands for the id of the run, which no product knows, until its files are published.
+_ANY_RUN: Final = "00000000-000000-000000"
 SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
+_NAMED_SUFFIXES: Final = (".tif", ".json", ".geojson", ".html")
+_NO_NAME: Final = re.compile(r"[^\w .,()-]", re.ASCII)
 # What is read is held as a whole, beside copies of it.
 MOST_CELLS: Final = 1 << 28
 MOST_BANDS: Final = 4
@@ -128,9 +133,31 @@ class GridPlace:
         )
 
 
+def local_crs_name(name: str) -> str:
+    """Return the name of the coordinate system of a wall in a run that `name_run` fills in."""
+    return f"run {_ANY_RUN} {re.sub(_NO_NAME, '_', name)}"
+
+
 def local_crs_wkt(name: str) -> str:
     """Return the WKT of the coordinate system of a wall, by its name."""
-    return _LOCAL_CRS_WKT.format(re.sub(r"[^\w .,()-]", "_", name, flags=re.ASCII))
+    return _LOCAL_CRS_WKT.format(local_crs_name(name))
+
+
+def name_run(path: Path, run_id: str) -> None:
+    """Fill the id of a run into the names of the coordinate systems of a published file.
+
+    The files that products publish are the same for every run; this makes them its own. An id of
+    another length than orthoflow's is cut or filled up, so that nothing in the file moves.
+    """
+    if path.suffix not in _NAMED_SUFFIXES or path.stat().st_size == 0:
+        return
+    token = _ANY_RUN.encode()
+    name = re.sub(_NO_NAME, "_", run_id)[: len(token)].ljust(len(token), "_").encode()
+    with path.open("r+b") as stream, mmap.mmap(stream.fileno(), 0) as content:
+        place = content.find(token)
+        while place >= 0:
+            content[place : place + len(token)] = name
+            place = content.find(token, place + len(token))
 
 
 def require_map_crs(crs: str) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.drawings.words import accuracy_phrase
-from orthoflow.files.geotiff import GridPlace, RasterParts
+from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
 from orthoflow.foreign_text import json_bytes, parse_json, text_of_file
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
@@ -81,7 +81,7 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         # X and Y of the top-left corner: of a wall metres along it, and height.
         "x_of_left_m": left_m,
         "height_of_top_m" if frame.raster_axes == "wall" else "y_of_top_m": top_m,
-        "crs": frame.crs,
+        "crs": frame.map_crs or local_crs_name(frame.crs),
         "raster": {
             "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
             "depth_m * normal_world; v_world points down, cell centres lie at .5",

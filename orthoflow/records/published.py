@@ -19,6 +19,7 @@ from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import StoreError
+from orthoflow.files.geotiff import name_run
 from orthoflow.foreign_text import csv_text
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.deliverables import write_walls_json
@@ -124,6 +125,7 @@ def publish_products(
     run_folder: Path,
     cells: Iterable[RecordedCell],
     files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
+    run_id: str,
 ) -> tuple[PublishedFile, ...]:
     """Fill `products/` of a run folder; an older one, left by an interrupted run, is replaced.
 
@@ -131,6 +133,7 @@ def publish_products(
         run_folder: existing folder.
         cells: all cells of the run.
         files_of: address -> output port -> files in the store, and the SHA-256 that each must have.
+        run_id: goes into the names of the coordinate systems of walls.
 
     Returns:
         What is there now, sorted by path.
@@ -141,7 +144,6 @@ def publish_products(
     """
     target = run_folder / PRODUCTS_FOLDER
     cells = tuple(cells)
-    expected: dict[Path, str] = {}
     with writing_to(target):
         if target.is_symlink():
             target.unlink()
@@ -159,16 +161,11 @@ def publish_products(
                     for port, files in ports.items()
                     if f"{cell.address}.{port}" not in replaced
                 }
-                expected |= _publish_cell(folder, cell, current)
+                _publish_cell(folder, cell, current, run_id)
         write_walls_json(target, cells)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
-        published = _digested(run_folder, target)
-    for file in published:
-        wanted = expected.get(run_folder / file.path, file.sha256)
-        if file.sha256 != wanted:
-            raise StoreError(f"{file.path} must have the digest {wanted}, got {file.sha256}")
-    return published
+        return _digested(run_folder, target)
 
 
 def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
@@ -208,11 +205,13 @@ def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
 
 
 def _publish_cell(
-    folder: Path, cell: RecordedCell, files_of: Mapping[str, Mapping[Path, str]]
-) -> dict[Path, str]:
-    """Copy the files of a cell, by port; give the SHA-256 that each copy must have."""
+    folder: Path,
+    cell: RecordedCell,
+    files_of: Mapping[str, Mapping[Path, str]],
+    run_id: str,
+) -> None:
+    """Copy the files of a cell, by port, and name the run in them."""
     folder.mkdir()
-    expected: dict[Path, str] = {}
     taken = [METRICS_FILE]
     for port, files in files_of.items():
         for file, sha256 in files.items():
@@ -224,9 +223,10 @@ def _publish_cell(
             # A copy, not a hard link: who edits a product must not change the store.
             copy = path_below(folder, name)
             shutil.copyfile(file, copy)
-            expected[copy] = sha256
+            if (found := file_sha256(copy)) != sha256:
+                raise StoreError(f"{copy} must have the digest {sha256}, got {found}")
+            name_run(copy, run_id)
     write_metrics_csv(folder / METRICS_FILE, cell_metrics(cell))
-    return expected
 
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:

@@ -153,7 +153,7 @@ def open_unfinished(folder: Path) -> Run:
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in results.items()
     }
-    published = publish_products(aside, record.cells, files)
+    published = publish_products(aside, record.cells, files, record.run_id)
     path = aside / RECORD_FILE
     try:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)

@@ -63,7 +63,7 @@ def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterat
             return
         folder = scratch / "run"
         folder.mkdir()
-        made = publish_products(folder, run.record.cells, files_of)
+        made = publish_products(folder, run.record.cells, files_of, run.record.run_id)
         tell(
             f"{run.path} lies alone: its rasters are made anew of the products in it, and "
             "other files that were published are left out"

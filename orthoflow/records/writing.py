@@ -171,7 +171,9 @@ def _publish(
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
         run_folder.mkdir(parents=True, exist_ok=True)
-    published = publish_products(run_folder, record.cells, _published(outcome, store))
+    published = publish_products(
+        run_folder, record.cells, _published(outcome, store), record.run_id
+    )
     record = dataclasses.replace(record, published=published)
     unfinished = run_folder / _UNFINISHED
     with writing_to(run_folder):

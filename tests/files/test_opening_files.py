@@ -90,7 +90,9 @@ def test_a_map_names_its_coordinate_system(tmp_path: Path) -> None:
     assert content["crs"]["properties"]["name"] == "urn:ogc:def:crs:EPSG::2180"
     # The plane of an upright wall is none of it, and without a map there are those of the scan.
     own = json.loads((tmp_path / f"wall_{WALL}_openings.geojson").read_text())
-    assert own["crs"]["properties"]["name"].startswith('LOCAL_CS["plane, metres"')
+    assert own["crs"]["properties"]["name"].startswith(
+        'LOCAL_CS["run 00000000-000000-000000 plane, metres"'
+    )
     publish_openings(box_openings(), tmp_path, "sha256:0")
     content = json.loads((tmp_path / "openings.geojson").read_text())
     assert content["crs"]["properties"]["name"].startswith('LOCAL_CS["coordinates of the scan')

@@ -13,7 +13,7 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files import geotiff, images, publishing
-from orthoflow.files.geotiff import GridPlace
+from orthoflow.files.geotiff import GridPlace, local_crs_name
 from orthoflow.files.sidecars import frame_of_raster, number, numbers
 from orthoflow.products import (
     Camera,
@@ -58,7 +58,7 @@ PLACED: dict[str, Any] = {
     "up_world": [0.0, 0.0, 1.0],
     "x_of_left_m": 0.0,
     "height_of_top_m": 30.0,
-    "crs": FRAME.crs,
+    "crs": local_crs_name(FRAME.crs),
 }
 TAGS = {
     "AREA_OR_POINT": "Area",

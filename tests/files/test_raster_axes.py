@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
+from orthoflow.files.geotiff import name_run, read_raster
 from orthoflow.files.polygons import write_features
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.files.sidecars import placed_raster
@@ -103,7 +105,27 @@ def test_files_have_heights_or_places_in_plan(
     write_features(tmp_path / "a.geojson", [], of.crs)
     named = json.loads((tmp_path / "a.geojson").read_text())["crs"]["properties"]["name"]
     assert rasterio.crs.CRS.from_user_input(named).to_wkt() == wkt
-    assert f'"{of.crs}, metres"' in wkt
+    assert f' {of.crs}, metres"' in wkt
+
+
+@pytest.mark.parametrize(
+    "run_id", ["20260314-101500-a1b2c3", "7", "a run: \u00e4 of another program"]
+)
+def test_published_files_name_run_and_wall(run_id: str, tmp_path: Path) -> None:
+    path = published(frame("wall", UPS[0]), tmp_path)
+    before = read_raster(path)
+    write_features(tmp_path / "a.geojson", [], frame("wall", UPS[0]).crs)
+    for file in tmp_path.iterdir():
+        name_run(file, run_id)
+    named = json.loads((tmp_path / "a.geojson").read_text())["crs"]["properties"]["name"]
+    crs = json.loads(path.with_suffix(".json").read_text())["crs"]
+    with rasterio.open(path) as dataset:
+        wkt = dataset.crs.to_wkt()
+        assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+    assert f'"{crs}, metres"' in wkt
+    assert rasterio.crs.CRS.from_user_input(named).to_wkt() == wkt
+    assert re.match(rf"run {re.sub('[^ a-z0-9-]', '_', run_id)[:22]}_* wall 0 ", crs)
+    np.testing.assert_array_equal(read_raster(path).values, before.values)
 
 
 def test_a_floor_and_the_ceiling_over_it_lie_upon_each_other(tmp_path: Path) -> None:

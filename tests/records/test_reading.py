@@ -159,7 +159,9 @@ def run_folder(tmp_path: Path) -> Path:
     write_record(folder / "run.h5", record, lambda asked: product if asked == digest else None)
     published = tmp_path / "planes.json"
     published.write_text('{"planes": []}', encoding="utf-8")
-    publish_products(folder, record.cells, {"plane@plane=given": {"planes": as_stored(published)}})
+    publish_products(
+        folder, record.cells, {"plane@plane=given": {"planes": as_stored(published)}}, "r"
+    )
     return folder
 
 
@@ -259,7 +261,7 @@ def test_two_outputs_that_publish_the_same_name_both_stay(tmp_path: Path) -> Non
         (tmp_path / port).mkdir()
         (tmp_path / port / "planes.json").write_text(port, encoding="utf-8")
     files = {port: as_stored(tmp_path / port / "planes.json") for port in ("a", "b")}
-    publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files})
+    publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files}, "r")
     cell = tmp_path / "run" / "products" / "cloud"
     assert (cell / "planes.json").read_text(encoding="utf-8") == "a"
     assert (cell / "b_planes.json").read_text(encoding="utf-8") == "b"
@@ -275,7 +277,7 @@ def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path
         for path in paths:
             path.write_text(f"{port} {path.name}", encoding="utf-8")
         files[port] = as_stored(*paths)
-    published = publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files})
+    published = publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files}, "r")
     cell = tmp_path / "run" / "products" / "cloud"
     assert {path.name: path.read_text(encoding="utf-8")[:20] for path in cell.iterdir()} == {
         "b_x.csv": "a b_x.csv",
@@ -321,7 +323,7 @@ def test_what_a_later_step_gives_anew_is_not_published_beside_it(
         path = tmp_path / cell.address / "planes.json"
         path.write_text(cell.address, encoding="utf-8")
         files[cell.address] = {"planes": as_stored(path)}
-    publish_products(tmp_path / "run", cells, files)
+    publish_products(tmp_path / "run", cells, files, "r")
     products = tmp_path / "run" / "products"
     # What was read stays, and what nobody changed.
     found = {path.parent.name for path in products.glob("*/planes.json")}
@@ -333,7 +335,7 @@ def test_products_are_not_published_through_a_link(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     (tmp_path / "outside" / "precious.txt").write_text("precious")
     (tmp_path / "run" / "products").symlink_to(tmp_path / "outside")
-    publish_products(tmp_path / "run", [cloud_cell()], {})
+    publish_products(tmp_path / "run", [cloud_cell()], {}, "r")
     assert [path.name for path in (tmp_path / "outside").iterdir()] == ["precious.txt"]
     assert not (tmp_path / "run" / "products").is_symlink()
 

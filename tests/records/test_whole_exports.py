@@ -115,7 +115,7 @@ def test_published_files_come_by_number(run: Run) -> None:
     files = {"cloud": {"cloud": first, "more": more}, "ortho": {"x": first}}
     (run.folder / "products").mkdir()
     (run.folder / "products" / "old").touch()
-    found = publish_products(run.folder, run.record.cells, files)
+    found = publish_products(run.folder, run.record.cells, files, "r")
     there = [path.name for path in published_files(run.folder, "cloud")]
     assert there == [
         *("2.tif", "a.txt", "metrics.csv", "more_wall_10.tif", "wall_2.tif", "wall_10.tif"),

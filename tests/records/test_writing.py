@@ -340,7 +340,7 @@ def test_what_an_earlier_run_left_is_never_published(tmp_path: Path) -> None:
         files = FaultyFiles(tmp_path, "bad disk", operation, seed=operation)
         with files.in_place():
             try:
-                published = [file.path for file in publish_products(run, (), {})]
+                published = [file.path for file in publish_products(run, (), {}, "r")]
             except StoreError as error:
                 refusals.append(str(error))
             else:

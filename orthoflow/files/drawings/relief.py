@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.files.drawings.papers import Part
 from orthoflow.files.drawings.printed_pictures import contours, stretch_of
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.sidecars import write_json
+from orthoflow.files.polygons import Feature, write_features
 from orthoflow.geometry import WallFrame
 
 NOTHING: Final = 0
@@ -104,23 +104,15 @@ def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
     Each line has `depth_mm`, positive towards the viewer.
     """
     interval_m = stretch_of(depth).interval
-    write_json(
-        path,
+    features: list[Feature] = [
         {
-            "type": "FeatureCollection",
-            "features": [
-                {
-                    "type": "Feature",
-                    "properties": {"depth_mm": round(1e3 * level, 3)},
-                    "geometry": {
-                        "type": "LineString",
-                        "coordinates": np.round(points, 4).tolist(),
-                    },
-                }
-                for level, points in _contours(depth, frame, interval_m)
-            ],
-        },
-    )
+            "type": "Feature",
+            "properties": {"depth_mm": round(1e3 * level, 3)},
+            "geometry": {"type": "LineString", "coordinates": np.round(points, 4).tolist()},
+        }
+        for level, points in _contours(depth, frame, interval_m)
+    ]
+    write_features(path, features, frame.crs)
     return interval_m
 
 

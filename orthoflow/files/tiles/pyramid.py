@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.geotiff import local_crs_name
 from orthoflow.files.images import encode_webp
 from orthoflow.files.sidecars import OrthoFile, numbers, write_bytes, write_text
 from orthoflow.products import JsonValue
@@ -186,6 +187,6 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "corner": list(frame.raster_corner_m),
         "down": frame.raster_down,
         "axes": "E, N" if frame.map_crs else "X, H" if frame.raster_axes == "wall" else "X, Y",
-        "crs": frame.crs,
+        "crs": frame.map_crs or local_crs_name(frame.crs),
         "accuracy": ortho.accuracy,
     }
