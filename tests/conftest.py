@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import hashlib
 import multiprocessing.util
 import os
 import sys
@@ -16,7 +15,7 @@ import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 
-from orthoflow.engine.kernels import kernel_sources, private_folder
+from orthoflow.engine.kernels import private_folder
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.kept_memory import KEPT_MEMORY
@@ -37,12 +36,9 @@ _ROOT = Path(__file__).resolve().parents[1]
 # the libraries hold; with Python's own threshold that was a fifth of what detecting planes took.
 gc.set_threshold(50_000, *gc.get_threshold()[1:])
 
-# For what numba compiles, set before anything imports it: a folder per state of all kernels, in the
-# private cache of the user, for the tests and for the steps that they run.
-_PACKAGES = [_ROOT / "orthoflow", _ROOT / "plugins" / "orthoflow_plugins"]
-_KERNELS = kernel_sources([path for package in _PACKAGES for path in package.rglob("*.py")])
-_STATE = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(_KERNELS))).hexdigest()
-os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba-of-tests") / _STATE[:16]))
+# For what numba compiles, set before anything imports it: in the private cache of the user, for the
+# tests and for the steps that they run.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba-of-tests")))
 
 # What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")

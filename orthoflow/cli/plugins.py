@@ -512,11 +512,11 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 def _sharing_kernels(method_id: str) -> Iterator[None]:
     """Let the suite use what this user's runs have compiled, and leave them what it compiles."""
     from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
-    from orthoflow.engine.keys import compiled_digest
+    from orthoflow.engine.keys import method_facts
 
     if VARIABLE in os.environ:
         yield
         return
-    digest = compiled_digest(discover_catalog().method(method_id))
-    with kernels_in(kernel_folder(digest)):
+    facts = method_facts(method_id, discover_catalog())
+    with kernels_in(kernel_folder(facts.kernels)):
         yield

@@ -5,33 +5,25 @@ working folder, which people hand on, and nothing is ever copied from there. The
 the user (or to root) and nobody else may write to it; where there is none, kernels are kept in a
 temporary folder of this process.
 
-Numba notices an edit of the file of a kernel, and not of what the kernel calls in other files. So
-there is a folder for each state of all modules with kernels and of all that these import.
+Our own kernels are found there by their content, see `geometry.compiling`. Those that numba itself
+keeps for a plugin are found by the file of the kernel, whatever it calls in other files: a plugin
+has a folder for each state of its code.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import stat
 import sys
 import tempfile
-from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
-_MAY_COMPILE: Final = re.compile(r"numba|jit|vectorize|stencil|geometry(\.| import )compiling")
-_IMPORT: Final = re.compile(
-    r"(?:^|[:;])[ \t]*(?:from\s+([\w.]+)\s+import\s*(\([^)]*\)|[^\n;]+)|import\s+([^\n;]+))",
-    re.MULTILINE,
-)
-_COMMENT_OR_JOINT: Final = re.compile(r"#[^\n]*|\\\n")
-_NAME: Final = re.compile(r"[\w.]+")
 # Some 60 MB each.
 _MAX_STATES: Final = 8
 
@@ -51,20 +43,22 @@ def private_folder(name: str) -> Path:
     return Path(_temporary().name)
 
 
-def kernel_folder(digest: str) -> Path:
-    """Return the folder for the kernels of a state of the code, see `all_kernels`.
+def kernel_folder(state: str) -> Path:
+    """Return the folder for kernels, see `all_kernels`.
 
-    Of earlier states the last ones are kept.
+    Args:
+        state: digest of the code of a plugin, whose last states are kept; empty for our own.
     """
     root = all_kernels()
-    if str(root) == os.environ.get(VARIABLE):
+    if not state or str(root) == os.environ.get(VARIABLE):
         return root
-    folder = root / digest[:32]
+    folder = root / "plugins" / state[:32]
     if not folder.exists():
         with suppress(OSError):
-            states = sorted(root.iterdir(), key=lambda path: path.stat().st_mtime)
-            for state in states[:-_MAX_STATES]:
-                shutil.rmtree(state, ignore_errors=True)
+            folder.parent.mkdir(mode=0o700, exist_ok=True)
+            states = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+            for old in states[:-_MAX_STATES]:
+                shutil.rmtree(old, ignore_errors=True)
             folder.mkdir(mode=0o700, exist_ok=True)
     return folder
 
@@ -124,47 +118,3 @@ def reload_numba_config() -> None:
         from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
 
         config.reload_config()  # type: ignore[no-untyped-call]
-
-
-def kernel_sources(files: Collection[Path], third_party: Collection[Path] = ()) -> frozenset[Path]:
-    """Return those files whose content decides compiled code: kernels, and what these import.
-
-    Imports are read from the text, since a plan loads no compiler.
-
-    Args:
-        files: Python files of the framework and of a plugin.
-        third_party: those among them that may compile by decorators of their own: where one of them
-            may compile at all, each of them counts.
-    """
-    texts = {path: path.read_text(encoding="utf-8", errors="replace") for path in files}
-    found = {path for path, text in texts.items() if _MAY_COMPILE.search(text)}
-    if not found.isdisjoint(third_party):
-        found.update(third_party)
-    by_last_name: defaultdict[str, list[tuple[tuple[str, ...], Path]]] = defaultdict(list)
-    for path in files:
-        parts = path.parent.parts if path.stem == "__init__" else path.with_suffix("").parts
-        by_last_name[parts[-1]].append((parts, path))
-    waiting = list(found)
-    while waiting:
-        path = waiting.pop()
-        for wanted in _imported_names(texts[path], path):
-            for parts, file in by_last_name.get(wanted[-1], ()):
-                if parts[-len(wanted) :] == wanted and file not in found:
-                    found.add(file)
-                    waiting.append(file)
-    return frozenset(found)
-
-
-def _imported_names(text: str, path: Path) -> Iterator[tuple[str, ...]]:
-    """Yield the parts of dotted names that a file imports, or that may be names of modules."""
-    for module, names, modules in _IMPORT.findall(_COMMENT_OR_JOINT.sub(" ", text)):
-        joint = "" if module.endswith(".") else "."
-        found = [f"{module}{joint}{name}" for name in _NAME.findall(names)] if module else []
-        for name in [module, *found] if module else _NAME.findall(modules):
-            inner = name.lstrip(".")
-            n_up = len(name) - len(inner)
-            parts = tuple(part for part in inner.split(".") if part)
-            if n_up:
-                parts = path.parents[min(n_up, len(path.parents)) - 1].parts + parts
-            if parts:
-                yield parts

@@ -22,7 +22,6 @@ from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
 from orthoflow.catalog.distributions import canonical_name, package_path, source_files
 from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
 from orthoflow.catalog.wording import describe_error
-from orthoflow.engine.kernels import kernel_sources
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.foreign_text import parse_json
@@ -62,7 +61,6 @@ class MethodFacts(MethodIdentity):
         target: import string of the class.
         tools: libraries whose version may change results, with their versions.
         code: digests of the code of the plugin and of the framework.
-        compiled_digest: names the folder for compiled kernels.
         inputs: port -> product type.
         outputs: port -> product type.
         sources: the files behind `code`.
@@ -72,11 +70,17 @@ class MethodFacts(MethodIdentity):
     target: str
     tools: Mapping[str, str]
     code: Mapping[str, str]
-    compiled_digest: str
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     sources: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
     repeatable: frozenset[str] = frozenset()
+
+    @property
+    def kernels(self) -> str:
+        """Names the folder for the kernels of a plugin; empty for our own methods."""
+        if self.target.startswith(f"{_BUILT_IN_PACKAGE}."):
+            return ""
+        return hashlib.sha256("".join(self.code.values()).encode()).hexdigest()
 
     def is_code_unchanged(self) -> bool:
         """Whether the code on the disk is still the one in the keys."""
@@ -121,7 +125,6 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         },
         code={name: files_digest(files) for name, files in sources.items()},
         sources=sources,
-        compiled_digest=compiled_digest(entry),
         inputs={name: port.type_name for name, port in port_specs(cls.In).items()},
         outputs={name: port.type_name for name, port in port_specs(cls.Out).items()},
         repeatable=frozenset(cls.repeatable),
@@ -291,20 +294,6 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
 def _code_files(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
     """Files whose content decides a method's results, whatever version their distribution says."""
     return {"plugin": plugin_files(entry), "framework": framework_files()}
-
-
-def compiled_digest(entry: MethodEntry) -> str:
-    """Digest of all code that decides which kernels a method may use, one per plugin."""
-    own, framework = entry.source_files(), framework_files()
-    is_ours = entry.spec.target.startswith(f"{_BUILT_IN_PACKAGE}.")
-    sources = _kernel_sources(_states({*own, *framework}), () if is_ours else own)
-    both = files_digest(sources.intersection(framework)) + files_digest(sources.intersection(own))
-    return hashlib.sha256(both.encode()).hexdigest()
-
-
-@lru_cache(maxsize=64)
-def _kernel_sources(files: _States, strangers: tuple[Path, ...]) -> frozenset[Path]:
-    return kernel_sources([path for path, _, _ in files], strangers)
 
 
 def files_digest(files: Iterable[Path]) -> str:

@@ -550,7 +550,7 @@ class _TaskMaker:
             store=str(self.store.folder),
             folder=str(self.scratch / uuid.uuid4().hex[:12]),
             log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            kernels=facts.compiled_digest,
+            kernels=facts.kernels,
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),
         )

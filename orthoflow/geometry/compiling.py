@@ -11,14 +11,17 @@ about shapes: kernels put numbers, one by one.
 
 from __future__ import annotations
 
+import hashlib
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar, cast
 
 import numba
-from numba.core import event, types
+import numpy as np
+from numba.core import config, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
@@ -27,6 +30,8 @@ from orthoflow.geometry.kernel_news import tell
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
+# Some 40 kB each; the code of one version has about 400.
+_MAX_FILES: Final = 8000
 _UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
@@ -82,21 +87,54 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
     # Where nothing can be kept, no home and a program that only others may change, it is compiled
     # in each process.
     with suppress(RuntimeError):
-        vars(kernel)["_cache"] = _KernelCache(function)  # numba has no public name for it
+        # Numba has no public name for it.
+        vars(kernel)["_cache"] = _KernelCache(function)  # type: ignore[no-untyped-call]
     _give_constants_no_version(kernel)
     return kernel
 
 
 class _KernelCache(FunctionCache):
-    """Numba's cache of a function, for processes that compile at the same time."""
+    """Numba's cache of a function, found by the content of all that it calls.
 
-    def __init__(self, function: Callable[..., object]) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
-        self._cache_file = _KernelFiles(
-            cache_path=self._cache_path,
-            filename_base=self._impl.filename_base,
-            source_stamp=self._impl.locator.get_source_stamp(),
-        )  # type: ignore[no-untyped-call]
+    Numba itself looks at the file of a kernel alone, and not at what the kernel calls in others.
+    Here the name of the files has the digest of the kernel, of all functions that it calls and of
+    the constants that these use. So an edit compiles what it changes and nothing else, wherever a
+    checkout lies, and several versions of the code share a folder.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what is kept for argument types, or None."""
+        self._open_files()
+        return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code; a full disk costs the next process seconds and nothing else."""
+        self._open_files()
+        with suppress(OSError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        if self._impl.check_cachable(data):
+            key = self._index_key(sig, data.codegen)
+            self._cache_file.save(key, self._impl.reduce(data))  # type: ignore[no-untyped-call]
+
+    def _open_files(self) -> None:
+        """Find the files; at the first call, since what a kernel calls may stand below it."""
+        if not isinstance(self._cache_file, _KernelFiles):
+            root = cast("str", vars(config)["CACHE_DIR"])
+            folder = Path(root, "kernels") if root else Path(self._cache_path)
+            with suppress(OSError):
+                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            name = f"{self._py_func.__module__}.{self._py_func.__qualname__}"
+            digest = content_digest(self._py_func)
+            self._cache_file = _KernelFiles(
+                cache_path=str(folder),
+                filename_base=f"{name.replace('<', '').replace('>', '')}-{digest[:32]}",
+                source_stamp=digest,
+            )  # type: ignore[no-untyped-call]
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[object, ...]:
+        return (*super()._index_key(sig, codegen), _field_names(sig))  # type: ignore[no-untyped-call]
 
 
 class _KernelFiles(IndexDataCacheFile):
@@ -107,10 +145,12 @@ class _KernelFiles(IndexDataCacheFile):
     one name. A file that was cut off by a power failure is as good as none.
     """
 
-    def save(self, key: object, data: object) -> None:
-        # A full disk costs the next process some seconds, and not this one its result.
-        with suppress(OSError):
-            super().save(key, data)  # type: ignore[no-untyped-call]
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        super()._save_index(overloads)  # type: ignore[no-untyped-call]
+        files = sorted(Path(self._cache_path).iterdir(), key=lambda path: path.lstat().st_mtime)
+        if len(files) > _MAX_FILES:
+            for old in files[: _MAX_FILES // 2]:
+                old.unlink(missing_ok=True)
 
     def _data_name(self, number: int) -> str:
         return f"{Path(self._index_path).stem}.{number}-{uuid.uuid4().hex[:12]}.nbc"
@@ -126,6 +166,78 @@ class _KernelFiles(IndexDataCacheFile):
             return super()._load_data(name)  # type: ignore[no-untyped-call]
         except Exception:  # noqa: BLE001 - as above
             return None
+
+
+def content_digest(function: FunctionType) -> str:
+    """Return the SHA-256 of all that decides the compiled code of a function but argument types.
+
+    That is its bytecode and constants, and those of each function that it calls, with the values of
+    the module constants that these read.
+    """
+    digest = hashlib.sha256()
+    seen: set[int] = set()
+
+    def add(value: object) -> None:
+        if isinstance(value, Dispatcher):
+            digest.update(repr(sorted(value.targetoptions.items())).encode())
+            value = value.py_func
+        if not isinstance(value, FunctionType | tuple):
+            digest.update(_described(value))
+        elif isinstance(value, tuple):
+            digest.update(f"{len(value)} values".encode())
+            for item in value:
+                add(item)
+        elif id(value) not in seen:
+            seen.add(id(value))
+            add(_decisive(value))
+
+    add(function)
+    return digest.hexdigest()
+
+
+def _decisive(function: FunctionType) -> tuple[object, ...]:
+    """Code of a function and of those inside it, and what the names in it stand for."""
+    cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
+    found: list[object] = [function.__defaults__, cells]
+    for code in _all_code(function.__code__):
+        constants = tuple(value for value in code.co_consts if not isinstance(value, CodeType))
+        found += [code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars]
+        for name in code.co_names:
+            value = function.__globals__.get(name)
+            found.append(value)
+            if isinstance(value, ModuleType):
+                found += [getattr(value, inner, None) for inner in code.co_names]
+    return tuple(found)
+
+
+def _described(value: object) -> bytes:
+    """Bytes that stand for a value which is no function."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    if isinstance(value, type):
+        fields = getattr(value, "_fields", ())
+        return f"{value.__module__}.{value.__qualname__}{fields}".encode()
+    if isinstance(value, int | float | complex | str | bytes | None):
+        return repr(value).encode()
+    # Of libraries, whose versions numba's own and the platform stand for.
+    return str(getattr(value, "__name__", type(value).__name__)).encode()
+
+
+def _all_code(code: CodeType) -> Iterator[CodeType]:
+    """Yield the code of a function and of those that are defined in it."""
+    yield code
+    for value in code.co_consts:
+        if isinstance(value, CodeType):
+            yield from _all_code(value)
+
+
+def _field_names(type_: object) -> tuple[object, ...]:
+    """Names of the fields of all named tuples among types: numba compares their types alone."""
+    if isinstance(type_, types.NamedTuple | types.NamedUniTuple):
+        fields = type_.instance_class._fields
+        return (fields, *map(_field_names, type_.types))
+    inner = type_ if isinstance(type_, tuple) else getattr(type_, "types", ())
+    return tuple(map(_field_names, inner))
 
 
 def _give_constants_no_version(kernel: Any) -> None:

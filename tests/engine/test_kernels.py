@@ -8,17 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.kernels import (
     VARIABLE,
     all_kernels,
     is_private,
     kernel_folder,
-    kernel_sources,
     private_folder,
 )
-from orthoflow.engine.keys import compiled_digest
-from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
+from tests.workshop_runs import orthoflow, write_studio
 
 
 class _Hostile:
@@ -141,31 +138,6 @@ def test_old_states_of_the_code_are_removed(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for nth in range(10):
         os.utime(kernel_folder(f"state-{nth}"), (nth, nth))
-    kept = {path.name for path in all_kernels().iterdir()}
+    kept = {path.name for path in (all_kernels() / "plugins").iterdir()}
     assert len(kept) == 9
     assert "state-9" in kept
-
-
-def test_kernels_belong_to_all_that_their_modules_import(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    texts = {
-        "pack/__init__.py": "",
-        "pack/kernels.py": "import numba\nfrom pack.numbers import (  # some\n    TURN,\n)\n",
-        "pack/numbers.py": "from . import inner\nTURN = 3\n",
-        "pack/inner.py": "",
-        "pack/other.py": "import pack.kernels\n",
-    }
-    for name, text in texts.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-    files = list(tmp_path.rglob("*.py"))
-    names = {path.name for path in kernel_sources(files)}
-    assert names == {"__init__.py", "kernels.py", "numbers.py", "inner.py"}
-    assert kernel_sources(files, files) == frozenset(files)
-    (tmp_path / "pack" / "kernels.py").write_text("")
-    assert kernel_sources(files, files) == frozenset()
-    monkeypatch.syspath_prepend(str(WORKSHOP))
-    catalog = discover_catalog()
-    digests = {compiled_digest(catalog.method(name)) for name in ("paint.kernel", "plane.hough2d")}
-    assert len(digests) == 2

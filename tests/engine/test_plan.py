@@ -64,7 +64,6 @@ FACTS = MethodFacts(
     distribution_version="1",
     tools={"tool": "1"},
     code={"plugin": "aa"},
-    compiled_digest="bb",
     inputs={"left": "numbers", "right": "numbers"},
     outputs={"numbers": "numbers"},
 )

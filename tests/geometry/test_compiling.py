@@ -1,57 +1,116 @@
-"""One version of each kernel, whatever constants it is called with."""
+"""Compiled kernels are found by all that decides them, and by nothing else."""
 
 from __future__ import annotations
 
-from typing import Any
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
 
-import numpy as np
-from numba.core.caching import NullCache
+import pytest
+
+from orthoflow.geometry.compiling import content_digest
+
+_KERNEL: Final = """
+from typing import NamedTuple
 
 from orthoflow.geometry.compiling import compiled, kernel_part
+from numbers_of_it import FACTOR, turned
 
 
-def compiled_here(kernel: Any) -> Any:
-    """Take nothing that another process has compiled."""
-    kernel._cache = NullCache()
-    return kernel
+class Pair(NamedTuple):
+    first: float
+    second: float
 
 
-@compiled_here
-@kernel_part
-def taken(values: Any, k: int, place: tuple[int, int]) -> int:
-    return int(values[k]) + place[0] - place[1]
-
-
-@compiled_here
 @compiled
-def taken_many(values: Any) -> int:
-    count = 0
-    for i in range(values.size):
-        count += taken(values, count % 2, (i, 0))
-    return (
-        count + taken(values, 0, (0, 1)) + taken(values, 1, (0, count)) + taken(values, 2, (1, 2))
+def answer(pair):
+    return part(pair) + (lambda x: x * FACTOR)(1.0)
+
+
+@kernel_part
+def part(pair):
+    return turned(pair.first)
+"""
+_PRINTED: Final = "print(answer(Pair(3.0, 5.0)), sum(answer.stats.cache_misses.values()))"
+_NUMBERS: Final = """
+from orthoflow.geometry.compiling import inlined, kernel_part
+
+FACTOR = 10.0
+
+
+@inlined
+def turned(x):
+    return doubled(x) + 1
+
+
+@kernel_part
+def doubled(x):
+    return 2 * x
+"""
+
+
+def _digest(texts: dict[str, str], folder: Path) -> str:
+    """Digest of the kernel as these modules define it."""
+    for name, text in texts.items():
+        (folder / f"{name}.py").write_text(text)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        patch.setattr(sys, "dont_write_bytecode", True)
+        for name in texts:
+            patch.delitem(sys.modules, name, raising=False)
+        try:
+            return content_digest(importlib.import_module("kernel").answer.py_func)
+        finally:
+            for name in texts:
+                sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "is_same"),
+    [
+        ("numbers_of_it", "FACTOR = 10.0", "FACTOR = 20.0", False),  # a constant elsewhere
+        ("numbers_of_it", "2 * x", "3 * x", False),  # two calls away
+        ("numbers_of_it", "+ 1", "+ 2", False),
+        ("numbers_of_it", "@inlined", "@kernel_part", False),
+        ("kernel", "turned(pair.first)", "turned(pair.second)", False),
+        ("kernel", "@compiled", "# A comment.\n\n\n@compiled", True),
+        ("numbers_of_it", "FACTOR =", "OTHER = 1\nFACTOR =", True),
+    ],
+)
+def test_the_digest_is_of_all_that_a_kernel_calls_and_of_nothing_else(
+    tmp_path: Path, file: str, before: str, after: str, *, is_same: bool
+) -> None:
+    texts = {"kernel": _KERNEL, "numbers_of_it": _NUMBERS}
+    edited = texts | {file: texts[file].replace(before, after)}
+    assert edited != texts
+    (tmp_path / "elsewhere").mkdir()
+    digests = {_digest(texts, tmp_path), _digest(edited, tmp_path / "elsewhere")}
+    assert len(digests) == (1 if is_same else 2)
+
+
+def _answer(folder: Path, cache: Path, kernel: str) -> tuple[float, int]:
+    """Value of the kernel and how many versions of it were compiled, by a new process."""
+    folder.mkdir(exist_ok=True)
+    (folder / "kernel.py").write_text(f"{kernel}\n{_PRINTED}")
+    (folder / "numbers_of_it.py").write_text(_NUMBERS)
+    done = subprocess.run(
+        [sys.executable, "-c", "import kernel"],
+        cwd=folder,
+        env={"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
     )
+    value, n_compiled = done.stdout.split()
+    return float(value), int(n_compiled)
 
 
-@compiled_here
-@kernel_part
-def member(pair: tuple[int, float], k: int) -> float:
-    return pair[k]
-
-
-@compiled_here
-@compiled
-def both_members(n: int) -> float:
-    return member((n, 0.5), 1) + member((n, 0.5), 0)
-
-
-def test_a_part_has_one_version_for_all_constants() -> None:
-    values = np.zeros(4, dtype=np.int64)
-    # The counter goes 0, 1, 3, 6; then -1, -6 and -1 are added.
-    assert taken_many(values) == 6 - 1 - 6 - 1
-    assert len(taken.signatures) == 1
-
-
-def test_a_tuple_of_several_types_is_indexed_by_constants_all_the_same() -> None:
-    assert both_members(3) == 3.5
-    assert len(member.signatures) == 2
+def test_versions_are_kept_side_by_side_for_checkouts_anywhere(tmp_path: Path) -> None:
+    # Numba itself takes tuples for the same type whose fields changed places.
+    edited = _KERNEL.replace("first: float\n    second: float", "second: float\n    first: float")
+    cache = tmp_path / "cache"
+    assert _answer(tmp_path / "a", cache, _KERNEL) == (7.0 + 10.0, 1)
+    assert _answer(tmp_path / "a", cache, edited) == (11.0 + 10.0, 1)
+    assert _answer(tmp_path / "b", cache, _KERNEL) == (7.0 + 10.0, 0)
