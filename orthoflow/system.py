@@ -153,7 +153,7 @@ def file_lock(path: Path, descriptor: int) -> FileLock:
 
     Args:
         path: of the file.
-        descriptor: the same file, open; whoever opened it closes it, after the lock.
+        descriptor: the same file, open; the caller closes it, after the lock.
     """
     return _DatabaseLock(path) if _fcntl is None else _KernelLock(descriptor)
 

@@ -1,4 +1,4 @@
-"""Name and version of this release, for whoever writes them into a file."""
+"""Name and version of this release, for what is written into files."""
 
 # What pip calls it.
 DISTRIBUTION = "orthoflow-tls"

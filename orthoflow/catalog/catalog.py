@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, cast
 
@@ -67,11 +68,11 @@ class BrokenPlugin:
 
 @dataclass(frozen=True, kw_only=True)
 class Announced:
-    """What an entry says of who announced it, and of what is wrong with that.
+    """Who announced an entry, and what is wrong with it.
 
     Attributes:
         distribution: who announced it; of a clash, the first.
-        state: `clash` when several announce it and nobody said which is meant; `broken` when it
+        state: `clash` when several announce it and none takes precedence; `broken` when it
             cannot be used.
         problem: one sentence that names the distributions; of what is fine, who else claims it.
     """
@@ -112,12 +113,16 @@ class MethodEntry(Announced):
     contested: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> type[Method]:
-        """Import the class and check what the framework relies on.
+        """Import the class and check what the framework relies on, once.
 
         Raises:
             PluginError: the entry is not fine, the import fails, or the class breaks a rule; the
                 sentence names the distribution.
         """
+        return self._loaded
+
+    @cached_property
+    def _loaded(self) -> type[Method]:
         if self.state != "fine" or self.kind is None:
             raise PluginError(self.problem)
         from orthoflow.catalog.loading import load_method  # noqa: PLC0415 - loads pydantic
@@ -127,10 +132,10 @@ class MethodEntry(Announced):
         )
 
     def looked_at(self) -> MethodEntry:
-        """Give the entry as it is: `broken` where its class is not in its source and does not load.
+        """Return the entry, `broken` where its class is not in its source and does not load.
 
-        Of a class that seems to be there nothing is loaded, so what listings say of it may still
-        prove wrong.
+        Of a class that seems to be there nothing is loaded, so listings may state what later
+        proves wrong.
         """
         if self.state != "fine" or may_define(self.spec.target):
             return self
@@ -212,7 +217,7 @@ class Catalog:
         if own != type_name:
             raise PluginError(
                 f"product type {type_name} of {entry.distribution} breaks a rule: it is announced "
-                f"as {type_name}, but {entry.spec.target} says type_name {own!r}"
+                f"as {type_name}, but the type_name of {entry.spec.target} is {own!r}"
             )
         if complaint := product_complaint(cls):
             raise PluginError(
@@ -249,7 +254,7 @@ class Catalog:
         return entry
 
     def _suggest(self, method_id: str) -> str:
-        # Inside a kind only the second part tells names apart; `plane.` is alike in all of them.
+        # Inside a kind only the second part tells names apart; `plane.` is the same in all of them.
         kind, _, name = method_id.partition(".")
         siblings = {other.partition(".")[2]: other for other in self._of_kind(kind)}
         if not siblings:

@@ -27,7 +27,7 @@ from orthoflow.catalog.distributions import (
     canonical_name,
     describe_distribution,
 )
-from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
+from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
@@ -96,7 +96,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
         described, key=lambda item: (item[1].name, item[0].name, item[0].value)
     ):
         try:
-            with foreign_code(f"plugin {entry.name} of {distribution}"):
+            with guarded(f"plugin {entry.name} of {distribution}"):
                 announcements.append(_announce(entry, distribution))
         except UserInterrupt:
             raise

@@ -25,7 +25,7 @@ class DistributionInfo:
         is_released: installed from an index, so that name and version stand for the code; False
             for editable installs, installs from a folder or URL, and code run from a checkout.
         source_folder: folder of the package that holds the hooks; None for a plugin of a single
-            module, which lies among strangers' code (see `MethodEntry.source_files`).
+            module, which lies beside unrelated code (see `MethodEntry.source_files`).
     """
 
     name: str
@@ -56,7 +56,7 @@ def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """What the metadata say; nothing where they are missing or cannot be read."""
+    """Name and version in the metadata; empty where they are missing or unreadable."""
     try:
         stated = distribution.metadata
     except ValueError:
@@ -98,8 +98,8 @@ def package_path(module: str) -> Path | None:
 def may_define(target: str) -> bool:
     """Whether a module's source seems to have what `package.module:Name` names, without running it.
 
-    False where the source is missing, is no Python, or says the name nowhere; True of what is not
-    source.
+    False where the source is missing, is no Python, or does not contain the name; True of what is
+    not source.
     """
     module, _, name = target.partition(":")
     path = _module_file(module)
@@ -144,7 +144,7 @@ def canonical_name(name: str) -> str:
 def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
     """Distributions and all that they require, by canonical name, whatever system that is for.
 
-    None when one of the named is not installed here: nobody can say what it requires.
+    None when one of the named is not installed here: its requirements are unknown.
     """
     # Name and the extras that are asked for.
     left = [(canonical_name(name), frozenset[str]()) for name in names]
@@ -155,7 +155,7 @@ def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
         try:
             stated = requires(name) or []
         except (PackageNotFoundError, ValueError):
-            # No such thing, or nobody can read what it says.
+            # No such thing, or its metadata cannot be read.
             missing.add(name)
             continue
         for text in stated:

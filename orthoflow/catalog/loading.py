@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
-from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
+from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Product
@@ -38,7 +39,7 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     module_name, _, name = target.partition(":")
     module: object = None
     try:
-        with foreign_code(f"{what} of {distribution}"):
+        with guarded(f"{what} of {distribution}"):
             module = import_module(module_name)
             return typing.cast("object", getattr(module, name))
     except UserInterrupt:
@@ -101,7 +102,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     citations: object = method.citations
     metrics: object = method.metrics
     rules = {
-        f"its class says id {own_id!r}": own_id == spec.id,
+        f"the id of its class is {own_id!r}": own_id == spec.id,
         "its Params must be a subclass of MethodParams": _is_subclass(
             getattr(method, "Params", None), MethodParams
         ),
@@ -125,6 +126,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
 
+@cache
 def product_complaint(cls: type[Product]) -> str:
     """State which name in the class of a product is none of its fields; empty when all are."""
     if not hasattr(cls, "__dataclass_fields__"):
@@ -186,7 +188,7 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
             cls = next(iter(_products_of(typing.get_type_hints(method.Out)[port.name])))
             return (
                 f"its output port {port.name} is {wanted} in kind {kind.name}, but "
-                f"{cls.__module__}:{cls.__qualname__} says type_name '{port.type_name}'"
+                f"{cls.__module__}:{cls.__qualname__} has type_name '{port.type_name}'"
             )
     if given.keys() != kind.outputs.keys():
         return (

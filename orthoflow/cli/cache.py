@@ -14,8 +14,8 @@ from orthoflow.cli.commands import (
     Command,
     LazyCommand,
     LazyGroup,
+    echo_error,
     json_option,
-    say_error,
     store_option,
 )
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
@@ -71,7 +71,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
         ],
     )
     echo(f"{counted(len(results), 'result')} in {store}")
-    _say_what_lies_aside(lying_aside(opened))
+    _echo_set_aside(lying_aside(opened))
     return EXIT_GOOD
 
 
@@ -126,17 +126,17 @@ def cache_verify(store: Path, *, as_json: bool) -> int:
         f"{counted(found.n_results, 'result')} and {counted(found.n_objects, 'object')} in {store} "
         "are as they were stored"
     )
-    _say_what_lies_aside(found.aside)
+    _echo_set_aside(found.aside)
     if found.damaged:
-        say_error(
+        echo_error(
             f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and set aside, "
             "see above; the next run computes what it needs of them again"
         )
     return code
 
 
-def _say_what_lies_aside(aside: Aside) -> None:
-    """Say how much was set aside, if anything was."""
+def _echo_set_aside(aside: Aside) -> None:
+    """Report how much was set aside, if anything."""
     if aside.count:
         echo(
             f"set aside because damaged: {aside.count}, {size(aside.size_bytes)}; "

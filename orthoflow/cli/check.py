@@ -52,7 +52,7 @@ class _Verdict:
 
 def _check(workflow: str, changes: Changes) -> _Verdict:
     from orthoflow.catalog.discovery import discover_catalog
-    from orthoflow.workflow.checks import doubts_about
+    from orthoflow.workflow.checks import lint_workflow
     from orthoflow.workflow.expand import expand_cells, is_plain
     from orthoflow.workflow.inputs import resolve_input_files
 
@@ -69,7 +69,7 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"
         f"{n_runs}{without_data}{_baseline_text(loaded)}"
     )
-    return _Verdict(summary=summary, warnings=doubts_about(loaded))
+    return _Verdict(summary=summary, warnings=lint_workflow(loaded))
 
 
 def _baseline_text(workflow: Workflow) -> str:

@@ -42,7 +42,7 @@ class Session:
 
     Attributes:
         debug: show tracebacks.
-        resume_hint: sentence that says how to go on after Ctrl-C, empty when there is no way.
+        resume_hint: sentence that states how to go on after Ctrl-C, empty when there is no way.
     """
 
     debug: bool = False
@@ -89,7 +89,7 @@ class Command(click.Command):
         self.params.append(debug_parameter())
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments; where a shell took a list apart, say so."""
+        """Parse the arguments; where a shell took a list apart, report it."""
         given = list(args)
         try:
             return super().parse_args(ctx, args)
@@ -108,13 +108,13 @@ class Command(click.Command):
 
 
 class RecordCommand(Command):
-    """A command whose arguments are runs: what fails on a damaged record is said to be its fault.
+    """A command whose arguments are runs: what fails on a damaged record is reported as its fault.
 
-    Reading checks the form of a record, not what one part of it says of another; verifying does.
+    Reading checks the form of a record, not whether its parts agree; verifying does.
     """
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the command; where it fails on what a record holds, say what is wrong with that."""
+        """Run the command; where it fails on what a record holds, report what is wrong with it."""
         try:
             return super().invoke(ctx)
         except (GeometryError, ProductError) as error:
@@ -178,7 +178,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command, and say which one was probably meant when there is none."""
+        """Find the command, and suggest which one was probably meant when there is none."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -210,7 +210,7 @@ DEFAULT_STORE: Final = Path(".orthoflow")
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """What the command line puts in the place of what a workflow file says."""
+    """What the command line puts in the place of what a workflow file states."""
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -355,7 +355,7 @@ EXIT_INTERRUPTED: Final = 130
 
 
 def explain(error: Exception, session: Session) -> int:
-    """Tell the user about an error that ended a command.
+    """Report an error that ended a command.
 
     Returns:
         The exit code of the process.
@@ -366,29 +366,29 @@ def explain(error: Exception, session: Session) -> int:
     if session.debug:
         import traceback
 
-        say_error(*"".join(traceback.format_exception(error)).rstrip("\n").split("\n"))
+        echo_error(*"".join(traceback.format_exception(error)).rstrip("\n").split("\n"))
     if isinstance(error, click.Abort | KeyboardInterrupt):
-        say_error(session.resume_hint or "interrupted")
+        echo_error(session.resume_hint or "interrupted")
         return EXIT_INTERRUPTED
     if isinstance(error, OrthoflowError):
         interrupted = error.exit_code == EXIT_INTERRUPTED
         hint = session.resume_hint if interrupted else ""
-        say_error(*([hint] if hint else _sentences(error)))
+        echo_error(*([hint] if hint else _sentences(error)))
         return error.exit_code
     if is_for_want_of_memory(error):
-        say_error("error: not enough memory to go on; free some, or raise the limit on memory")
+        echo_error("error: not enough memory to go on; free some, or raise the limit on memory")
         return EXIT_CELL_FAILED
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
-        say_error(f"error: {where}{error.strerror.lower()}")
+        echo_error(f"error: {where}{error.strerror.lower()}")
         return EXIT_CELL_FAILED
     if isinstance(error, ImportError):
-        say_error(
-            f"error: a library fails to import: {one_line(error)}; `orthoflow doctor` says what is "
-            f"missing"
+        echo_error(
+            f"error: a library fails to import: {one_line(error)}; `orthoflow doctor` lists what "
+            "is missing"
         )
         return EXIT_PLUGIN_MISSING
-    say_error(
+    echo_error(
         f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
         "repeat the command with --debug and report what it prints"
     )
@@ -408,26 +408,26 @@ def error_text(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
-def say_error(*lines: str) -> None:
+def echo_error(*lines: str) -> None:
     """Write lines to standard error; a closed one is no reason to fail."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
 
 
-def say_doubts(workflow: Workflow) -> None:
-    """Write to standard error what is allowed in a workflow and can hardly be meant."""
-    from orthoflow.workflow.checks import doubts_about
+def echo_lint(workflow: Workflow) -> None:
+    """Write to standard error what is allowed in a workflow but probably a mistake."""
+    from orthoflow.workflow.checks import lint_workflow
 
-    for doubt in doubts_about(workflow):
-        say_error(f"workflow: warning: {doubt}")
+    for warning in lint_workflow(workflow):
+        echo_error(f"workflow: warning: {warning}")
 
 
-def code_for(doubts: Iterable[str], consequence: str) -> int:
-    """Tell which records are not as they were written and what follows, and give the exit code."""
-    told = [f"error: {doubt}; {consequence}" for doubt in doubts if doubt]
-    if not told:
+def code_for(findings: Iterable[str], consequence: str) -> int:
+    """Report records that are not as they were written, and return the exit code."""
+    lines = [f"error: {one}; {consequence}" for one in findings if one]
+    if not lines:
         return EXIT_GOOD
-    say_error(*told)
+    echo_error(*lines)
     return EXIT_RECORD_DIFFERS
 
 

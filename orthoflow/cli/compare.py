@@ -17,11 +17,11 @@ from orthoflow.cli.tables import (
     echo,
     echo_distances,
     echo_json,
+    echo_left_out,
     echo_table,
     first_rows,
     number,
-    say_more,
-    say_verify,
+    verify_hint,
 )
 from orthoflow.foreign_text import first_few
 
@@ -64,12 +64,12 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
         echo_json(comparison_json(comparison))
     else:
         _print(comparison, most=None if is_whole else ROWS_MOST)
-        echo("", say_verify(first, second))
-    return code_for(map(broken_seal, runs), "rely on nothing that is said of it here")
+        echo("", verify_hint(first, second))
+    return code_for(map(broken_seal, runs), "do not rely on what is printed here")
 
 
 def comparison_json(comparison: RunComparison) -> dict[str, object]:
-    """Give a comparison as JSON; every row says whether both sides are the same."""
+    """Return a comparison as JSON; every row states whether both sides are the same."""
     return {
         "runs": [
             {
@@ -151,8 +151,8 @@ def _print_pairs(
     Args:
         title: what they are.
         rows: all.
-        text: how a side is said.
-        most: rows that are printed, what is said alike of a step as one; all of them without it.
+        text: how a side is written.
+        most: rows that are printed, equal differences of a step as one; all of them without it.
         step_of: the step of each cell.
         whose: of which steps the rows are, if not of all.
     """
@@ -179,12 +179,12 @@ def _print_pairs(
             for one in first_rows(told, most, lambda one: not one.pair.is_shared)
         ],
     )
-    say_more(len(told), most)
+    echo_left_out(len(told), most)
 
 
 # Any: rows of all kinds.
 def _counts(rows: Sequence[Pair[Any]]) -> str:
-    """Say in how many rows the runs differ, and in how many by rounding."""
+    """Count the rows in which the runs differ, and in how many by rounding."""
     from orthoflow.records.comparison import Difference
 
     found = Difference.of(rows)
@@ -218,12 +218,12 @@ def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     else:
         told = repeats_as_one(row for row in different if row.is_moved)
         _print_numbers(told[:most])
-        say_more(len(told), most)
+        echo_left_out(len(told), most)
     costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")
     _print_numbers(alike_rows(different, id)[:most])
-    say_more(len(different), most)
+    echo_left_out(len(different), most)
 
 
 def _print_numbers(rows: Sequence[Alike[ComparedMetric]]) -> None:

@@ -161,7 +161,7 @@ def diagnose_libraries() -> list[Diagnosis]:
 
 
 def diagnose_library(library: Library) -> Diagnosis:
-    """Say which version of a library is installed and whether it can be imported."""
+    """State which version of a library is installed and whether it can be imported."""
     try:
         version = metadata.version(library.distribution)
     except metadata.PackageNotFoundError:
@@ -249,7 +249,9 @@ def _diagnose_memory() -> Diagnosis:
         n_bytes = available_memory().available
     except (ImportError, OSError, KeyError, ValueError):
         # The engine does not load when a core library is missing, which is a finding of its own.
-        return Diagnosis(name="memory", verdict="limited", found="unknown", cost="cannot be told")
+        return Diagnosis(
+            name="memory", verdict="limited", found="unknown", cost="cannot be measured"
+        )
     is_enough = n_bytes >= _COMFORTABLE_MEMORY_BYTES
     return Diagnosis(
         name="memory",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from orthoflow.cli.commands import RecordCommand, code_for, input_option, say_error, store_option
+from orthoflow.cli.commands import RecordCommand, code_for, echo_error, input_option, store_option
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import FORMATS, Format, check_choices
 from orthoflow.cli.exports.products import make_empty
@@ -222,10 +222,10 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
         raise RecordError(f"{doubt}; what was changed is not handed on: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
-            said = _export_to(FORMATS[target], opened, aside, chosen)
+            summary = _export_to(FORMATS[target], opened, aside, chosen)
         else:
-            said = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
-    echo(f"{name}: {folder}: {said}")
+            summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
+    echo(f"{name}: {folder}: {summary}")
     return code_for([doubt], f"rely on nothing in {folder}")
 
 
@@ -234,14 +234,14 @@ def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.records.wall_results import with_files
 
     if target.takes_rasters:
-        with with_files(run, lambda said: say_error(f"note: {said}")) as whole:
-            said = target.load()(whole, folder, chosen)
+        with with_files(run, lambda note: echo_error(f"note: {note}")) as whole:
+            summary = target.load()(whole, folder, chosen)
     else:
-        said = target.load()(run, folder, chosen)
+        summary = target.load()(run, folder, chosen)
     for path in folder.rglob("*"):
         if path.is_file():
             name_run(path, run.record.run_id)
-    return said
+    return summary
 
 
 def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
@@ -256,7 +256,7 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + ("all of it embedded before, the same seal" if is_same else "sealed anew")
+        + ("all of it embedded before, the same seal" if is_same else "sealed again")
         + f": sha256:{after}"
     )
 

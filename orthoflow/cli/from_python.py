@@ -63,24 +63,24 @@ def run(
         set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` makes a
             variant of each value; arrays are as good as lists.
         inputs: files by name of the input.
-        datasets: a table of datasets, a CSV file; or what a workflow would say of them, `{"hall":
-            {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a list of paths,
+        datasets: a table of datasets, a CSV file; or what a workflow would state,
+            `{"hall": {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a list of paths,
             from the working directory.
         only_data: of these datasets only.
         output: folder of the run; `runs/<name>-<run id>` without one.
         store: folder of stored results.
         **options: the command's `jobs`, `executor`, `scheduler`, `retries` and `embed`; `only`,
             `from_`, `until` and `force`, a step or several; `set_files`, one or several YAML files
-            of `step.parameter: value`, before which goes what `set` says.
+            of `step.parameter: value`, which `set` overrides.
 
     Raises:
-        WorkflowError: something is wrong with the workflow, or with what was set; says all of it.
+        WorkflowError: something is wrong with the workflow, or with what was set; lists all of it.
         InputError: files are missing.
         ArgumentError: the folder holds a finished run, or an option is none.
     """
     changes = Changes(
         sets=tuple(
-            f"{name}={_spelt(_said(value, f'set[{name!r}]'))}"
+            f"{name}={_spelt(_as_json(value, f'set[{name!r}]'))}"
             for name, value in _named(set, "set", _FORM_OF_SET).items()
         ),
         set_files=_several(options.pop("set_files", ()), "set_files"),
@@ -128,24 +128,24 @@ def _named(given: Any, name: str, form: str) -> Mapping[str, Any]:
 
 def _datasets(given: Any) -> str | Mapping[str, JsonValue]:
     if isinstance(given, Mapping):
-        return {str(name): _said(said, f"datasets[{name!r}]") for name, said in given.items()}
+        return {str(name): _as_json(item, f"datasets[{name!r}]") for name, item in given.items()}
     if isinstance(given, str | PathLike):
         return str(given)
     raise _wrong("datasets", _FORM_OF_DATASETS, given)
 
 
-def _said(value: Any, where: str) -> JsonValue:
+def _as_json(value: Any, where: str) -> JsonValue:
     """Give what a workflow file would hold of a value: paths as texts, any sequence as a list."""
     # Arrays and their numbers, of whatever library.
     value = value.tolist() if callable(getattr(value, "tolist", None)) else value
     if isinstance(value, Mapping):
-        return {str(key): _said(item, f"{where}[{key!r}]") for key, item in value.items()}
+        return {str(key): _as_json(item, f"{where}[{key!r}]") for key, item in value.items()}
     if isinstance(value, str | bool | int | float | None):
         return value
     if isinstance(value, PathLike):
         return str(value)
     if isinstance(value, Sequence):
-        return [_said(item, f"{where}[{index}]") for index, item in enumerate(value)]
+        return [_as_json(item, f"{where}[{index}]") for index, item in enumerate(value)]
     raise _wrong(where, "a path, a text, a number, a list or a mapping", value)
 
 
@@ -154,10 +154,10 @@ def _is_whole(value: object) -> bool:
 
 
 def _wrong(name: str, form: str, got: object) -> ArgumentError:
-    said = repr(got)
-    if len(said) > _SHORT or "\n" in said:
-        said = f"an object of class {type(got).__name__}"
-    return ArgumentError(f"{name} must be {form}, got {said}")
+    text = repr(got)
+    if len(text) > _SHORT or "\n" in text:
+        text = f"an object of class {type(got).__name__}"
+    return ArgumentError(f"{name} must be {form}, got {text}")
 
 
 def _refuse_unknown(options: Mapping[str, object]) -> None:

@@ -79,10 +79,10 @@ def _write(output: Path, text: str) -> None:
 
 
 def _print(draft: Draft, output: Path) -> None:
-    for name, said in draft.inputs.items():
-        echo(f"{name}: {said}")
-    for said in draft.left_out:
-        echo_folded(f"not used: {said}")
+    for name, text in draft.inputs.items():
+        echo(f"{name}: {text}")
+    for text in draft.left_out:
+        echo_folded(f"not used: {text}")
     for text in draft.advice:
         echo_folded(f"note: {text}")
     name = shlex.quote(str(output))

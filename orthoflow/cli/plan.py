@@ -12,8 +12,8 @@ from orthoflow.cli.commands import (
     EXIT_GOOD,
     Changes,
     Command,
+    echo_lint,
     json_option,
-    say_doubts,
     selection_options,
     store_option,
     workflow_arguments,
@@ -62,17 +62,17 @@ def plan(
     if indices := swept_indices(loaded):
         echo()
         echo_table(("variant", "parameters"), indices)
-    say_doubts(loaded)
+    echo_lint(loaded)
     echo("", _summary(planned))
     return EXIT_GOOD
 
 
 def _summary(planned: Sequence[PlannedCell]) -> str:
-    said = [item.status for item in planned]
+    states = [item.status for item in planned]
     counts = [
         f"{number} {status}"
         for status in ("cached", "will run", "unknown yet", "skipped")
-        if (number := said.count(status))
+        if (number := states.count(status))
     ]
     return f"{counted(len(planned), 'step')}: {', '.join(counts)}"
 

@@ -231,7 +231,7 @@ def _failure(catalog: Catalog, name: str) -> _Failure | None:
 
 
 def _method_json(entry: MethodEntry) -> dict[str, object]:
-    """Give everything that a method says of itself, as JSON.
+    """Return everything that a method declares, as JSON.
 
     Raises:
         PluginError: the method's class cannot be loaded.
@@ -345,7 +345,7 @@ def _parameters(params: type[MethodParams]) -> list[tuple[str, str, object, str,
 
 
 def _type_text(field: dict[str, object], definitions: dict[str, dict[str, object]]) -> str:
-    """Say the type of a JSON Schema node in a few words, with its limits."""
+    """Describe the type of a JSON Schema node in a few words, with its limits."""
     reference = field.get("$ref")
     if isinstance(reference, str):
         return _type_text(definitions.get(reference.rpartition("/")[2], {}), definitions)
@@ -408,7 +408,7 @@ def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
 @click.option("--citation", default="", help="Where the method comes from: DOI, title or URL.")
 @json_option
 def plugins_new(
-    name: str, *, as_json: bool, folder: Path, new_kind: str, takes: str, gives: str, **said: str
+    name: str, *, as_json: bool, folder: Path, new_kind: str, takes: str, gives: str, **about: str
 ) -> int:
     """Write a plugin NAME that installs, works and passes its tests at once, e.g. my-detector.
 
@@ -418,22 +418,22 @@ def plugins_new(
     """
     from orthoflow.scaffold import Project, write_project
 
-    if said["kind"] and new_kind:
+    if about["kind"] and new_kind:
         raise click.UsageError(
-            f"--kind {said['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
+            f"--kind {about['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
             "its own) exclude each other: leave one of them away"
         )
-    if not (said["kind"] or new_kind):
+    if not (about["kind"] or new_kind):
         raise click.UsageError(
             "give --kind, the kind of the method (`orthoflow plugins list`), or --new-kind"
         )
     types = (part.strip() for part in takes.split(",")) if new_kind else ()
     project = Project(
         name=name,
-        kind=new_kind or said["kind"],
-        author=said["author"],
-        licence=said["licence"],
-        citation=said["citation"],
+        kind=new_kind or about["kind"],
+        author=about["author"],
+        licence=about["licence"],
+        citation=about["citation"],
         product=(gives or f"{new_kind}s") if new_kind else "",
         takes=tuple(dict.fromkeys(types)),
     )
@@ -485,14 +485,14 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
             is_left_out = quick and not case.check.is_quick
             problem = "" if is_left_out else case.problem()
             name, rule = case.check.name, case.check.rule
-            told = next((one["check"] for one in results if one["problem"] == problem != ""), "")
+            first = next((one["check"] for one in results if one["problem"] == problem != ""), "")
             state = "broken" if problem else "left out" if is_left_out else "kept"
-            state, said = (
-                ("skipped", f"stopped by the same as {told}") if told else (state, problem)
+            state, text = (
+                ("skipped", f"stopped by the same as {first}") if first else (state, problem)
             )
             results.append({"check": name, "state": state, "rule": rule, "problem": problem})
             if not as_json:
-                echo(f"{state:{8 if quick else 7}} {name}: {said or rule}")
+                echo(f"{state:{8 if quick else 7}} {name}: {text or rule}")
     counts = Counter(result["state"] for result in results)
     left = unwritten(method_id, discover_catalog())
     if as_json:

@@ -18,8 +18,8 @@ from orthoflow.cli.commands import (
     LazyGroup,
     Session,
     debug_parameter,
+    echo_error,
     explain,
-    say_error,
     silence_stdout,
 )
 from orthoflow.cli.tables import echo
@@ -73,9 +73,9 @@ class Program(LazyGroup):
             silence_stdout()
             code = 0
         except click.ClickException as error:
-            said = io.StringIO()
-            error.show(said)
-            say_error(*said.getvalue().rstrip("\n").split("\n"))
+            shown = io.StringIO()
+            error.show(shown)
+            echo_error(*shown.getvalue().rstrip("\n").split("\n"))
             code = error.exit_code
         except Exception as error:  # noqa: BLE001 - the last stop before the user
             code = explain(error, session)
@@ -128,7 +128,7 @@ def main() -> NoReturn:
     try:
         program.main(prog_name="orthoflow")
     except SystemExit as end:
-        _leave_foreign_threads(end.code)
+        _leave_library_threads(end.code)
         raise
 
 
@@ -147,7 +147,7 @@ def take_up_streams() -> None:
             setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
 
 
-def _leave_foreign_threads(code: object) -> None:
+def _leave_library_threads(code: object) -> None:
     """Leave at once where a plugin left threads behind, for which Python would wait for ever."""
     main_thread = threading.main_thread()
     if all(thread.daemon or thread is main_thread for thread in threading.enumerate()):

@@ -19,11 +19,11 @@ from orthoflow.cli.commands import (
     EXIT_RECORD_DIFFERS,
     RecordCommand,
     current_session,
+    echo_error,
     execution_options,
     input_option,
     json_option,
     output_option,
-    say_error,
 )
 from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
@@ -138,7 +138,7 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
 
 
 def _earlier_stores() -> tuple[Store, ...]:
-    """The store of runs made here: it has products, and remembers where input files lay."""
+    """The store of runs made here: it has products, and remembers where input files were."""
     from orthoflow.engine.store import stores_at
 
     return stores_at(DEFAULT_STORE)
@@ -156,7 +156,7 @@ class _Call:
     as_json: bool
 
     def go(self) -> int:
-        """Execute, record, report, compare and say how far the products lie apart."""
+        """Execute, record, report, compare, and print how far the products differ."""
         from orthoflow.records.replaying import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
 
@@ -188,7 +188,7 @@ class _Call:
             echo(*_metric_lines(metrics))
             echo(f"record of the replay: {made.path}", f"report: {self.folder / REPORT_FILE}")
         if differs:
-            say_error(f"error: the replay of {self.original.path} differs, see above")
+            echo_error(f"error: the replay of {self.original.path} differs, see above")
         return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
 
     def _make(self) -> Run:
@@ -202,7 +202,7 @@ class _Call:
 
         def run() -> RunOutcome:
             with make_progress(plan.cells, jobs=plan.options.jobs) as progress:
-                return execute(plan, self.folder, self.store, progress.tell, run_id=self.run_id)
+                return execute(plan, self.folder, self.store, progress.take, run_id=self.run_id)
 
         def write(outcome: RunOutcome) -> Run:
             return write_run(
@@ -230,7 +230,7 @@ class _Call:
 
 
 def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
-    """Say how many metrics differ and which: what nothing excuses first, on a line of its own."""
+    """Count how many metrics differ and which: what nothing excuses first, on a line of its own."""
     what = "metrics, without times"
     kinds = (
         ("different", "differ though the products of their steps are identical"),
@@ -240,10 +240,10 @@ def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
         ("rounding", "differ by rounding"),
     )
     lines = []
-    for verdict, said in kinds:
+    for verdict, words in kinds:
         if found := [_metric_text(item) for item in metrics if item.verdict == verdict]:
             some = first_few(found, most=_METRICS_MOST)
-            lines.append(f"{what}: {len(found)} of {len(metrics)} {said}: {some}")
+            lines.append(f"{what}: {len(found)} of {len(metrics)} {words}: {some}")
     return lines or [f"{what}: {len(metrics)} same"]
 
 

@@ -38,7 +38,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     opened = [open_run(run) for run in runs]
     if output is None and len(opened) > 1:
         raise ArgumentError(
-            f"{len(opened)} runs were given: say with -o FILE where their common report goes"
+            f"{len(opened)} runs were given: give -o FILE, where their common report goes"
         )
     target = output if output is not None else opened[0].home_folder / REPORT_FILE
     if not target.parent.is_dir():
@@ -49,4 +49,4 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     else:
         write_report(opened, target, doubts=doubts, stores=stores_at(store))
     echo(f"report: {target}")
-    return code_for(doubts.values(), "the page says so")
+    return code_for(doubts.values(), "the page states it")

@@ -17,10 +17,10 @@ from orthoflow.cli.commands import (
     Command,
     command_again,
     current_session,
+    echo_error,
+    echo_lint,
     execution_options,
     output_option,
-    say_doubts,
-    say_error,
     selection_options,
     silence_stdout,
     store_option,
@@ -140,7 +140,7 @@ class Call:
     json_log: Path | None = None
 
     def go(self) -> int:
-        """Execute, record, report and say what came out."""
+        """Execute, record, report and print the summary."""
         from orthoflow.engine.journal import LOGS
         from orthoflow.records.runs import REPORT_FILE
 
@@ -149,7 +149,7 @@ class Call:
         report = folder / REPORT_FILE
         _print_tracebacks(made.run.record.cells, folder / LOGS)
         if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
-            say_error(f"with more room on the disk, the same command with -o {folder} goes on")
+            echo_error(f"with more room on the disk, the same command with -o {folder} goes on")
         try:
             _print_summary(made, report)
         except BrokenPipeError:
@@ -198,7 +198,7 @@ class Call:
         from orthoflow.records.writing import begin_run
 
         # Before minutes pass.
-        say_doubts(self.workflow)
+        echo_lint(self.workflow)
         with (
             make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
             _json_log(self.json_log, self.plan) as log,
@@ -210,7 +210,7 @@ class Call:
                 if not has_begun:
                     has_begun = True
                     begin_run(self.plan, self.workflow, folder, self.store, run_id)
-                progress.tell(event)
+                progress.take(event)
                 log(event)
 
             return execute(
@@ -223,7 +223,7 @@ class Call:
             )
 
     def _show_unfinished(self, folder: Path, outcome: RunOutcome) -> None:
-        """Write the report of a run that was broken off: what is there, and how to go on."""
+        """Write the report of an interrupted run: what is there, and how to go on."""
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.writing import show_unfinished
         from orthoflow.report import write_page
@@ -235,7 +235,7 @@ class Call:
             write_page(run, report, go_on=go_on)
 
         if show_unfinished(outcome, self.plan, self.workflow, folder, self.store, show):
-            say_error(f"report of what there is so far: {report}")
+            echo_error(f"report of what there is so far: {report}")
 
 
 @contextmanager
@@ -272,7 +272,7 @@ def _print_tracebacks(cells: Iterable[RecordedCell], logs: Path) -> None:
 
     for cell in cells:
         if cell.status == "failed" and "Traceback (most recent call last)" in cell.log:
-            say_error(f"{cell.address}: traceback: {logs / cell_file_name(cell.address)}.log")
+            echo_error(f"{cell.address}: traceback: {logs / cell_file_name(cell.address)}.log")
 
 
 def _print_summary(made: WrittenRun, report: Path) -> None:
@@ -305,7 +305,7 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
 
 
 def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
-    """Say how many cells came from the store, or from before an interruption; no skipped ones."""
+    """Count the cells that came from the store, or from before an interruption; no skipped ones."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)
@@ -321,7 +321,7 @@ def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
 
 
 def _damaged_text(damaged: Mapping[str, str]) -> str:
-    """Say which cells' results were damaged in the store."""
+    """List the cells whose results were damaged in the store."""
     were = "were" if len(damaged) > 1 else "was"
     named = ", ".join(f"{address} ({what})" for address, what in damaged.items())
     count = counted(len(damaged), "result")

@@ -173,9 +173,9 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
     """Give runs as JSON, with every metric and parameter, and in what they differ from others."""
-    from orthoflow.report.browsing import differing_facts, told_facts
+    from orthoflow.report.browsing import differing_facts, distinct_facts
 
-    facts, differs = told_facts(found), differing_facts(found)
+    facts, differs = distinct_facts(found), differing_facts(found)
     return [_row_json(run, facts[run.folder], differs[run.folder]) for run in kept]
 
 
@@ -288,15 +288,15 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
 
 
 def _facts_text(facts: Mapping[str, object]) -> str:
-    """Say in what a run differs, as far as a line bears it."""
-    said = []
+    """Describe in what a run differs, as far as a line bears it."""
+    parts = []
     for name, value in facts.items():
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         if name.startswith("input ") and isinstance(value, list):
             text = ", ".join(map(str, value)) or "not given"
         cut = text if len(text) <= _LONGEST_FACT else f"{text[:_LONGEST_FACT]}..."
-        said.append(f"{name}={cut}")
-    return first_few(said, most=_FACTS_MOST)
+        parts.append(f"{name}={cut}")
+    return first_few(parts, most=_FACTS_MOST)
 
 
 def _row_json(
@@ -310,9 +310,9 @@ def _row_json(
 
 
 def _print_csv(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
-    from orthoflow.report.browsing import told_facts
+    from orthoflow.report.browsing import distinct_facts
 
-    told = told_facts(found)
+    told = distinct_facts(found)
     metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
     facts = list(dict.fromkeys(name for run in kept for name in told[run.folder]))
     header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]

@@ -20,13 +20,13 @@ from orthoflow.cli.tables import (
     echo,
     echo_diagnostics,
     echo_json,
+    echo_left_out,
     echo_table,
     first_rows,
     medians,
     number,
-    say_more,
-    say_verify,
     size,
+    verify_hint,
 )
 from orthoflow.workflow.model import (
     DATA,
@@ -79,8 +79,8 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
             _print_metrics(opened, most=None if is_whole else ROWS_MOST)
         _print_environments(opened)
         _print_files(opened)
-        echo("", say_verify(run))
-    return code_for([broken_seal(opened)], "rely on nothing that is said of it here")
+        echo("", verify_hint(run))
+    return code_for([broken_seal(opened)], "do not rely on what is printed here")
 
 
 def _print_head(run: Run) -> None:
@@ -151,7 +151,7 @@ def _print_comparison(run: Run) -> bool:
             (methods[0].name, *(_median(one) for one in methods))
             for methods in zip(*(one.methods for one in over), strict=True)
         ]
-        said = who_leads(over, len(parts))
+        leaders = who_leads(over, len(parts))
         shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
         counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
         about = (
@@ -164,7 +164,7 @@ def _print_comparison(run: Run) -> bool:
             (variants_text(dict(zip(table.steps, row.variants, strict=True))), *_texts(row))
             for row in table.rows
         ]
-        said, about = "", "means of the repeats ± their standard deviation, where there are some"
+        leaders, about = "", "means of the repeats ± their standard deviation, where there are some"
     else:
         return False
     if not names:
@@ -174,7 +174,7 @@ def _print_comparison(run: Run) -> bool:
     echo_table(("combination", *names)[:width], [row[:width] for row in rows])
     n_more = len(names) - _COLUMNS_MOST
     more = f"; {counted(n_more, 'more metric')} in the report" if n_more > 0 else ""
-    echo(f"{about}{more}; --all prints every number", *([f"{said}."] if said else []))
+    echo(f"{about}{more}; --all prints every number", *([f"{leaders}."] if leaders else []))
     return True
 
 
@@ -206,7 +206,7 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
     if rows:
         echo()
         echo_table(("step", "metric", "value", "unit"), rows)
-        say_more(len(told), most)
+        echo_left_out(len(told), most)
 
 
 def _print_environments(run: Run) -> None:

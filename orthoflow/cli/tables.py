@@ -30,7 +30,7 @@ _UNITS: Final = {"grey": " grey levels", "1": ""}
 def echo(*lines: str, err: bool = False) -> None:
     """Print lines, on standard error if asked to; what a terminal would obey is written out.
 
-    All that a command says goes through here: names, messages and logs come from strangers.
+    All output of commands goes through here: names, messages and logs are untrusted.
     """
     for line in lines or ("",):
         click.echo(shown(line), err=err)  # noqa: TID251 - the one place
@@ -81,7 +81,7 @@ def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lay rows under a header, columns aligned.
+    """Write rows under a header, columns aligned.
 
     >>> table_lines(("step", "time"), [("cloud", "1.0 s")])
     ['step   time', 'cloud  1.0 s']
@@ -124,7 +124,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
     for item in told:
         if item.reason:
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
-    say_more(len(distances), most)
+    echo_left_out(len(distances), most)
     echo(verdict_counts(distances))
 
 
@@ -137,24 +137,25 @@ def first_rows(
     return sorted(rows, key=place)[:most]
 
 
-def say_more(n_rows: int, most: int | None) -> None:
-    """Say how many rows of a table were left out, and how they are had."""
+def echo_left_out(n_rows: int, most: int | None) -> None:
+    """Print how many rows of a table were left out, and how to see them."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, which --all prints")
 
 
-def say_verify(*runs: Path) -> str:
-    """Name what looks at the large arrays of runs, too.
+def verify_hint(*runs: Path) -> str:
+    """Return a sentence that names the command which checks large arrays, too.
 
-    >>> say_verify(Path("first"))
-    'whether all of it is as it was written, says `orthoflow verify first`'
+    >>> verify_hint(Path("first"))
+    '`orthoflow verify first` checks that nothing changed since it was written'
     """
     commands = " and ".join(f"`orthoflow verify {shlex.quote(str(run))}`" for run in runs)
-    return f"whether all of it is as it was written, says {commands}"
+    checks = "checks" if len(runs) == 1 else "check"
+    return f"{commands} {checks} that nothing changed since it was written"
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:
-    """Say how many products there are of each verdict.
+    """Count the products of each verdict.
 
     >>> verdict_counts(())
     '0 products'
@@ -168,7 +169,7 @@ def verdict_counts(distances: Sequence[ProductDistance]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Say a time as people do.
+    """Write a duration as people do.
 
     >>> [duration(seconds) for seconds in (0.001, 0.042, 59.97, 75, 3700)]
     ['< 0.01 s', '0.04 s', '1 min 00 s', '1 min 15 s', '1 h 02 min']
@@ -185,7 +186,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """Say a number of bytes in binary units.
+    """Write a number of bytes in binary units.
 
     >>> [size(n) for n in (512, 2048, 5 * 1024**3)]
     ['512 B', '2.0 KiB', '5.0 GiB']
@@ -199,7 +200,7 @@ def size(n_bytes: float) -> str:
 
 
 def number(value: float) -> str:
-    """Say a number to six significant digits, counts to the last one.
+    """Write a number to six significant digits, counts to the last one.
 
     >>> number(2251930.0), number(0.0012345678), number(-3.0)
     ('2251930', '0.00123457', '-3')
@@ -208,7 +209,7 @@ def number(value: float) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Say a number with its noun.
+    """Write a count with its noun.
 
     >>> counted(1, "step"), counted(3, "step")
     ('1 step', '3 steps')
@@ -219,7 +220,7 @@ def counted(count: int, noun: str) -> str:
 def medians(
     counts: Mapping[str, Collection[int]], n_datasets: int, flags: Collection[str] = ()
 ) -> str:
-    """Say of how many datasets medians are.
+    """Describe of how many datasets medians are.
 
     Args:
         counts: name of a number -> how many datasets have it, in each of its rows.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from orthoflow.cli.commands import EXIT_GOOD, EXIT_RECORD_DIFFERS, Command, json_option, say_error
+from orthoflow.cli.commands import EXIT_GOOD, EXIT_RECORD_DIFFERS, Command, echo_error, json_option
 from orthoflow.cli.tables import counted, echo, echo_json
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
         for finding in findings:
             echo(finding)
         beside = f"the seal of {verification.path} holds, but what lies beside it is not as written"
-        say_error(f"error: {verification.wrong or beside}, see above")
+        echo_error(f"error: {verification.wrong or beside}, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 
 

@@ -197,7 +197,7 @@ def _executed(plan: RunPlan, folder: Path, store: Store) -> list[tuple[str, Cell
     if not plan.cells:
         return []
     with make_progress(plan.cells) as progress:
-        results = execute(plan, folder, store, progress.tell).results
+        results = execute(plan, folder, store, progress.take).results
     return [
         (item.cell.method, results[item.cell.address])
         for item in plan.cells

@@ -20,7 +20,7 @@ from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
 from orthoflow.catalog.distributions import canonical_name, package_path, source_files
-from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
+from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import PluginError
@@ -190,7 +190,7 @@ def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, s
 
 def _tools(cls: type[Method]) -> dict[str, str]:
     try:
-        with foreign_code(f"method {cls.id}"):
+        with guarded(f"method {cls.id}"):
             return {str(name): str(version) for name, version in cls.tools().items()}
     except UserInterrupt:
         raise

@@ -149,7 +149,7 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
 
     A fact that some of them lack differs only where two others disagree on it.
     """
-    told = told_facts(runs)
+    told = distinct_facts(runs)
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:
         for name, value in told[run.folder].items():
@@ -164,7 +164,7 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
     }
 
 
-def told_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
+def distinct_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
     """All facts of each run, by its folder: each once, by the name that `--set` takes.
 
     Of a sweep all values are told, without the dataset what is the same on all datasets of each

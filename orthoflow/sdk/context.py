@@ -45,10 +45,10 @@ _HEAD_BYTES: Final = 16  # by which a picture is known
 
 
 def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
-    """Let what a method is refused for reporting say where in its source it reported it."""
+    """Add to an error about a report the line of source that reported it."""
 
     @wraps(report)
-    def told(*args: _Given.args, **kwargs: _Given.kwargs) -> None:
+    def located(*args: _Given.args, **kwargs: _Given.kwargs) -> None:
         try:
             report(*args, **kwargs)
         except ProductError as error:
@@ -63,7 +63,7 @@ def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
             where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
             raise ProductError(f"{error} ({where})") from error
 
-    return told
+    return located
 
 
 class Drawing(Protocol):

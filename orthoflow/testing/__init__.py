@@ -1,4 +1,4 @@
-"""The conformance suite that every method passes, ours and a stranger's.
+"""The conformance suite that every method passes, built in or third-party.
 
 Use it in the tests of a plugin:
 
@@ -6,7 +6,7 @@ Use it in the tests of a plugin:
     def test_conformance(case):
         case.run()
 
-It reads only what the method declares, needs no pytest itself, and says in one sentence what is
+It reads only what the method declares, needs no pytest itself, and states in one sentence what is
 wrong. A check that a method cannot pass is named with its reason in `expected_failures`; it fails
 when it starts to pass, so that reasons do not outlive their cause.
 """

@@ -1,4 +1,4 @@
-"""A method and a check become a case; a case that fails says why in one sentence."""
+"""A method and a check become a case; a case that fails states why in one sentence."""
 
 from __future__ import annotations
 

@@ -33,11 +33,11 @@ from orthoflow.testing.physics import (
     cells_show_their_own_place,
     finds_planes,
     joins_layers,
-    lays_onto_walls,
     mosaics_show_cells_in_place,
     orients_photos,
     planes_follow_a_rigid_motion,
     poses_are_recovered,
+    projects_onto_walls,
     stated_errors_of_planes_hold,
     stated_errors_of_poses_hold,
 )
@@ -88,7 +88,8 @@ def _parameter_faults(name: str, info: FieldInfo) -> Iterator[str]:
     is_float = info.annotation is float or info.annotation == (float | None)
     if is_float and not re.search(rf"_({'|'.join(UNIT_SUFFIXES)})(_|$)", f"_{name}"):
         yield (
-            f"parameter {name} does not say its unit: end it with one of {', '.join(UNIT_SUFFIXES)}"
+            f"parameter {name} does not state its unit: end it with one of "
+            f"{', '.join(UNIT_SUFFIXES)}"
         )
 
 
@@ -129,7 +130,7 @@ def outputs_are_valid(subject: Subject) -> None:
 
 
 def no_covariance_is_zero(subject: Subject) -> None:
-    """No plane and no pose is said to be known without error, by a covariance of zeros."""
+    """No plane and no pose is stated to be without error, by a covariance of zeros."""
     for product in subject.witness.first.run.outputs.values():
         stated: list[tuple[str, NDArray[np.float64] | None]] = []
         if isinstance(product, Planes):
@@ -139,7 +140,7 @@ def no_covariance_is_zero(subject: Subject) -> None:
         for name, covariance in stated:
             require(
                 covariance is None or bool(np.any(covariance)),
-                f"the covariance of {name} is zero, which says that it is known without error: put "
+                f"the covariance of {name} is zero, which means that it is known without error: put "
                 "in what your fit states; `orthoflow plugins new` writes that of least squares for "
                 "a plane, and of a camera it may be left out",
             )
@@ -276,7 +277,7 @@ def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
             ) from error
 
 
-def missing_ties_are_told(subject: Subject) -> None:
+def missing_ties_are_reported(subject: Subject) -> None:
     """Without any ties no photo is called oriented."""
     ties = example_ties()
     empty = replace(
@@ -301,7 +302,7 @@ def missing_ties_are_told(subject: Subject) -> None:
 
 
 def progress_never_goes_back(subject: Subject) -> None:
-    """Progress is told in fractions from 0 to 1 that never become smaller."""
+    """Progress is reported in fractions from 0 to 1 that never become smaller."""
     fractions = subject.witness.first.run.fractions
     for before, after in pairwise((0.0, *fractions, 1.0)):
         require(
@@ -383,12 +384,12 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(single_point_is_refused, _takes_a_cloud),
     _check(nan_is_refused, _takes_a_cloud),
     _check(a_huge_coordinate_does_no_harm, _takes_a_cloud, is_quick=False),
-    _check(missing_ties_are_told, _takes_ties, is_quick=False),
+    _check(missing_ties_are_reported, _takes_ties, is_quick=False),
     _check(planes_follow_a_rigid_motion, finds_planes, is_quick=False),
     _check(stated_errors_of_planes_hold, finds_planes, is_quick=False),
     _check(poses_are_recovered, orients_photos, is_quick=False),
     _check(stated_errors_of_poses_hold, _takes_ties, is_quick=False),
-    _check(cells_show_their_own_place, lays_onto_walls, is_quick=False),
+    _check(cells_show_their_own_place, projects_onto_walls, is_quick=False),
     _check(mosaics_show_cells_in_place, joins_layers, is_quick=False),
     _check(golden_digest_holds, _always),
 )

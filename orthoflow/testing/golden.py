@@ -1,7 +1,7 @@
 """Golden results: what a method gave when its author last looked, to notice when results move.
 
-Bits of a result hang on more than the method: on the processor, and on the version of every library
-that computes. So the file keeps both the digest, which must come again where it was recorded, and a
+The bits of a result depend on more than the method: on the processor and on the version of every
+library that computes. So the file keeps both the digest, which must come again where it was recorded, and a
 sample of the numbers, which must come again anywhere within the tolerances of the product types.
 Numbers that a product states about itself have no tolerance, and a share over few cells may move by
 any amount with the last bits of what goes in. So they are held to the file where the same bits go
@@ -73,7 +73,7 @@ class Golden:
         result_version: of the method.
         tools: as the method declares them; with others it may give something else.
         params: those that differ from the defaults, as JSON.
-        environment: digest of what bits hang on besides.
+        environment: digest of what else bits depend on.
         inputs: by port; files are left out.
         outputs: by port.
     """
@@ -172,7 +172,9 @@ def _moved(
     must_be_alike = same_went_in and before.environment == now.environment
     if problem or method.determinism == "loose" or not must_be_alike:
         return problem
-    return "in bits, not beyond the tolerances of its type, where libraries and processor are alike"
+    return (
+        "in bits, not beyond the tolerances of its type, where libraries and processor are the same"
+    )
 
 
 @cache

@@ -61,7 +61,7 @@ def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
     """Run a trial in a new process: other working directory, home, hash seed, BLAS threads.
 
     Raises:
-        AssertionError: the process failed; the sentence ends with what it said last.
+        AssertionError: the process failed; the sentence ends with the last line of its output.
     """
     world = folder / "elsewhere"
     places = {name: world / name for name in ("cwd", "home", "tmp")}

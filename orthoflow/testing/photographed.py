@@ -394,11 +394,11 @@ def example_ties() -> Ties:
 
 
 def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
-    """Return ties as those of the example, drawn anew.
+    """Return ties as those of the example, drawn again.
 
     Args:
         seed: of places, noise and wrong ties.
-        noise_m: standard deviation of each coordinate of a point; as stated, unless told otherwise.
+        noise_m: standard deviation of each coordinate of a point; as stated, unless given.
     """
     rng = np.random.default_rng(seed)
     views = list(photographing_cameras().values())

@@ -251,7 +251,7 @@ def orients_photos(method: type[Method]) -> bool:
     return method.id.startswith("orient.")
 
 
-def lays_onto_walls(method: type[Method]) -> bool:
+def projects_onto_walls(method: type[Method]) -> bool:
     """Whether the method paints layers."""
     return method.id.startswith("ortho.")
 

@@ -1,7 +1,7 @@
 """Small inputs from the simulated room, for methods that work on what other methods give.
 
-The room is simulated; what a road of methods would make of it (planes, rasters, orthoimages) is
-laid down here by closed forms instead. So an example does not move when another method does, and
+The room is simulated; what methods would compute from it (planes, rasters, orthoimages) is
+computed here by closed forms instead. So an example does not move when another method does, and
 has the same bits on every processor: what comes from sums, roots or angles is rounded far above
 its last digits, the rest is exact in any order.
 """

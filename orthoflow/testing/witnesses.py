@@ -64,7 +64,7 @@ class Witness:
 
     @cached_property
     def again(self) -> TrialRun:
-        """The same in the same process; the run on two cores where that came out alike."""
+        """The same in the same process; the run on two cores where the results were the same."""
         if self.on_two_cores.digests == self.first.run.digests:
             return self.on_two_cores
         return _run(self.trial)

@@ -393,7 +393,7 @@ _MAX_GSD_M: Final = 0.5
 _MILLIMETRES: Final = 1000.0
 
 
-def doubts_about(workflow: Workflow) -> tuple[str, ...]:
+def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
     """Return a sentence for each thing that is allowed and can hardly be meant."""
     return (
         *_unused_inputs(workflow),

@@ -53,7 +53,7 @@ class Recognised:
     Attributes:
         kind: what it is; `unknown` for what no method reads.
         path: as it was found.
-        said: what is in it, in words; why nothing is known of it.
+        summary: what is in it, in words; why nothing is known of it.
         n_photos: photos in it, also those in a scan.
         n_posed: photos in a scan whose lens and pose it states.
         fields: what the points of a scan have besides coordinates, empty fields left out.
@@ -63,7 +63,7 @@ class Recognised:
 
     kind: FileKind
     path: Path
-    said: str = ""
+    summary: str = ""
     n_photos: int = 0
     n_posed: int = 0
     fields: frozenset[str] = frozenset()
@@ -92,10 +92,10 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
     files = [path for path in inside if path.is_file()]
     names = {path.name.lower() for path in files}
     if depth and not _OF_RUNS.isdisjoint(names):
-        yield Recognised(kind="unknown", path=folder, said="a folder of results")
+        yield Recognised(kind="unknown", path=folder, summary="a folder of results")
         return
     if any({f"images{end}", f"cameras{end}"} <= names for end in (".bin", ".txt")):
-        yield _read("cameras", folder, lambda _: _cameras_said(files))
+        yield _read("cameras", folder, lambda _: _cameras_summary(files))
         return
     yield from map(_file, files)
     for path in inside:
@@ -105,32 +105,32 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
 
 def _file(path: Path) -> Recognised:
     if not path.is_file():
-        return Recognised(kind="unknown", path=path, said="a pipe or a device")
+        return Recognised(kind="unknown", path=path, summary="a pipe or a device")
     if text_of_path(path) is None:
-        return Recognised(kind="unknown", path=path, said="its path is no UTF-8: rename it")
+        return Recognised(kind="unknown", path=path, summary="its path is no UTF-8: rename it")
     suffix = path.suffix.lower()
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
-        return Recognised(kind="other", path=path, said="an orthoimage with its frame beside it")
+        return Recognised(kind="other", path=path, summary="an orthoimage with its frame beside it")
     if suffix in PHOTO_SUFFIXES:
-        return Recognised(kind="photos", path=path, said="a photo", n_photos=1, lens=_lens(path))
+        return Recognised(kind="photos", path=path, summary="a photo", n_photos=1, lens=_lens(path))
     readers: dict[str, Callable[[Path], Recognised]] = {
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),
         **dict.fromkeys(RAW_SUFFIXES, _raw),
         **dict.fromkeys(_YAML, _yaml),
         **dict.fromkeys(
-            _CAMERAS, lambda file: _read("cameras", file, lambda f: _cameras_said([f]))
+            _CAMERAS, lambda file: _read("cameras", file, lambda f: _cameras_summary([f]))
         ),
     }
     # Scanners and sidecars write JSON of all kinds.
     if suffix not in readers or (suffix == ".json" and path.name != "cameras.json"):
-        return Recognised(kind="unknown", path=path, said="no method reads such files")
+        return Recognised(kind="unknown", path=path, summary="no method reads such files")
     return readers[suffix](path)
 
 
 def _raw(path: Path) -> Recognised:
-    said = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
-    return Recognised(kind="unknown", path=path, said=said)
+    summary = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
+    return Recognised(kind="unknown", path=path, summary=summary)
 
 
 def _lens(path: Path) -> str:
@@ -159,7 +159,7 @@ def _scan(path: Path) -> Recognised:
     return Recognised(
         kind="scan",
         path=path,
-        said=", ".join(words),
+        summary=", ".join(words),
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
         fields=fields,
@@ -221,22 +221,24 @@ def _table(path: Path) -> Recognised:
         except InputError as error:
             if _has_columns_of(path, kind):
                 first = str(error).partition("\n")[0]
-                return Recognised(kind="unknown", path=path, said=first)
+                return Recognised(kind="unknown", path=path, summary=first)
             continue
         if not _is_cloud(rows):
-            return Recognised(kind=kind, path=path, said=f"{len(rows)} {noun}")
+            return Recognised(kind=kind, path=path, summary=f"{len(rows)} {noun}")
     if path.suffix.lower() == ".csv":
-        found = _read("cameras", path, lambda file: _cameras_said([file]))
+        found = _read("cameras", path, lambda file: _cameras_summary([file]))
         if found.kind == "cameras":
             return found
     elif _column_names(path) >= _CAMERA_COLUMNS:
         return Recognised(
-            kind="unknown", path=path, said="a list of cameras, which is read from .csv: rename it"
+            kind="unknown",
+            path=path,
+            summary="a list of cameras, which is read from .csv: rename it",
         )
     try:
         return _scan(path)
     except InputError as error:
-        return Recognised(kind="unknown", path=path, said=str(error))
+        return Recognised(kind="unknown", path=path, summary=str(error))
 
 
 _TABLES: Final[Sequence[tuple[FileKind, Callable[[Path], Sequence[object]], str]]] = (
@@ -273,29 +275,29 @@ def _is_cloud(rows: Sequence[object]) -> bool:
 
 
 def _yaml(path: Path) -> Recognised:
-    """A calibration; a workflow, which `new` may have written before, is told as one."""
-    found = _read("calibration", path, _calibration_said)
+    """A calibration; a workflow, which `new` may have written before, is reported as one."""
+    found = _read("calibration", path, _calibration_summary)
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
     if found.kind == "unknown" and is_workflow:
-        return Recognised(kind="unknown", path=path, said=f"{path.name} is a workflow itself")
+        return Recognised(kind="unknown", path=path, summary=f"{path.name} is a workflow itself")
     return found
 
 
-def _calibration_said(path: Path) -> str:
+def _calibration_summary(path: Path) -> str:
     return f"a calibration of {', '.join(read_calibration(path).patterns)}"
 
 
-def _cameras_said(paths: Sequence[Path]) -> str:
+def _cameras_summary(paths: Sequence[Path]) -> str:
     return f"{len(read_given_cameras(paths))} cameras"
 
 
-def _read(kind: FileKind, path: Path, said: Callable[[Path], str]) -> Recognised:
+def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recognised:
     try:
-        return Recognised(kind=kind, path=path, said=said(path))
+        return Recognised(kind=kind, path=path, summary=summary(path))
     except InputError as error:
         first = str(error).partition("\n")[0]
-        return Recognised(kind="unknown", path=path, said=first)
+        return Recognised(kind="unknown", path=path, summary=first)
 
 
 # The workflow ------------------------------------------------------------------------------------
@@ -347,7 +349,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         by_kind.setdefault(item.kind, []).append(item)
     scans = by_kind.get("scan", [])
     if not scans:
-        others = "; ".join(f"{item.path.name}: {item.said}" for item in found[:_MOST_LISTED])
+        others = "; ".join(f"{item.path.name}: {item.summary}" for item in found[:_MOST_LISTED])
         raise InputError(
             "there is no scan among the files, and a workflow needs one (E57, LAS, LAZ, PLY, PCD, "
             f"PTX or text); found {others or 'nothing'}"
@@ -358,7 +360,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         by_kind["unknown"] = [
             *by_kind.get("unknown", []),
             *(
-                replace(scan, said="text, left out beside scans of other formats")
+                replace(scan, summary="text, left out beside scans of other formats")
                 for scan in scans
                 if scan not in own_formats
             ),
@@ -380,10 +382,10 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         )
     if own_photos and "photos" not in by_kind:
         # Photos that a scanner took lie in its file, with their poses.
-        inside = [replace(scan, said="the photos in it") for scan in own_photos]
+        inside = [replace(scan, summary="the photos in it") for scan in own_photos]
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
-            by_kind.setdefault("cameras", [replace(inside[0], said="the poses of its photos")])
+            by_kind.setdefault("cameras", [replace(inside[0], summary="the poses of its photos")])
     return _Drafting(by_kind=by_kind, target=target, recipe=chosen).draft()
 
 
@@ -435,11 +437,11 @@ class _Drafting:
             if kind == "unknown":
                 reasons: dict[str, list[str]] = {}
                 for item in items:
-                    reasons.setdefault(item.said, []).append(item.path.name)
+                    reasons.setdefault(item.summary, []).append(item.path.name)
                 left_out += [f"{_some(each)}: {reason}" for reason, each in reasons.items()]
             elif kind not in names:
                 left_out += [
-                    f"{item.path.name}: {item.said}; {self.recipe} has no input for it"
+                    f"{item.path.name}: {item.summary}; {self.recipe} has no input for it"
                     for item in items
                 ]
             elif len(items) > 1 and not takes_many:
@@ -468,12 +470,12 @@ class _Drafting:
         return Path(os.path.relpath(place, here)).as_posix()
 
     def _heading(self, start: str, described: Mapping[str, str], left_out: Sequence[str]) -> str:
-        said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
-        said += [f"#   {name}: {text}" for name, text in described.items()]
-        said += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
-        said += [f"# Note: {text}" for text in self._advice[:_MOST_LISTED]]
+        summary = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
+        summary += [f"#   {name}: {text}" for name, text in described.items()]
+        summary += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
+        summary += [f"# Note: {text}" for text in self._advice[:_MOST_LISTED]]
         run = shlex.quote(self.target.name)
-        said += [
+        summary += [
             "#",
             f"#   orthoflow check {run}       is anything wrong with it?",
             f"#   orthoflow plan {run}        what would run",
@@ -484,7 +486,7 @@ class _Drafting:
         ]
         paragraphs = start.rstrip("\n").split("\n#\n")
         kept = [text for text in paragraphs if not text.startswith(_NOT_OWN)]
-        return "\n".join(map(_seen, said)) + "\n" + "\n#\n".join(kept) + "\n"
+        return "\n".join(map(_seen, summary)) + "\n" + "\n#\n".join(kept) + "\n"
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
@@ -507,7 +509,7 @@ def _holds_photos_only(folder: Path) -> bool:
 def _described(items: Sequence[Recognised]) -> str:
     """What some files are, in one line."""
     if len(items) == 1:
-        return f"{_word(items[0].path.name)}, {items[0].said}"
+        return f"{_word(items[0].path.name)}, {items[0].summary}"
     n_photos = sum(item.n_photos for item in items)
     if n_photos == len(items):
         lenses = Counter(item.lens for item in items if item.lens)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.foreign_code import UserInterrupt, foreign_code
+from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.files.yaml_positions import describe_scalar
@@ -368,7 +368,7 @@ def _resolved(
         return {}
     resolved: dict[str, JsonValue] = {}
     try:
-        with foreign_code(f"checking the parameters of {info.id}"):
+        with guarded(f"checking the parameters of {info.id}"):
             params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
             resolved = params.model_dump(mode="json")
             # As the step will: a default may be refused once it is given like any other value.
@@ -645,11 +645,11 @@ def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) 
     each = room // len(parameters)
     short = [name.lower()[:each].rstrip("_-") for name in parameters]
     is_plain = all(re.fullmatch(r"[a-z][a-z0-9_-]*", name) for name in short)
-    is_told = all(
+    is_readable = all(
         len(cut) >= min(_MIN_LETTERS, len(name))
         for cut, name in zip(short, parameters, strict=True)
     )
-    if all(all(row) for row in words) and is_plain and is_told and len({*short}) == len(short):
+    if all(all(row) for row in words) and is_plain and is_readable and len({*short}) == len(short):
         pairs = [zip(short, row, strict=True) for row in words]
         names = ["-".join([*head, *(f"{a}-{b}" for a, b in row)]) for row in pairs]
         if max(Counter(names).values()) == 1:

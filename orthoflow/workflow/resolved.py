@@ -71,7 +71,7 @@ _ResolvedName: TypeAlias = Annotated[str, AfterValidator(check_name)]
 
 
 class _Resolved(BaseModel):
-    """The form of a resolved workflow: whoever wrote the record may have written anything."""
+    """The form of a resolved workflow: the record may hold anything."""
 
     orthoflow: Literal[1]
     name: _ResolvedName
@@ -224,7 +224,7 @@ def _check_resolved_step(workflow: Workflow, step: WorkflowStep) -> None:
     if not step.variants or not (step.is_varied or len(step.variants) == 1):
         raise ValueError(f"step {step.name} has {len(step.variants)} variants")
     if not step.is_varied and step.variants[0].name:
-        raise ValueError(f"step {step.name} has a variant, and is said to have none")
+        raise ValueError(f"step {step.name} has a variant, but is stated to have none")
     for variant in step.variants if step.is_varied else ():
         check_name(variant.name)
     if len({variant.name for variant in step.variants}) != len(step.variants):

@@ -120,7 +120,7 @@ def validate(
         except ValidationError as error:
             details = error.errors(include_url=False)
         if is_first:
-            for one in _told_once(details):
+            for one in _once(details):
                 _report(model, one, log, location)
         is_first = False
         unfit = sorted({_unfit(data, one["loc"]) for one in details}, key=repr, reverse=True)
@@ -130,7 +130,7 @@ def validate(
             _remove(data, parts)
 
 
-def _told_once(details: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+def _once(details: Sequence[ErrorDetails]) -> list[ErrorDetails]:
     """Leave out what follows from another problem: a list that is short of the items in it."""
     locs = [one["loc"] for one in details]
     keys = [loc[:-1] for loc in locs if loc and loc[-1] == "[key]"]

@@ -146,7 +146,7 @@ def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> N
 
 
 def _tidy(schema: Any) -> None:
-    """Drop what tells an editor nothing: titles made of names, `null` as the absence of a key."""
+    """Drop what is of no use to an editor: titles made of names, `null` as the absence of a key."""
     if isinstance(schema, list):
         for item in schema:
             _tidy(item)

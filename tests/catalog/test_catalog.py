@@ -160,7 +160,7 @@ def test_a_plugin_that_loads_has_no_say_in_the_rest_of_the_program(
 def test_a_plugin_that_is_slow_to_load_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("orthoflow.catalog.foreign_code._SLOW_S", 0.05)
+    monkeypatch.setattr("orthoflow.catalog.guarding._SLOW_S", 0.05)
     wait = "import time; time.sleep(0.3)\n"
     text = wait + hooks(methods=method("plane.slow", "slow:B"))
     catalog = with_plugin("slowly", text, tmp_path, monkeypatch, slow=wait)
@@ -372,7 +372,7 @@ class Mine(Method):
         raise NotImplementedError
 """
 CHANGES = {
-    "other id": ('"plane.mine"', '"plane.yours"', "its class says id 'plane.yours'"),
+    "other id": ('"plane.mine"', '"plane.yours"', "the id of its class is 'plane.yours'"),
     "no Params": ("    Params = MethodParams\n", "", "Params must be a subclass of MethodParams"),
     "no Ports": ("class In(Ports):", "class In:", "its In must be a subclass of Ports"),
     "no Out": ("class Out(Ports):", "class Result(Ports):", "its Out must be a subclass of Ports"),
@@ -400,7 +400,7 @@ CHANGES = {
     "other output": (
         "labels: PointLabels",
         "labels: Planes",
-        "is labels in kind plane, but orthoflow.products.planes:Planes says type_name 'planes'",
+        "is labels in kind plane, but orthoflow.products.planes:Planes has type_name 'planes'",
     ),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
     "name lacks": ("class Mine(", "class Yours(", "_class has no Mine"),
@@ -525,7 +525,7 @@ def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.Monke
     publish = catalog.publisher("notes")
     assert publish is not None
     with pytest.raises(
-        PluginError, match=r"product type notes of press .* says type_name .planes."
+        PluginError, match=r"product type notes of press .* the type_name of .* is .planes."
     ):
         catalog.product_class("notes")
 

@@ -66,7 +66,7 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     # What is embedded once can be embedded again, with neither store nor files.
     shutil.rmtree(studio.folder / ".orthoflow")
     (studio.folder / "n.txt").unlink()
-    assert "sealed anew: sha256:" in done.output
+    assert "sealed again: sha256:" in done.output
     again = studio("export", "whole", "--embed", "-o", "twice")
     assert again.exit_code == 0
     seal = done.output.rpartition("sha256:")[2]

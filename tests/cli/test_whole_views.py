@@ -52,7 +52,7 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
         "",
         f"products: {tmp_path / 'products'}, 0 files",
         "",
-        f"whether all of it is as it was written, says `orthoflow verify {path}`",
+        f"`orthoflow verify {path}` checks that nothing changed since it was written",
     ]
     told = json.loads(said("show", path, "--json"))
     assert [cell["address"] for cell in told["cells"]] == ["cloud", wall, "ortho"]

@@ -152,7 +152,7 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     assert shown.splitlines()[-3:] == [
         "2 products: 2 identical",
         "",
-        f"whether all of it is as it was written, says {verify}",
+        f"{verify} check that nothing changed since it was written",
     ]
 
 

@@ -17,11 +17,11 @@ from orthoflow.report.browsing import (
     Fact,
     RunSummary,
     differing_facts,
+    distinct_facts,
     key_metrics,
     run_folders,
     summaries,
     told_apart,
-    told_facts,
 )
 from tests.report_runs import HeldRun, cell, metrics, record
 
@@ -130,7 +130,7 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     assert {name: told.metrics[name] for name in wanted} == wanted
     assert told.labels["check.rms_mm"] == told.labels["rms_mm"] == "points to the first plane, RMS"
     assert told.n_datasets == 0
-    assert told_facts([told])[folder] == {
+    assert distinct_facts([told])[folder] == {
         "seed": 1,
         "orthoflow": "orthoflow 0.1.0",
         "input scan": ["hall.laz 01234567", "b.laz 01234567"],
@@ -164,7 +164,7 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     summary = module._of_run(tmp_path, run)
     assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
     assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
-    facts, labels = told_facts([summary])[tmp_path], summary.labels
+    facts, labels = distinct_facts([summary])[tmp_path], summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "points to the first plane, RMS"
     assert {name: facts[name] for name in facts if name.endswith("tries")} == {
         "check@data=hall.tries": 0,
@@ -276,7 +276,7 @@ def test_what_was_changed_once_is_named_once_and_as_it_is_set(
     first, second = compared(tmp_path / "a"), compared(tmp_path / "b", **changed)
     assert list(differing_facts([first, second]).values()) == [of_first, of_second]
     # Among all that is told each parameter stands once, too.
-    told = told_facts([first, second])[second.folder]
+    told = distinct_facts([first, second])[second.folder]
     is_of_one = any(name.count(".") == 2 for name in of_second)
     variants = ("plane.hough", "plane.ransac") if is_of_one else ("plane",)
     wanted = {f"{name}.tol_m": 0.05 for name in variants} | {"wall.gsd_m": 0.01} | of_second

@@ -20,7 +20,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, unwritten, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
-from orthoflow.workflow.checks import doubts_about
+from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from tests.long_loops import IS_LONG
@@ -133,7 +133,7 @@ def test_a_new_kind_brings_its_product_and_passes_the_suite(
     cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == project.kind]
     assert [cell.params["factor"] for cell in cells] == [1.0, 2.0]
     assert [cell.skip_reason for cell in cells] == ["", ""]
-    assert doubts_about(workflow) == ()
+    assert lint_workflow(workflow) == ()
 
 
 def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
@@ -155,7 +155,7 @@ def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
         cells = [one for one in expand_cells(workflow, catalog) if one.step == project.kind]
         assert project.method_id in {one.method for one in cells}
         assert [one.skip_reason for one in cells] == ["", ""]
-        assert doubts_about(workflow) == ()
+        assert lint_workflow(workflow) == ()
     then_steps = YAML(typ="safe").load((tmp_path / "then-own" / "compare.yaml").read_text())[
         "steps"
     ]

@@ -228,7 +228,7 @@ def test_without_ties_no_photo_is_oriented() -> None:
         asked.append(ties)
         raise OrthoflowError("no ties")
 
-    checks.missing_ties_are_told(without_ties(refuses))
+    checks.missing_ties_are_reported(without_ties(refuses))
     # All columns are as empty as each other.
     columns = [getattr(asked[0], field.name) for field in fields(Ties)]
     assert {len(column) for column in columns if isinstance(column, np.ndarray)} == {0}
@@ -237,9 +237,9 @@ def test_without_ties_no_photo_is_oriented() -> None:
     )
     run = SimpleNamespace(outputs={"cameras": found})
     with pytest.raises(AssertionError, match=r"without any ties b\.png was oriented all the same"):
-        checks.missing_ties_are_told(without_ties(lambda _: run))
+        checks.missing_ties_are_reported(without_ties(lambda _: run))
     lost = SimpleNamespace(outputs={"cameras": Cameras(cameras=found.cameras[:1])})
-    checks.missing_ties_are_told(without_ties(lambda _: lost))
+    checks.missing_ties_are_reported(without_ties(lambda _: lost))
 
 
 def test_a_cloud_with_a_huge_coordinate_has_one_in_its_middle() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.workflow.checks import doubts_about
+from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.model import (
     Reference,
     StepVariant,
@@ -41,7 +41,7 @@ def test_cells_that_cannot_be_meant_are_told(
     gsd_m: str, said: str, catalog: Catalog, tmp_path: Path
 ) -> None:
     text = GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}")
-    assert doubts_about(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
+    assert lint_workflow(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
 
 
 @pytest.mark.parametrize("step", ["ties", "colours"])
@@ -66,20 +66,20 @@ def test_a_crop_is_doubted_where_photos_are_matched_to_it(step: str) -> None:
         inputs={"cameras": WorkflowInputSpec(name="cameras")},
         steps={one.name: one for one in steps},
     )
-    told = doubts_about(flow)
+    told = lint_workflow(flow)
     assert len(told) == (step == "ties")
     assert all(text.startswith("wall.crop leaves ties less to match photos to: ") for text in told)
     # Who hands cameras on has done what it says.
     given = {"cameras": WorkflowInputSpec(name="cameras", files=("cameras.json",))}
-    assert doubts_about(replace(flow, inputs=given)) == ()
+    assert lint_workflow(replace(flow, inputs=given)) == ()
 
 
 def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:
     text = GOOD.replace("{gsd_m: 1}", "{gsd_m: 0.01}")
     more = text.replace("inputs:\n", "inputs:\n  other: {optional: true}\n")
-    assert doubts_about(load(more, tmp_path / "flow.yaml", catalog)) == (
+    assert lint_workflow(load(more, tmp_path / "flow.yaml", catalog)) == (
         "no step takes the input other: wire it as inputs.other, or remove it",
     )
     # One that only says whether a step runs is of use.
     asked = more.replace("wall:   {use", "wall:   {unless: inputs.other, use")
-    assert doubts_about(load(asked, tmp_path / "flow.yaml", catalog)) == ()
+    assert lint_workflow(load(asked, tmp_path / "flow.yaml", catalog)) == ()

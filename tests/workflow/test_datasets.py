@@ -10,7 +10,7 @@ import pytest
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
 from orthoflow.files.yaml_positions import Position, Table
-from orthoflow.workflow.checks import doubts_about
+from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
 from orthoflow.workflow.inputs import read_rows, resolve_input_files
@@ -532,12 +532,12 @@ def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path)
 @pytest.mark.usefixtures("folder")
 def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None:
     idle = load(ROOMS + "datasets: {hall: {}, attic: {}}\n", catalog)
-    assert doubts_about(idle) == (
+    assert lint_workflow(idle) == (
         "the datasets change nothing: they name no input that a step takes, and no parameter",
-        *doubts_about(load(ROOMS, catalog)),
+        *lint_workflow(load(ROOMS, catalog)),
     )
     coarse = load(ROOMS + "datasets: {hall: {set: {wall.gsd_m: 3}}, attic: {}}\n", catalog)
-    (said,) = set(doubts_about(coarse)) - set(doubts_about(load(ROOMS, catalog)))
+    (said,) = set(lint_workflow(coarse)) - set(lint_workflow(load(ROOMS, catalog)))
     assert said.startswith("wall.gsd_m of dataset hall is 3 m, which can hardly be meant")
 
 

@@ -241,13 +241,13 @@ def test_photos_are_told_by_their_lenses(data: Path) -> None:
 # --- drafts by themselves ---
 
 
-def found(kind: str, name: str, said: str = "something", n_photos: int = 0) -> Recognised:
+def found(kind: str, name: str, summary: str = "something", n_photos: int = 0) -> Recognised:
     posed = n_photos if kind == "scan" else 0
     fields = frozenset(["rgb"] if kind == "scan" else [])
     return Recognised(
         kind=kind,  # type: ignore[arg-type]
         path=Path(name),
-        said=said,
+        summary=summary,
         n_photos=n_photos,
         n_posed=posed,
         fields=fields,
@@ -309,7 +309,7 @@ def test_what_is_wrong_in_the_same_way_is_said_once() -> None:
 
 
 def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None:
-    image = Recognised(kind="other", path=tmp_path / "wall.tif", said="an orthoimage")
+    image = Recognised(kind="other", path=tmp_path / "wall.tif", summary="an orthoimage")
     photos = [found("scan", "hall.laz"), found("photos", "a.jpg", "a photo", 1)]
     text = draft_workflow([*photos, image], tmp_path / "w.yaml", None).text
     assert "    files:\n      - wall.tif\n      - wall.json\n" in text
@@ -346,7 +346,7 @@ def test_a_file_is_what_is_in_it(
     tmp_path: Path, name: str, content: str, kind: str, said: str, n_photos: int
 ) -> None:
     found = one(tmp_path / name, content)
-    assert (found.kind, found.said, found.n_photos) == (kind, said, n_photos)
+    assert (found.kind, found.summary, found.n_photos) == (kind, said, n_photos)
     assert found.fields == frozenset()
 
 
@@ -354,10 +354,10 @@ def test_numbers_in_rows_are_a_scan_and_not_points_with_names(tmp_path: Path) ->
     rows = "\n".join(f"{k}.25 {k} {k}.5 {k}" for k in range(20))
     found = one(tmp_path / "cloud.xyz", rows)
     assert found.kind == "scan"
-    assert found.said.startswith("text, ")
+    assert found.summary.startswith("text, ")
     # A single name among them makes it a list.
     named = one(tmp_path / "list.csv", "1.5,1,2,3\nP1,1,2,3\n")
-    assert (named.kind, named.said) == ("checkpoints", "2 surveyed points")
+    assert (named.kind, named.summary) == ("checkpoints", "2 surveyed points")
     assert one(tmp_path / "words.txt", "nothing but words\n").kind == "unknown"
 
 
@@ -368,7 +368,7 @@ def test_a_scan_says_how_many_points_it_has_and_what_of_each(tmp_path: Path) -> 
     cloud.write(str(tmp_path / "hall.las"))
     (found,) = recognised([tmp_path / "hall.las"])
     assert (found.kind, found.n_photos) == ("scan", 0)
-    assert found.said == "LAS/LAZ, 1,500 points, colours, nothing in its fields for intensity"
+    assert found.summary == "LAS/LAZ, 1,500 points, colours, nothing in its fields for intensity"
     assert found.fields == {"rgb"}
 
 
@@ -377,24 +377,24 @@ def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> N
     assert alone.kind == "photos"
     (tmp_path / "wall.json").write_text("{}")
     (beside,) = recognised([tmp_path / "wall.tif"])
-    assert (beside.kind, beside.said) == ("other", "an orthoimage with its frame beside it")
+    assert (beside.kind, beside.summary) == ("other", "an orthoimage with its frame beside it")
 
 
 def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) -> None:
     text = f"{REALITYCAPTURE}a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n"
     found = one(tmp_path / "cameras.csv", text)
-    assert (found.kind, found.said) == ("cameras", "1 cameras")
+    assert (found.kind, found.summary) == ("cameras", "1 cameras")
     assert one(tmp_path / "cameras.txt", text).kind == "unknown"
 
 
 def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
     broken = one(tmp_path / "lens.yaml", "cameras: {a.jpg: {width: x}, b.jpg: {}}")
     assert broken.kind == "unknown"
-    assert "\n" not in broken.said
-    assert "lens.yaml" in broken.said
+    assert "\n" not in broken.summary
+    assert "lens.yaml" in broken.summary
     cameras = one(tmp_path / "cameras.json", json.dumps({"cameras": 5}))
     assert cameras.kind == "unknown"
-    assert "cameras.json" in cameras.said
+    assert "cameras.json" in cameras.summary
 
 
 @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ def test_a_faulty_table_says_what_is_wrong_with_it_and_not_that_it_is_no_scan(
 ) -> None:
     found = one(tmp_path / name, content)
     assert found.kind == "unknown"
-    assert said in found.said
+    assert said in found.summary
 
 
 def names(paths: list[Path], root: Path) -> list[str]:
@@ -452,7 +452,7 @@ def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:
     for name in ("run.h5", "sheet.png", "figures/plan.png"):
         (run / name).touch()
     (tmp_path / "photo.jpg").touch()
-    found = {one.path: (one.kind, one.said) for one in recognised([tmp_path])}
+    found = {one.path: (one.kind, one.summary) for one in recognised([tmp_path])}
     assert found == {
         tmp_path / "photo.jpg": ("photos", "a photo"),
         run: ("unknown", "a folder of results"),
@@ -469,7 +469,7 @@ def test_a_model_of_cameras_is_one_thing(tmp_path: Path) -> None:
     (model / "deeper").mkdir()
     (model / "deeper" / "c.jpg").touch()
     (found,) = recognised([tmp_path])
-    assert (found.kind, found.path, found.said) == ("cameras", model, "2 cameras")
+    assert (found.kind, found.path, found.summary) == ("cameras", model, "2 cameras")
     # With one of the two files it is a folder like any.
     (model / "images.txt").unlink()
     assert len(recognised([tmp_path])) == 2

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from orthoflow.cli.commands import say_error
+from orthoflow.cli.commands import echo_error
 from orthoflow.errors import ArgumentError, StoreError
 from orthoflow.foreign_text import first_few
 
@@ -79,7 +79,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     *others, last = found
     if others:
         few = first_few(others, most=_MOST_NAMED)
-        say_error(f"note: the {named} of {last}; --step takes others: {few}")
+        echo_error(f"note: the {named} of {last}; --step takes others: {few}")
     return last, found[last]
 
 

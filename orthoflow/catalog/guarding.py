@@ -1,4 +1,4 @@
-"""Running strangers' code in this process while it loads: named when slow, without a say here.
+"""Running third-party code while it loads: reported when slow, kept from side effects.
 
 Light on purpose, as all of the catalog.
 """
@@ -26,12 +26,12 @@ class UserInterrupt(KeyboardInterrupt):
 
 
 @contextmanager
-def foreign_code(what: str) -> Iterator[None]:
+def guarded(what: str) -> Iterator[None]:
     """Keep what the code inside does from the rest of the program.
 
     What it prints goes to standard error, the working directory and the limit of recursion stay,
-    and where it ends the process at once it raises `SystemExit` instead. After 3 s the user is told
-    what is slow.
+    and where it ends the process at once it raises `SystemExit` instead. After 3 s a line on
+    standard error names what is slow.
 
     Args:
         what: as the sentence about it begins, e.g. `method plane.mine of mine 1.0`.
@@ -40,7 +40,7 @@ def foreign_code(what: str) -> Iterator[None]:
         UserInterrupt: the user pressed Ctrl-C.
         PluginError: it lowered the limit of recursion.
     """
-    watch = threading.Timer(_SLOW_S, _say_slow, [what])
+    watch = threading.Timer(_SLOW_S, _report_slow, [what])
     watch.daemon = True
     watch.start()
     limit = sys.getrecursionlimit()
@@ -65,7 +65,7 @@ def foreign_code(what: str) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_marked() -> Iterator[None]:
-    """Raise `UserInterrupt` on Ctrl-C, which plain code can tell from its own."""
+    """Raise `UserInterrupt` on Ctrl-C, unlike a `KeyboardInterrupt` that a plugin raises."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler or threading.current_thread() is not (
         threading.main_thread()
@@ -89,7 +89,7 @@ def _exits_refused() -> Iterator[None]:
     is_over = False
 
     def refuse(status: int) -> NoReturn:
-        # Somebody may have taken it along, and a forked process may do as it likes.
+        # The function may outlive this block, and a forked process may end as it likes.
         if is_over or os.getpid() != process:
             real(status)
         raise SystemExit(status)
@@ -102,7 +102,7 @@ def _exits_refused() -> Iterator[None]:
         os._exit = real
 
 
-def _say_slow(what: str) -> None:
+def _report_slow(what: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         sys.stderr.write(f"{what} is slow to load: waiting for it\n")
         sys.stderr.flush()
