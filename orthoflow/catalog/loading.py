@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Iterator, Mapping
-from functools import cache
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
@@ -126,7 +125,6 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
 
-@cache
 def product_complaint(cls: type[Product]) -> str:
     """State which name in the class of a product is none of its fields; empty when all are."""
     if not hasattr(cls, "__dataclass_fields__"):

@@ -64,8 +64,8 @@ def run(
             variant of each value; arrays are as good as lists.
         inputs: files by name of the input.
         datasets: a table of datasets, a CSV file; or what a workflow would state,
-            `{"hall": {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a list of paths,
-            from the working directory.
+            `{"hall": {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a
+            list of paths, from the working directory.
         only_data: of these datasets only.
         output: folder of the run; `runs/<name>-<run id>` without one.
         store: folder of stored results.

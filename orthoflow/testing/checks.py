@@ -140,7 +140,7 @@ def no_covariance_is_zero(subject: Subject) -> None:
         for name, covariance in stated:
             require(
                 covariance is None or bool(np.any(covariance)),
-                f"the covariance of {name} is zero, which means that it is known without error: put "
+                f"the covariance of {name} is zero, which means that it is without error: put "
                 "in what your fit states; `orthoflow plugins new` writes that of least squares for "
                 "a plane, and of a camera it may be left out",
             )
