@@ -2,10 +2,10 @@
 
 The bits of a result depend on more than the method: on the processor and on the version of every
 library that computes. So the file keeps the digest, which must come again where it was recorded,
-and a sample of the numbers, which must come again anywhere within the tolerances of the product types.
-Numbers that a product states about itself have no tolerance, and a share over few cells may move by
-any amount with the last bits of what goes in. So they are held to the file where the same bits go
-in: give a method inputs that no other method computed.
+and a sample of the numbers, which must come again anywhere within the tolerances of the product
+types. Numbers that a product states about itself have no tolerance, and a share over few cells may
+move by any amount with the last bits of what goes in. So they are held to the file where the same
+bits go in: give a method inputs that no other method computed.
 """
 
 from __future__ import annotations
