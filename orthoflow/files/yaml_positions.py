@@ -289,6 +289,7 @@ def _reader_position(text: str, error: YAMLError) -> Position:
     return Position(line=before.count("\n") + 1, column=len(before) - before.rfind("\n"))
 
 
+_GLUED: Final = re.compile(r" *[\w-]+:(?=\w)")
 _OPENED: Final = {
     "while parsing a flow mapping": "the brace { that opens here is not closed",
     "while parsing a flow sequence": "the bracket [ that opens here is not closed",
@@ -306,6 +307,11 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
     if re.search(r":[\[{]$", text[: stumbled + 1]):
         return _UnreadableError(noticed, "this is not YAML: put a space behind the colon")
+    # `key:value` above is text, which cannot be followed by another key.
+    above = noticed.line - 1
+    if "mapping values" in problem and (glued := _GLUED.match(text.splitlines()[above - 1])):
+        position = Position(line=above, column=glued.end())
+        return _UnreadableError(position, "this is not YAML: put a space behind the colon")
     if context in _OPENED and error.context_mark is not None:
         opened = _mark_position(error.context_mark)
         where = f"noticed in line {noticed.line}"

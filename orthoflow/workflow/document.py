@@ -327,7 +327,7 @@ class _Reader:
         return tuple(calls)
 
     def _call(self, name: str, call: CallSection, location: Location) -> DraftCall:
-        if self.log.value((*location, "use")) is None:
+        if as_plain(self.log.value((*location, "use"))) is None:
             message = "needs the key use, a method such as plane.hough2d"
             self.log.report(location, message, at_key=True)
         kind = self.catalog.kinds.get((call.use or "").partition(".")[0])

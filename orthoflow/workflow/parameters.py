@@ -420,8 +420,26 @@ class _Reporter:
             if form := self._other_form(str(first[0]) if first else "", several):
                 self._report(first, form)
                 continue
+            # Each alternative of a type reports what it would take.
+            places: dict[Location, list[ErrorDetails]] = {}
             for details in several:
-                self._report(details["loc"], self._message(details))
+                places.setdefault(self._location(details), []).append(details)
+            for location, alternatives in places.items():
+                self._report(location, self._message(alternatives, location))
+
+    def _location(self, details: ErrorDetails) -> Location:
+        """Where in the parameters an error is, without pydantic's names of alternative types."""
+        here: JsonValue = dict(self.as_set)
+        location: Location = ()
+        for part in details["loc"]:
+            if isinstance(here, dict) and part in here:
+                here = here[str(part)]
+            elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+                here = here[part]
+            elif details["type"] != "missing" or part != details["loc"][-1]:
+                continue
+            location = (*location, part)
+        return location
 
     def _other_form(self, name: str, errors: Sequence[ErrorDetails]) -> str:
         """Return how a parameter is written whose value has another form, else nothing."""
@@ -451,8 +469,8 @@ class _Reporter:
         else:
             self.log.report(here, message, at_key=bool(loc))
 
-    def _message(self, details: ErrorDetails) -> str:
-        location = details["loc"]
+    def _message(self, alternatives: Sequence[ErrorDetails], location: Location) -> str:
+        details = alternatives[0]
         name = str(location[-1]) if location else ""
         match details["type"]:
             case "extra_forbidden":
@@ -466,7 +484,10 @@ class _Reporter:
                 return f"{self.info.id} needs parameter {name}"
             case "value_error" | "assertion_error":
                 return str(details.get("ctx", {}).get("error", details["msg"]))
-        words = details["msg"][:1].lower() + details["msg"][1:]
+        texts = dict.fromkeys(one["msg"].removeprefix("Input should be ") for one in alternatives)
+        words = f"input should be {' or '.join(texts)}"
+        if not details["msg"].startswith("Input should be "):
+            words = details["msg"][:1].lower() + details["msg"][1:]
         given = details["input"]
         meant = meant_number(name, given) if "number" in words else ""
         if len(location) == 1 and details["type"].endswith(("_type", "enum", "literal_error")):

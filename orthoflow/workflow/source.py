@@ -66,7 +66,11 @@ def find_workflow(name_or_path: str | Path) -> Path:
         WorkflowError: there is neither.
     """
     path = Path(name_or_path)
-    return path if path.is_file() else shipped_workflow(str(name_or_path))
+    if path.is_file():
+        return path
+    if path.exists() and path.parent != Path():
+        raise WorkflowError(f"{path} is a folder or a device; give a workflow file")
+    return shipped_workflow(str(name_or_path))
 
 
 def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_BYTES) -> str:
@@ -177,7 +181,8 @@ def _report(
         name = str(loc[-1])
         log.report(
             here,
-            f"unknown key {name}{did_you_mean(name, known)}; known here: {', '.join(known)}",
+            f"unknown key {name}{did_you_mean(name, known)}; known here: {', '.join(known)}"
+            f"{'; parameters of the method belong into params' if 'params' in known else ''}",
             at_key=True,
         )
         return

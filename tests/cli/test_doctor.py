@@ -159,7 +159,7 @@ def test_little_memory_is_told(
     assert (unknown.verdict, unknown.found, unknown.cost) == (
         "limited",
         "unknown",
-        "cannot be told",
+        "cannot be measured",
     )
 
 

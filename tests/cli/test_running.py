@@ -382,7 +382,7 @@ def test_report_writes_one_page_for_several_runs(finished: tuple[Path, str, str]
     folder = finished[0]
     refused = orthoflow(folder, "report", "good", "good")
     assert refused.returncode == 2
-    assert "2 runs were given: say with -o FILE where their common report goes" in refused.stderr
+    assert "2 runs were given: give -o FILE, where their common report goes" in refused.stderr
     done = orthoflow(folder, "report", "good", "good", "-o", "both.html")
     assert (done.returncode, done.stdout) == (0, "report: both.html\n")
     assert (folder / "both.html").read_text(encoding="utf-8").startswith("<!")

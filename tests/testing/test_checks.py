@@ -201,7 +201,7 @@ class Demanding(MethodParams):
     ("params", "said"),
     [
         (Documented, ""),
-        (Vague, "parameter reach does not say its unit: end it with one of m, mm, m2, px"),
+        (Vague, "parameter reach does not state its unit: end it with one of m, mm, m2, px"),
         (
             Demanding,
             "^parameter reach_m has no default; parameter n_trials has no default; parameter n_t",
@@ -280,7 +280,7 @@ def test_refusing_without_a_word_is_no_refusal() -> None:
         ("results-repeat", {Finding, Guessing, Posing}),
         ("threads-do-not-show", {Finding, Posing}),
         ("empty-cloud-is-refused", {Finding, Guessing}),
-        ("missing-ties-are-told", {Posing}),
+        ("missing-ties-are-reported", {Posing}),
         ("planes-follow-a-rigid-motion", {Finding, Guessing}),
         ("poses-are-recovered", {Posing}),
         ("cells-show-their-own-place", set()),

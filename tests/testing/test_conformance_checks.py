@@ -86,7 +86,7 @@ class Floor(Method):
 CHEATS: dict[str, tuple[str, str, str]] = {
     "unitless": (
         "parameters-are-documented",
-        "parameter tolerance does not say its unit",
+        "parameter tolerance does not state its unit",
         """
         class Params(MethodParams):
             tolerance: float = Field(0.1, description="Near enough.")
@@ -121,7 +121,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "faultless": (
         "no-covariance-is-zero",
-        "the covariance of plane 0 is zero, which says that it is known without error: put in what",
+        "the covariance of plane 0 is zero, which means that it is without error: put in what",
         """
         def covariance(self):
             return np.zeros((1, 4, 4))

@@ -53,6 +53,11 @@ CASES = {
         "steps.x.params.normal[2]",
         'input should be a valid number, got the text "up"',
     ),
+    "none of several types": (
+        "x: {use: plane.ransac, in: {cloud: cloud.cloud}, params: {tolerance_m: yes}}",
+        "steps.x.params.tolerance_m",
+        "input should be a valid number or 'auto', got the text \"yes\"",
+    ),
     "list instead of a number": (
         STEP % ", params: {cell_m: [0.02]}",
         "steps.x.params.cell_m",
@@ -108,6 +113,12 @@ CASES = {
         STEP % ", unless: inputs.scam",
         "steps.x.unless",
         "there is no input scam (did you mean scan?)",
+    ),
+    "use without a value": ("x: {use: , in: {cloud: cloud.cloud}}", "steps.x", "needs the key use"),
+    "parameter beside the others": (
+        "x: {use: plane.hough2d, in: {cloud: cloud.cloud}, cell_m: 1}",
+        "steps.x.cell_m",
+        "timeout, in, if, unless, variants; parameters of the method belong into params",
     ),
     "no use": ("x: {in: {cloud: cloud.cloud}}", "steps.x", "needs the key use"),
     "use is no text": ("x: {use: 3}", "steps.x.use", "expected a text, got 3"),
@@ -353,6 +364,11 @@ def test_a_step_that_cannot_be_read_does_not_bring_problems_of_its_users(
 UNREADABLE = {
     "unclosed bracket": ("steps: [1", 1, "this is not YAML: the bracket [ that opens"),
     "tab": ("orthoflow: 1\n\tsteps: 2\n", 2, "this is not YAML: a tab stands here; indent"),
+    "no space behind a colon": (
+        "steps:\n  x:\n    use:plane.hough2d\n    in: {cloud: cloud.cloud}\n",
+        3,
+        "this is not YAML: put a space behind the colon",
+    ),
     "undefined alias": ("steps: *nothing\n", 1, "this is not YAML: found undefined alias"),
     "two documents": ("a: 1\n---\nb: 2\n", 2, "expected a single document"),
     "control character": ("orthoflow: 1\nname: a\x01\n", 2, "this is not YAML: unacceptable"),

@@ -116,7 +116,7 @@ CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
     "no variants": (lambda d: _first(d, "steps").update(variants=[]), "has 0 variants"),
     "a hidden variant": (
         lambda d: _first(d, "steps")["variants"][0].update(name="other"),
-        "has a variant, and is said to have none",
+        "has a variant, but is stated to have none",
     ),
     "a method that is a list": (
         lambda d: _first(d, "steps")["variants"][0].update(use=["a"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -99,7 +99,9 @@ class Ransac(Idle):
     determinism = "seeded"
 
     class Params(MethodParams):
-        tolerance_m: float = Field(0.05, gt=0, description="Distance that counts as on the plane.")
+        tolerance_m: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
+            0.05, description="Distance that counts as on the plane."
+        )
         iterations: int = Field(2000, ge=1, description="Trials.")
 
     class In(Ports):
