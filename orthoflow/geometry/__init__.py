@@ -1,4 +1,4 @@
-"""Planes, directions and raster frames: arithmetic on arrays, no files, no clocks."""
+"""Planes, directions and raster frames: pure array arithmetic, without files or clocks."""
 
 from orthoflow.geometry.directions import UpDirection, basis_from_up, up_vector
 from orthoflow.geometry.frames import WallFrame, frame_over, wall_axes

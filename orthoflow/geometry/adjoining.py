@@ -1,4 +1,4 @@
-"""Where planes of a room meet: lines between two of them, corners between three."""
+"""Intersections of the planes of a room: lines between two of them, corners between three."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.planes import Plane
 
-# Rectangles of points end before a corner that furniture hides, and reach past one at a reveal.
+# Rectangles of points end before a corner that furniture hides, and extend past one at a reveal.
 REACH_M: Final = 0.3
 SHORTEST_M: Final = 0.1
-# Planes that are nearer to parallel meet somewhere, but their line is not known well.
+# The intersection of planes that are closer to parallel is poorly determined.
 _LEAST_ANGLE_DEG: Final = 20.0
 
 Interval = tuple[float, float]
@@ -24,7 +24,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """A plane, and where it is known.
+    """A plane and the region where it was measured.
 
     Attributes:
         plane: it.
@@ -37,11 +37,11 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Edge:
-    """A piece of the line in which two planes meet.
+    """A segment of the line in which two planes intersect.
 
     Attributes:
         first: index of one plane.
-        second: index of the other, larger.
+        second: index of the other, larger plane.
         ends_world: (2, 3) metres.
     """
 
@@ -57,10 +57,10 @@ class Edge:
 
 @dataclass(frozen=True, kw_only=True)
 class Corner:
-    """A point in which three planes meet.
+    """A point in which three planes intersect.
 
     Attributes:
-        planes: their indices, rising.
+        planes: their indices, ascending.
         point_world: (3,) metres.
     """
 
@@ -69,9 +69,9 @@ class Corner:
 
 
 def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The line in which two planes meet: the point (3,) nearest to the origin, and its direction.
+    """Return the intersection line of two planes: its point (3,) nearest the origin, its direction.
 
-    None for planes that are nearly parallel.
+    None for nearly parallel planes.
     """
     direction = np.cross(first.normal, second.normal)
     size = float(np.linalg.norm(direction))
@@ -84,20 +84,20 @@ def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> tuple[Edge, ...]:
-    """Pieces of the lines along which planes adjoin.
+    """Return the segments of the lines along which planes adjoin.
 
-    A piece is where both planes are known within a distance of the line.
+    A segment is where both planes were measured within `reach_m` of the line.
 
     Args:
         surfaces: planes with their rectangles.
-        reach_m: that distance.
+        reach_m: maximum distance from the line.
     """
     found = []
     for (i, first), (j, second) in combinations(enumerate(surfaces), 2):
         line = line_of(first.plane, second.plane)
         if line is None:
             continue
-        # From a point near both, so that survey coordinates lose nothing.
+        # Solve about a point near both planes, so that survey coordinates lose no precision.
         point, direction = line
         middle = first.rectangles_world.mean(axis=(0, 1))
         start = point + ((middle - point) @ direction) * direction
@@ -112,7 +112,7 @@ def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> t
 def corners_between(
     surfaces: Sequence[Surface], edges: Sequence[Edge], *, reach_m: float = REACH_M
 ) -> tuple[Corner, ...]:
-    """Points in which three planes meet that adjoin each other there."""
+    """Return the points in which three planes that adjoin there intersect."""
     by_pair: dict[tuple[int, int], list[Edge]] = {}
     for edge in edges:
         by_pair.setdefault((edge.first, edge.second), []).append(edge)
@@ -128,7 +128,7 @@ def corners_between(
     normals = np.array([surface.plane.normal for surface in surfaces])[at]
     offsets = np.array([surface.plane.offset_m for surface in surfaces])[at]
     meet = np.abs(np.linalg.det(normals)) >= math.sin(math.radians(_LEAST_ANGLE_DEG)) ** 2
-    # About a point nearby, so that survey coordinates lose nothing.
+    # Solve about a nearby point, so that survey coordinates lose no precision.
     middles = np.array([surface.rectangles_world.mean(axis=(0, 1)) for surface in surfaces])
     near = middles[at[meet, 0]]
     rest = offsets[meet] - np.einsum("nij,nj->ni", normals[meet], near)
@@ -144,11 +144,11 @@ def corners_between(
 def _spans(
     surface: Surface, start: NDArray[np.float64], direction: NDArray[np.float64], reach_m: float
 ) -> list[Interval]:
-    """Where along a line a surface is known near it: separate intervals, rising."""
+    """Return the intervals of a line near which a surface was measured: disjoint, ascending."""
     relative = surface.rectangles_world - start
     along = relative @ direction
     aside = relative @ np.cross(surface.plane.normal, direction)
-    # What lies within reach of the line has its corners there, and where its sides cross the limit.
+    # The part within reach of the line has its corners there and where its sides cross the limit.
     places = [np.where(np.abs(aside) <= reach_m, along, np.nan)]
     over = np.roll(aside, -1, axis=1) - aside
     for limit in (-reach_m, reach_m):
@@ -180,7 +180,7 @@ def _common(first: list[Interval], second: list[Interval]) -> Iterator[Interval]
 
 
 def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
-    """Distance of a point from a piece of a line."""
+    """Return the distance of a point from a line segment."""
     begin, end = edge.ends_world
     along = float(np.clip((point - begin) @ (end - begin) / edge.length_m**2, 0.0, 1.0))
     return float(np.linalg.norm(point - begin - along * (end - begin)))

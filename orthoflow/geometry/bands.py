@@ -1,4 +1,4 @@
-"""Rasters cut into bands of rows: a large one lies in a file and never wholly in memory."""
+"""Rasters processed in bands of rows: a large raster is in a file and never wholly in memory."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-# Name, shape, type -> zeroed array, in a file that is mapped into memory where it is large.
+# Name, shape, type -> zeroed array, in a memory-mapped file if it is large.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
-# Finished rasters of more cells lie in files: a site has many walls.
+# Finished rasters with more cells are kept in files, because a site has many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
-# What is made of a band for a moment takes some 16 MB a byte.
+# Temporary arrays of a band take about 16 MB per byte of a cell.
 _BAND_CELLS: Final = 1 << 24
 
 
@@ -28,11 +28,11 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
     """Cut a raster into bands of rows.
 
     Args:
-        shape: rows, columns, and what else a cell holds.
-        multiple: all bands but the last have a multiple of so many rows.
+        shape: rows, columns, and further dimensions of a cell.
+        multiple: the height of all bands but the last is a multiple of this.
 
     Yields:
-        Rows of a band, from the top.
+        Yield the rows of each band, from the top.
     """
     height = max(1, _BAND_CELLS // max(1, shape[1]) // multiple) * multiple
     for first in range(0, shape[0], height):
@@ -41,11 +41,11 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """Some rows of a raster, and so many more about them as decide what becomes of them.
+    """A band of rows, and the rows around it that influence its result.
 
     Attributes:
-        rows: that the band is for.
-        around: these and a reach above and below, as far as there are rows.
+        rows: the rows of the band.
+        around: these rows and a margin above and below, clipped to the raster.
     """
 
     rows: slice
@@ -53,13 +53,13 @@ class Band:
 
     @property
     def inner(self) -> slice:
-        """Where `rows` are within `around`."""
+        """Return the position of `rows` within `around`."""
         first = self.rows.start - self.around.start
         return slice(first, first + self.rows.stop - self.rows.start)
 
 
 def bands_with_reach(shape: tuple[int, int], *, cells_most: int, reach_rows: int) -> Iterator[Band]:
-    """Cut a raster into bands of about equal height with at most so many cells, reach included."""
+    """Cut a raster into bands of about equal height, each of at most `n_cells` with its margin."""
     n_rows, n_columns = shape
     height = max(1, cells_most // max(1, n_columns) - 2 * reach_rows)
     height = -(-n_rows // -(-n_rows // height))
@@ -70,7 +70,7 @@ def bands_with_reach(shape: tuple[int, int], *, cells_most: int, reach_rows: int
 
 
 def count_cells(raster: NDArray[np.generic], value: int) -> int:
-    """How many cells of a raster (rows, cols) have a value."""
+    """Count the cells of a raster (rows, cols) that have a value."""
     return sum(int(np.count_nonzero(raster[rows] == value)) for rows in row_bands(raster.shape))
 
 
@@ -80,7 +80,7 @@ def holds_cells(raster: NDArray[np.generic], value: int) -> bool:
 
 
 def count_known(raster: NDArray[np.floating]) -> int:
-    """How many cells of a raster (rows, cols) are not NaN."""
+    """Count the cells of a raster (rows, cols) that are not NaN."""
     return sum(
         raster[rows].size - int(np.count_nonzero(np.isnan(raster[rows])))
         for rows in row_bands(raster.shape)

@@ -1,4 +1,4 @@
-"""Compiled projection through a distorted camera, shared by every step that looks through one."""
+"""Compiled projection through a camera with distortion, shared by all steps that project points."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ CAMERA_LENGTH = 25
 def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba infers the types
     """Project one world point: (u, v, depth); u and v are NaN behind the camera or beyond the lens.
 
-    Brown's model as OpenCV has it; pixels with the first centre at (0.5, 0.5). A point farther
-    off the axis than the radius at which the distortion polynomial turns back would appear inside
-    the image a second time, so it counts as not seen.
+    Brown's model as in OpenCV, but pixels have the first centre at (0.5, 0.5). A point farther from
+    the axis than the radius at which the distortion polynomial folds back would appear inside the
+    image a second time, so it counts as not visible.
     """
     xc = camera[0] * x + camera[1] * y + camera[2] * z + camera[9]
     yc = camera[3] * x + camera[4] * y + camera[5] * z + camera[10]
@@ -40,7 +40,7 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
 
 
 def largest_radius(distortion: NDArray[np.float64], *, limit: float = 10.0) -> float:
-    """Undistorted radius up to which radial distortion k1, k2, k3 grows steadily.
+    """Return the undistorted radius up to which radial distortion (k1, k2, k3) is monotonic.
 
     The derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is a cubic in r^2; its smallest positive
     root is where the lens model folds back.

@@ -1,4 +1,4 @@
-"""A camera with distortion: from world points to pixels, and from pixels to rays."""
+"""A camera with distortion: world points to pixels, and pixels to rays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow.errors import GeometryError
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
-# What lies no farther before the projection centre counts as behind the camera.
+# Points closer than this to the plane of the projection centre count as behind the camera.
 _NEAREST_M: Final = 1e-9
 _PROJECTED_AT_ONCE: Final = 1 << 15
 _UNTURNED: Final = np.eye(3)
@@ -49,7 +49,7 @@ class ViewingCamera:
     skew: float = 0.0
 
     def __post_init__(self) -> None:
-        # The other way round, so that NaN does not pass.
+        # Written as a negated comparison, so that NaN fails it.
         if not np.abs(self.rotation @ self.rotation.T - _UNTURNED).max() <= 1e-6:
             raise GeometryError("a camera's rotation must be orthonormal")
         if np.linalg.det(self.rotation) < 0.0:
@@ -57,12 +57,12 @@ class ViewingCamera:
 
     @property
     def centre_world(self) -> NDArray[np.float64]:
-        """Projection centre (3,) in metres."""
+        """Return the projection centre (3,) in metres."""
         return -self.rotation.T @ self.translation
 
     @cached_property
     def flat(self) -> NDArray[np.float64]:
-        """The camera as the compiled kernels take it, see `camera_kernels`."""
+        """Return the camera as the array that compiled kernels take, see `camera_kernels`."""
         from orthoflow.geometry.camera_kernels import largest_radius  # noqa: PLC0415 - numba
 
         return np.concatenate(
@@ -76,10 +76,10 @@ class ViewingCamera:
         )
 
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
-        """Return the same camera in a world whose origin is at (3,) of this one.
+        """Return the same camera in a world with its origin at `middle` (3,) of this one.
 
-        With survey coordinates of 10^6 m, project offsets through the shifted camera: the sum
-        R x + t of large numbers would lose what float32 offsets keep.
+        With survey coordinates of 10^6 m, project offsets through the shifted camera: the sum R x +
+        t of large numbers would lose the precision of float32 offsets.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
 
@@ -99,7 +99,7 @@ class ViewingCamera:
     def _project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (3, n); the formula of `camera_kernels.project_point`."""
         k1, k2, p1, p2, k3 = self.distortion
-        # Infinite and missing points end as NaN, without a word.
+        # Infinite and missing points become NaN without a warning.
         with np.errstate(all="ignore"):
             x, y, z = (
                 row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + shift
@@ -118,7 +118,7 @@ class ViewingCamera:
         return np.column_stack([u, v, z])
 
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which pixels (n, 2) lie inside the image; NaN does not."""
+        """Report which pixels (n, 2) lie inside the image; NaN does not."""
         u, v = pixels_photo[:, 0], pixels_photo[:, 1]
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
@@ -126,8 +126,8 @@ class ViewingCamera:
         """Directions (n, 3) with z = 1 in camera axes of pixels (n, 2).
 
         Raises:
-            GeometryError: the distortion cannot be undone there, e.g. beyond the fold of the lens
-                model.
+            GeometryError: the distortion cannot be undone there, e.g. beyond the radius where the
+                model folds back.
         """
         found = undistorted(*self.bent_rays(pixels_photo.T), self.distortion)
         if found.size and not np.abs(found[2]).max() < 1e-9:
@@ -140,7 +140,7 @@ class ViewingCamera:
     def bent_rays(
         self, pixels_photo: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Directions x / z and y / z of pixels (2, n) = (u, v), as the distortion has left them."""
+        """Return the distorted directions x / z and y / z of pixels (2, n) = (u, v)."""
         u, v = np.asarray(pixels_photo, dtype=np.float64)
         b = (v - self.cy) / self.fy
         return (u - self.cx - self.skew * b) / self.fx, b
@@ -158,12 +158,13 @@ def undistorted(
     """Undo a distortion by Newton steps.
 
     Args:
-        wanted_a: (n,) distorted x / z, NaN where there is none.
+        wanted_a: (n,) distorted x / z, NaN where missing.
         wanted_b: (n,) distorted y / z.
         distortion: (5,) k1, k2, p1, p2, k3.
 
     Returns:
-        (3, n) rows: x / z, y / z, and the last step, which is not small where there is no way back.
+        (3, n) rows: x / z, y / z, and the last step, which stays large where the distortion cannot
+        be undone.
     """
     k1, k2, p1, p2, k3 = distortion
     found = np.empty((3, len(wanted_a)))
@@ -196,10 +197,10 @@ def looking_at(
     target_world: NDArray[np.float64],
     up: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Rotation (3, 3) camera_from_world of a level camera at a point that looks at another.
+    """Return the rotation (3, 3) camera_from_world of a level camera aimed at a point.
 
     Raises:
-        GeometryError: the camera would look straight up or down, where level has no meaning.
+        GeometryError: the camera would look straight up or down, where level is undefined.
     """
     forward = target_world - centre_world
     forward = forward / np.linalg.norm(forward)

@@ -1,4 +1,4 @@
-"""Covariances that stay honest when observations err together."""
+"""Covariances that remain valid when observations have common errors."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Parts that are tried, each a sum of errors with these correlation lengths, as shares of the extent
-# of what a photo sees. What reaches far is taken up by the pose and leaves hardly a trace, but an
-# error of registration, of a path or of stereo does not end where residuals cease to show it.
+# The correlation lengths that are tried, as shares of the extent of what a photo sees. Long-range
+# errors are absorbed by the pose and leave almost no trace in the residuals, but errors of
+# registration, of a scanner path or of stereo do not end where residuals cease to show them.
 _PARTS: Final = ((0.03,), (0.1,), (0.25, 0.6, 1.2))
-# The products of all pairs of more points tell nothing new.
+# Products of pairs of more points add no information.
 _MAX_POINTS: Final = 280
 _MIN_POINTS: Final = 30
-# An error is shared where it is so many times as large as chance makes it of independent ones.
+# An error counts as common if it is this many times larger than chance makes it for independent
+# errors.
 _MIN_SIGNIFICANCE: Final = 5.0
-# Kinds of errors that explain the same but for so much are not told apart.
+# Kinds of errors whose explanations differ by less than this are not distinguished.
 _MIN_OWN_SHARE: Final = 0.02
 
 
@@ -31,17 +32,17 @@ def honest_covariance(
     *,
     sigma0: float,
 ) -> NDArray[np.float64]:
-    """Covariance that does not take points of one group as independent.
+    """Return a covariance that does not treat the points of a group as independent.
 
     The pose is adjusted, to first order, without each group in turn (delete-group jackknife: the
-    CR3 estimate of Bell & McCaffrey 2002). Where the poses differ by more than the residuals
-    explain, that is the covariance; nowhere is it smaller than what the residuals explain.
+    CR3 estimate of Bell & McCaffrey 2002). If these poses differ by more than the residuals
+    explain, their scatter is the covariance; it is never smaller than what the residuals explain.
 
     Args:
         jacobian: (n, 2, p) derivatives of each point's two observations, in standard deviations.
         residuals: (n, 2) observed - computed, in standard deviations.
         cofactors: (p, p) inverse of the normal matrix, prior included.
-        groups: (n,) group of each point, or None when all are independent.
+        groups: (n,) group of each point, or None if all are independent.
         sigma0: standard deviation of unit weight.
     """
     plain = sigma0**2 * cofactors
@@ -63,18 +64,18 @@ def honest_covariance(
 
 @dataclass(frozen=True, kw_only=True)
 class AdjustedPoints:
-    """Points of photos after their adjustment, whose places in the world may err together.
+    """Points of photos after their adjustment, whose world positions may have common errors.
 
     Attributes:
-        photo: (n,) which of the photos sees each.
+        photo: (n,) index of the photo that sees each point.
         places: (n, 3) metres.
         residuals: (n, 2) observed - computed, in standard deviations.
         jacobian: (n, 2, p) derivatives by the unknowns, in standard deviations.
         by_place: (n, 2, 3) derivatives by the place, standard deviations per metre.
-        pulls: (n, p, 3) of an error of the place on the normal equations, per metre.
-        towards: (n, 3) unit vectors out of the surface: what measures a cloud errs most in depth.
+        pulls: (n, p, 3) effect of an error of the position on the normal equations, per metre.
+        towards: (n, 3) unit vectors out of the surface: errors of a cloud are largest in depth.
         cofactors: (p, p) inverse of the normal matrix.
-        weight: for how many points of the adjustment each stands.
+        weight: number of points of the adjustment that each point represents.
     """
 
     photo: NDArray[np.intp]
@@ -88,7 +89,7 @@ class AdjustedPoints:
     weight: float = 1.0
 
     def thinned(self) -> AdjustedPoints:
-        """Return points spread evenly over all, as many as tell how they err together."""
+        """Return evenly spread points, as many as the estimate of common errors needs."""
         n_points = len(self.places)
         chosen = np.unique(np.linspace(0, n_points - 1, min(n_points, _MAX_POINTS)).astype(int))
         return AdjustedPoints(
@@ -105,7 +106,7 @@ class AdjustedPoints:
 
     @property
     def extent_m(self) -> float:
-        """How far the points of a photo reach, median over the photos."""
+        """Return the extent of the points of a photo, median over the photos."""
         reaches = []
         for photo in np.unique(self.photo):
             mine = self.places[self.photo == photo]
@@ -116,15 +117,18 @@ class AdjustedPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonError:
-    """An error that neighbouring points share: a sum of parts that reach differently far.
+    """An error common to neighbouring points: a sum of parts with different correlation lengths.
 
     Attributes:
-        of_places_m: standard deviation of each coordinate of places, in whichever photo, of each
-            part; none where points err independently.
-        of_depths_m: of their depth besides.
-        of_photos_m: of what the points of one photo alone share, as by its lens or how it matches.
-        lengths_m: of each part, whose correlation is the sum of exp(-distance / length).
-        sigma_alone: what is left to each observation alone, in its standard deviations.
+        of_places_m: standard deviation of each coordinate of a position, common to all photos, for
+            each part; empty if points have independent errors.
+        of_depths_m: additional standard deviation of depth.
+        of_photos_m: standard deviation of what only the points of one photo have in common, e.g.
+            from its lens or its matching.
+        lengths_m: correlation lengths of the parts; the correlation is the sum of exp(-distance /
+            length).
+        sigma_alone: standard deviation of the independent error of each observation, in units of
+            its stated one.
     """
 
     of_places_m: tuple[float, ...] = ()
@@ -135,18 +139,18 @@ class CommonError:
 
     @property
     def is_any(self) -> bool:
-        """Whether points share an error at all."""
+        """Whether points have a common error at all."""
         return any(self.of_places_m + self.of_depths_m + self.of_photos_m)
 
 
 def common_error(points: AdjustedPoints) -> CommonError:
-    """Estimate the error that neighbouring points share from the products of their residuals.
+    """Estimate the common error of neighbouring points from the products of their residuals.
 
-    An adjustment takes up a part of such an error, the more the longer it reaches, and the more
-    photos see the same places; expected products are those of residuals after that. The products of
-    all pairs, also of points of different photos, are explained by independent errors and by shared
-    ones of each kind and length (least squares of variance components, MINQUE: Rao 1971,
-    doi:10.1016/0047-259X(71)90001-7).
+    An adjustment absorbs a part of such an error; the part grows with the correlation length and
+    with the number of photos that see the same places. Expected products are therefore those of
+    residuals after the adjustment. The products of all pairs, also of points in different photos,
+    are explained by independent errors and by common ones of each kind and length (least squares of
+    variance components, MINQUE: Rao 1971, doi:10.1016/0047-259X(71)90001-7).
     """
     from scipy.optimize import nnls  # noqa: PLC0415 - most who load this module adjust nothing
 
@@ -155,8 +159,8 @@ def common_error(points: AdjustedPoints) -> CommonError:
     some, extent_m = points.thinned(), points.extent_m
     flat = some.jacobian.reshape(-1, some.jacobian.shape[2])
     moved = flat @ some.cofactors
-    # Of an error of its own, each point takes up what it does alone; of a shared one, as much as
-    # all the points for which it stands.
+    # A point absorbs its own share of an independent error, and of a common error as much as all
+    # points that it represents.
     expected = [np.eye(len(flat)) - moved @ flat.T]
     moved *= some.weight
     for directions, correlations in _kinds(some, [np.multiply(part, extent_m) for part in _PARTS]):
@@ -174,12 +178,12 @@ def common_error(points: AdjustedPoints) -> CommonError:
     layers /= scales[:, None]
     residuals = some.residuals.ravel()
     normal, right = layers @ layers.T, layers @ np.outer(residuals, residuals).ravel()
-    # Of an error that is none, what is found has this deviation at most.
+    # An error that does not exist is estimated with at most this deviation.
     chance = math.sqrt(2.0) * float(residuals @ residuals) / len(residuals)
     taken = [0]
     while True:
-        # One after the other, as long as one explains more than chance does: all at once, those
-        # that are none would share out what is left.
+        # Added one at a time while each explains more than chance does: fitted together, errors
+        # that do not exist would take shares of the others.
         solved = np.linalg.solve(normal[np.ix_(taken, taken)], normal[taken])
         left = np.maximum(1.0 - (normal[taken] * solved).sum(axis=0), 1e-9)
         found = (right - right[taken] @ solved) / np.sqrt(left)
@@ -194,7 +198,7 @@ def common_error(points: AdjustedPoints) -> CommonError:
     variances /= scales
     if not variances[1:].any():
         return CommonError(sigma_alone=math.sqrt(variances[0]))
-    # Rounded: what comes behind must not hang on the order of sums.
+    # Rounded, so that later results do not depend on the order of summation.
     alone, *sigmas = (float(f"{sigma:.4g}") for sigma in np.sqrt(variances))
     n = len(_PARTS)
     return CommonError(
@@ -207,7 +211,7 @@ def common_error(points: AdjustedPoints) -> CommonError:
 
 
 def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector (3,) across the plane that fits places best, towards a camera."""
+    """Return the normal (3,) of the plane that fits positions best, towards a camera."""
     middle = places.mean(axis=0)
     across = np.linalg.svd(places - middle, full_matrices=False)[2][2]
     return np.asarray(across if (centre - middle) @ across > 0.0 else -across)
@@ -216,7 +220,7 @@ def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArra
 def with_common_error(
     covariance: NDArray[np.float64], points: AdjustedPoints
 ) -> NDArray[np.float64]:
-    """Widen the covariance (p, p) of an adjustment by the error that its points share."""
+    """Widen the covariance (p, p) of an adjustment by the common error of its points."""
     error = common_error(points)
     if not error.is_any:
         return covariance
@@ -240,7 +244,7 @@ _Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _kinds(
     some: AdjustedPoints, lengths_m: Sequence[Sequence[float] | NDArray[np.float64]]
 ) -> Iterator[tuple[list[_Direction], list[NDArray[np.float64]]]]:
-    """Return the directions of each kind of shared error, and its correlations (n, n) by part."""
+    """Return the directions of each kind of common error, and its correlations (n, n) by part."""
     apart_m = np.linalg.norm(some.places[:, None] - some.places, axis=2)
     correlations = [
         np.sum([np.exp(-apart_m / length_m) for length_m in part], axis=0) for part in lengths_m
@@ -257,19 +261,19 @@ def _kinds(
 def _sum_over(
     directions: Sequence[_Direction], correlation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance (p, p) of the sum of all pulls, each times an error of one metre."""
+    """Return the covariance (p, p) of the sum of all pulls, each times an error of one metre."""
     return np.asarray(sum(pulls.T @ correlation @ pulls for _, pulls in directions))
 
 
 def stable(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round sums (p, p) so that the number of threads that BLAS took does not show."""
+    """Round sums (p, p) so that they do not depend on the number of threads of BLAS."""
     scale = np.sqrt(np.maximum(np.diag(sums), 1e-300))
     unit = np.outer(scale, scale)
     return np.asarray(np.round(sums / unit, 7) * unit, dtype=np.float64)
 
 
 def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverses (n, p, p); pseudo-inverses where a group alone fixes a parameter."""
+    """Return inverses (n, p, p); pseudo-inverses where a single group determines a parameter."""
     try:
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -277,7 +281,7 @@ def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the larger of two covariances (p, p), along each axis in which the first is one."""
+    """Return the larger of two covariances (p, p) along each axis that whitens the first."""
     root = _root(plain)
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ spread @ inverse.T)
@@ -287,11 +291,11 @@ def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[
 
 
 def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R (p, p) with R R' the covariance, or a little more where rounding left it none."""
+    """Return R (p, p) with R R' the covariance, enlarged a little where rounding made it indefinite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
-        # Some unknowns are hardly determined: their variances dwarf the others.
+        # Some unknowns are poorly determined: their variances dwarf the others.
         sigmas = np.sqrt(np.diag(covariance))
         values, axes = np.linalg.eigh(covariance / np.outer(sigmas, sigmas))
         least = len(values) * np.finfo(np.float64).eps * values[-1]

@@ -1,4 +1,4 @@
-"""Compiled passes that lay the points of a cloud into a depth buffer of a photo."""
+"""Compiled passes that render the points of a cloud into the depth buffer of a photo."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class DepthBuffer(NamedTuple):
 
 
 class VoxelGrid(NamedTuple):
-    """Cubes that tell how densely points lie.
+    """Voxels that show how dense points are.
 
     Attributes:
-        low: (3,) float64 metres from the cloud's origin, lower corner of the first cube.
-        side_m: side of a cube.
+        low: (3,) float64 metres from the cloud's origin, lower corner of the first voxel.
+        side_m: side of a voxel.
         counts: (nx, ny, nz) uint16 points in each, or in each and its 26 neighbours.
     """
 
@@ -48,7 +48,7 @@ class VoxelGrid(NamedTuple):
 
 @compiled
 def count_in_voxels(points: Offsets, grid: VoxelGrid) -> None:
-    """Count points in voxels, up to `COUNT_MOST`; points outside the grid are left out."""
+    """Count points in voxels, up to `COUNT_MOST`; points outside the grid are ignored."""
     nx, ny, nz = grid.counts.shape
     low_x, low_y, low_z, per_m = grid.low[0], grid.low[1], grid.low[2], 1.0 / grid.side_m
     for i in range(points.x.shape[0]):
@@ -67,13 +67,13 @@ def splat_points(
     n_least: int,
     buffer: DepthBuffer,
 ) -> None:
-    """Lay points into a depth buffer as squares as large as the gaps between them.
+    """Render points into a depth buffer as squares as large as the gaps between them.
 
     Args:
         points: offsets from the cloud's origin.
         camera: (25,) flat camera for these offsets.
-        around: points in 3 x 3 x 3 voxels; a surface through them has 9 faces of a voxel, which
-            tells the spacing of its points.
+        around: points in 3 x 3 x 3 voxels; a surface through them covers 9 voxel faces, which gives
+            the spacing of its points.
         n_least: points with fewer around them, themselves included, are outliers.
         buffer: the nearest depths so far, lowered in place.
     """

@@ -1,4 +1,4 @@
-"""How noisy a raster of depths is, told from the raster itself."""
+"""Estimate of the noise of a depth raster from the raster itself."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _SAMPLES: Final = 300_000
 
 
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
-    """Standard deviation of a depth, told from how neighbours scatter about a line.
+    """Estimate the standard deviation of a depth from the scatter of neighbours about a line.
 
-    The median of second differences does not see edges; a raster (rows, cols) without three
-    measured neighbours has no noise that could be told: 0.
+    The median of second differences ignores edges; a raster (rows, cols) without three adjacent
+    measured cells gives 0.
     """
-    # Half of the samples lie across, half down.
+    # Half of the samples are horizontal, half vertical.
     step = max(1, 2 * depth_m.size // _SAMPLES)
     rows, middle = depth_m[::step], depth_m[1:-1:step]
     across = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]

@@ -1,4 +1,4 @@
-"""Which way is up: the six world directions a scan may call up, and a frame that goes with each."""
+"""The six world directions that can be up in a scan, and the frame that belongs to each."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _FIRST_AXES: Final[dict[int, tuple[float, float, float]]] = {
 
 
 def up_vector(direction: UpDirection) -> NDArray[np.float64]:
-    """Unit vector (3,) of an up direction in world axes."""
+    """Return the unit vector (3,) of an up direction in world axes."""
     return np.array(UP_VECTORS[direction])
 
 
 def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Right-handed frame in which "horizontal", "2D" and the angles omega and phi are meant.
+    """Return the right-handed frame to which "horizontal", "2D" and the angles omega and phi refer.
 
     Args:
         up: (3,) unit vector in world axes, any direction.

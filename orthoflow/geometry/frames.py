@@ -1,4 +1,4 @@
-"""The wall frame: where the cells of a wall's raster lie in the world, and back."""
+"""The wall frame: transforms between the cells of a wall's raster and the world."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.directions import across, basis_from_up
 from orthoflow.geometry.planes import Plane
 
-# Below this angle between normal and up a plane counts as a floor or ceiling: "right for the
-# viewer" would then hang on a nearly vertical normal's noise.
+# If the angle between normal and up is smaller, a plane counts as a floor or ceiling: "right for
+# the viewer" would depend on the noise of a nearly vertical normal.
 LEVEL_LIMIT_DEG: Final = 10.0
-# Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
+# Beyond any survey frame on Earth: larger coordinates come from damaged numbers.
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
 
@@ -43,8 +43,9 @@ class WallFrame:
         map_crs: set where the raster is a map, with u to the east and v to the south: its
             coordinate system, an EPSG code, or `site` for the world's own without a name.
         up: unit vector along which heights count; None where it is unknown.
-        name: what the wall is called, and with it the coordinate system of its raster.
-        left_m: metres along the wall from its left edge to this raster's, for a part of a wall.
+        name: name of the wall, which is part of the name of its raster's coordinate system.
+        left_m: distance along the wall from its left edge to the left edge of this raster, for a
+            part of a wall.
     """
 
     origin_world: NDArray[np.float64]
@@ -73,12 +74,12 @@ class WallFrame:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns, as numpy arrays have them."""
+        """Rows and columns, in numpy's order."""
         return self.height, self.width
 
     @property
     def raster_axes(self) -> RasterAxes:
-        """What X and Y of the raster's files are; this is the only place that decides it.
+        """The meaning of X and Y in the raster's files; this is the only place that decides it.
 
         An upright wall has metres along it and heights, exact at its top edge; floors and ceilings
         have the world's horizontal axes, ceilings with rows that go north, so that they lie over
@@ -96,7 +97,7 @@ class WallFrame:
 
     @property
     def raster_corner_m(self) -> tuple[float, float]:
-        """X and Y of the outer corner of the top-left cell in the raster's files."""
+        """Return X and Y of the outer corner of the top-left cell in the raster's files."""
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
@@ -107,22 +108,22 @@ class WallFrame:
 
     @property
     def raster_down(self) -> float:
-        """Change of Y per metre down the rows: -1, but 1 for ceilings, seen from below."""
+        """Return the change of Y per metre down the rows: -1, but 1 for ceilings (seen from below)."""
         if self.up is None or self.raster_axes != "level":
             return -1.0
         return 1.0 if float(self.normal_world @ self.up) < 0.0 else -1.0
 
     @property
     def crs(self) -> str:
-        """Name of the coordinate system of the raster's files: that of the map, or the wall's own.
+        """Return the name of the coordinate system of the raster's files: the map's or the wall's.
 
-        The latter holds the wall's name and a number made of where X = Y = 0 lies in the world, so
-        that rasters and parts of one wall share it and no two walls do.
+        The latter contains the wall's name and a number derived from the world position of X = Y =
+        0, so that rasters and parts of one wall share it and no two walls do.
         """
         if self.map_crs is not None:
             return self.map_crs
         zero = self.world_from_wall(self.wall_from_raster(np.zeros((1, 2))))[0]
-        # Whole millimetres of the place, and axes to a millionth.
+        # The position in whole millimetres, and the axes to a millionth.
         axes = np.concatenate([self.u_world, self.v_world])
         place = [*np.round(1e3 * zero), *np.round(1e6 * axes)]
         digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
@@ -130,13 +131,13 @@ class WallFrame:
 
     @property
     def plane(self) -> Plane:
-        """The plane the frame lies on."""
+        """Return the plane of the frame."""
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
 
     def has_cells_of(self, other: WallFrame) -> bool:
-        """Whether both have the same cells, to a thousandth of one at the corners."""
+        """Whether both have the same cells, to a thousandth of a cell at the corners."""
         if self.shape != other.shape:
             return False
         apart = np.abs(self.corners_world() - other.corners_world()).max()
@@ -146,7 +147,7 @@ class WallFrame:
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
         """World points (n, 3), metres, of wall positions (n, 2) = (column, row) and depths (n,)."""
-        # Whoever asks for one place in a notebook gives a list of two numbers.
+        # In a notebook a single position is given as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
@@ -190,11 +191,11 @@ class WallFrame:
 
 
 def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes u and v of the wall frame on a plane.
+    """Return the axes u and v of the wall frame on a plane.
 
-    u is horizontal and to the right for a viewer whom the normal points to. For floors and
-    ceilings (normal within 10 deg of up or down) u is the horizontal e1 axis of `basis_from_up`
-    laid into the plane, so that a floor reads like a map: e1 to the right, e2 upwards.
+    u is horizontal and points to the right for a viewer in front of the plane. For floors and
+    ceilings (normal within 10 deg of up or down) u is the horizontal axis e1 of `basis_from_up`
+    projected onto the plane, so that a floor reads like a map: e1 to the right, e2 upwards.
 
     Args:
         normal: (3,) unit vector towards the viewer.
@@ -215,7 +216,7 @@ def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
 def frame_over(
     corners_world: NDArray[np.float64], normal: NDArray[np.float64], *, gsd_m: float
 ) -> WallFrame:
-    """Lay a grid over a rectangle on a plane.
+    """Place a grid over a rectangle on a plane.
 
     Args:
         corners_world: (4, 3) metres, top-left first, counter-clockwise for the viewer.
@@ -223,8 +224,8 @@ def frame_over(
         gsd_m: side of a cell in metres.
 
     Returns:
-        The grid whose top-left corner is the rectangle's; it covers the rectangle, so right and
-        bottom may reach past it by less than a cell.
+        The grid whose top-left corner is that of the rectangle; it covers the rectangle, so its
+        right and bottom edges may exceed it by less than a cell.
     """
     top_left, bottom_left, _, top_right = corners_world
     u = top_right - top_left
@@ -232,7 +233,7 @@ def frame_over(
     height_m = float(np.linalg.norm(bottom_left - top_left))
     if not (width_m > 0.0 and height_m > 0.0):
         raise GeometryError(f"a rectangle needs an area, got corners {corners_world.tolist()}")
-    # Re-orthogonalised against the normal: stored corners carry rounding.
+    # Re-orthogonalised against the normal, because stored corners are rounded.
     u = u - (u @ normal) * normal
     u = u / np.linalg.norm(u)
     return WallFrame(
@@ -241,7 +242,7 @@ def frame_over(
         v_world=np.cross(u, normal),
         normal_world=normal.copy(),
         gsd_m=gsd_m,
-        # A millionth of a cell of slack: 3.000000001 m at 3 mm must not cost a column.
+        # A tolerance of a millionth of a cell: 3.000000001 m at 3 mm must not add a column.
         width=max(1, math.ceil(width_m / gsd_m - 1e-6)),
         height=max(1, math.ceil(height_m / gsd_m - 1e-6)),
     )

@@ -1,7 +1,7 @@
-"""Random numbers that are a function of a place: of a lattice cell, a seed, and a draw.
+"""Random numbers as a function of a lattice cell, a seed and the index of the draw.
 
-Whoever asks, in whatever order and on however many threads, gets the same number. The formulas are
-those of `texture_kernels`, over whole arrays.
+The same numbers result in any order and on any number of threads. The formulas are those of
+`texture_kernels`, for whole arrays.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _TURN: Final = 2.0 * np.pi
 def cell_states(
     columns: NDArray[np.int64], rows: NDArray[np.int64], seed: int
 ) -> NDArray[np.uint64]:
-    """Random states (64 bits) of lattice cells; columns and rows are broadcast to each other."""
+    """Return random states (64 bits) of lattice cells; columns and rows are broadcast."""
     state = mixed_bits(columns.astype(np.uint64) * _COLUMN + np.uint64(seed % _WORD))
     return mixed_bits(state ^ (rows.astype(np.uint64) * _ROW))
 
 
 def uniforms(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Numbers in [0, 1), one per state; another draw gives other ones."""
+    """Return numbers in [0, 1), one per state; another draw gives other numbers."""
     bits = mixed_bits(states + np.uint64((draw + 1) * _GOLDEN % _WORD))
     bits >>= np.uint64(11)
     return np.multiply(bits, 1.0 / 9007199254740992.0, dtype=np.float64)
 
 
 def normals(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Normally distributed numbers (Box and Muller), one per state and even number of a draw."""
+    """Return normally distributed numbers (Box and Muller), one per state and even draw."""
     lengths = np.sqrt(-2.0 * np.log1p(-uniforms(states, draw)))
     return np.asarray(lengths * np.cos(_TURN * uniforms(states, draw + 1)), dtype=np.float64)
 

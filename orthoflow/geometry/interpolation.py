@@ -1,10 +1,11 @@
-"""Cells of a raster between others: what they hold follows from the points around them.
+"""Interpolation of raster cells from the points around them.
 
-No direction is favoured: all cells about a cell take part, weighed by the distance of their points
-to its centre, and what they hold is carried there along its slope. So a raster that is turned or
-mirrored is interpolated to the turned or mirrored one, up to the order of sums.
+No direction is favoured: all cells around a cell take part, weighted by the distance of their
+points from its centre, and their values are extrapolated to that centre along the slope. A raster
+that is rotated or mirrored is therefore interpolated to the rotated or mirrored result, up to the
+order of summation.
 
-Loads numba: methods import it where they run.
+This module loads numba: methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells take part that are so much farther than the nearest one, and all eight neighbours.
+# Cells within this many times the distance of the nearest one take part, and all eight neighbours.
 _BEYOND_CELLS: Final = 1.0
 _NEIGHBOURS_SQUARE: Final = 2.0
 # Standard deviation of the weights, as a share of the distance to the nearest cell, at least 1.
 _SIGMA_SHARE: Final = 0.5
-# (1 - x / 8)^8 is nearly exp(-x), and takes a tenth of the time; nothing weighs less than the last.
+# (1 - x / 8)^8 approximates exp(-x) in a tenth of the time; the outermost cells have no weight.
 _WEIGHT_LEAST: Final = 1e-6
-# Slopes that hardly any spread of the points tells are taken as level.
+# A slope that the spread of the points hardly determines is taken as zero.
 _RIDGE: Final = 0.005
-# Points are equally near whose squared distances differ by less.
+# Points whose squared distances differ by less count as equally near.
 _AS_NEAR: Final = 1e-6
 
 
 class CellValues(NamedTuple):
-    """What cells hold, flat over a raster; arrays without cells are left alone.
+    """The values of cells, flat over a raster; arrays without cells are left alone.
 
     Attributes:
         depth_m: float32, NaN where void.
@@ -62,13 +63,13 @@ def cell_values(
 
 
 class Surroundings(NamedTuple):
-    """The cells of a raster that lend what they hold to others.
+    """The cells of a raster from which others are interpolated.
 
     Attributes:
-        places: (cells, 2) float32, where their points lie to the right of and below the centre of
-            the cell, in cells; NaN for cells that lend nothing.
+        places: (cells, 2) float32, position of their points right of and below the centre of the
+            cell, in cells; NaN for cells that are not used.
         width: columns of the raster.
-        layer_m: depths that differ by more are of different surfaces.
+        layer_m: depths that differ by more belong to different surfaces.
     """
 
     places: NDArray[np.float32]
@@ -85,23 +86,23 @@ def interpolate(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Return cells what their surroundings hold, linear between them.
+    """Interpolate cells linearly from their surroundings.
 
-    A cell that lends nothing takes what lies around it on one surface: its own where its depth is
-    known, else that of the nearest points, among equally near ones that of the point nearest the
-    viewer. A cell that lends keeps what it holds, carried from where its points lie to its centre.
-    Nothing leaves the range of what lies around.
+    A void cell is interpolated from the surrounding points of one surface: its own if its depth is
+    known, else that of the nearest points, and among equally near ones that of the point nearest
+    the viewer. A cell with points keeps its value, shifted from the position of its points to its
+    centre. No result leaves the range of the surrounding values.
 
     Args:
         cells: (n,) flat indices of the cells to interpolate.
-        around: who lends.
-        values: what the lenders hold, and the depths of the cells, as far as they are known.
-        into: written at the cells; may be `values` unless one of the cells lends.
-        reach_cells: how far away the nearest cell that lends may be.
-        threads: how many threads work.
+        around: the cells to interpolate from.
+        values: the values of these cells, and the depths of the cells to interpolate where known.
+        into: the output; may be `values` unless one of the cells is itself used for others.
+        reach_cells: maximum distance of the nearest cell that can be used.
+        threads: number of threads.
 
     Returns:
-        (n,) where there was anything to take; the other cells are left alone.
+        (n,) which cells were interpolated; the others are unchanged.
     """
     wanted = _Wanted(
         cells=cells,
@@ -114,7 +115,7 @@ def interpolate(
 
 
 def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
-    """Cells (k, 2) = (row, column) within a radius of a centre cell, itself first."""
+    """Return the cells (k, 2) = (row, column) within a radius of a centre cell, itself first."""
     most = math.floor(radius_cells)
     steps = np.arange(-most, most + 1, dtype=np.int64)
     rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
@@ -125,7 +126,7 @@ def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
 
 
 class _Wanted(NamedTuple):
-    """The cells to interpolate, where to look about each, and for which anything was found."""
+    """The cells to interpolate, the neighbourhood of each, and which of them were interpolated."""
 
     cells: NDArray[np.int64]
     offsets: NDArray[np.int64]
@@ -133,7 +134,7 @@ class _Wanted(NamedTuple):
 
 
 class _Lenders(NamedTuple):
-    """Room for the lenders of one cell: where they are, how far off, and how much they count."""
+    """Buffers for the neighbours of one cell: position, distance and weight."""
 
     cells: NDArray[np.int64]
     across: NDArray[np.float64]
@@ -181,7 +182,7 @@ def _find_lenders(
     depth_m: NDArray[np.float32],
     lenders: _Lenders,
 ) -> tuple[int, float]:
-    """Find who lends to a cell; give how many, and how fast their weight falls off."""
+    """Find the neighbours of a cell; return their number, and how fast their weight decreases."""
     places, width = around.places, around.width
     height = places.shape[0] // width
     row, column = cell // width, cell % width
@@ -219,7 +220,7 @@ def _find_lenders(
 def _keep_layer(
     n: int, surface_m: float, layer_m: float, depth_m: NDArray[np.float32], lenders: _Lenders
 ) -> int:
-    """Keep those of n lenders that lie on a surface; give how many."""
+    """Keep those of n neighbours that lie on a surface; return their number."""
     kept = 0
     for k in range(n):
         if abs(depth_m[lenders.cells[k]] - surface_m) <= layer_m:
@@ -231,9 +232,9 @@ def _keep_layer(
 
 @kernel_part
 def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders: _Lenders) -> None:
-    """Set how much each of n lenders counts in a cell: linear regression, the nearer the more.
+    """Set the weight of each of n neighbours: linear regression, weighted by proximity.
 
-    For a cell that lends itself, how much each counts in what carries its own to its centre.
+    For a cell with points, set the weights that shift its own value to its centre.
     """
     per_square = 1.0 / (16.0 * sigma * sigma)
     w, wx, wy, wxx, wxy, wyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -247,7 +248,7 @@ def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders
         wxx, wxy, wyy = wxx + weight * x * x, wxy + weight * x * y, wyy + weight * y * y
     ridge = _RIDGE * sigma * sigma * w
     wxx, wyy = wxx + ridge, wyy + ridge
-    # Rows of the inverse of ((w, wx, wy), (wx, wxx, wxy), (wy, wxy, wyy)), but for its determinant.
+    # Rows of the inverse of ((w, wx, wy), (wx, wxx, wxy), (wy, wxy, wyy)), without its determinant.
     level, across, down = wxx * wyy - wxy * wxy, wxy * wy - wx * wyy, wx * wxy - wxx * wy
     determinant = w * level + wx * across + wy * down
     if not math.isnan(places[cell, 0]):
@@ -261,7 +262,7 @@ def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders
 
 @kernel_part
 def _mixed(values: NDArray[np.generic], lenders: _Lenders, n: int, own: int) -> float:
-    """What n lenders make of a cell, within their range; `own` is the cell if it lends, or -1."""
+    """Combine n neighbours into a cell, within their range; `own` is a cell with points, or -1."""
     total, least, most = 0.0, math.inf, -math.inf
     if own >= 0:
         total = float(values[own])

@@ -1,4 +1,4 @@
-"""Says which kernel is being compiled to whoever waits for it; loads no compiler itself."""
+"""Reports which kernel is being compiled; does not load the compiler itself."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def heard_by(hear: Hear) -> Iterator[None]:
     """Report a function of the kernels that are compiled while the block runs, in any thread.
 
     Args:
-        hear: gets `compiling NAME (3 so far)` when one is begun, and nothing, an empty text, when
-            it and all that it needs is there.
+        hear: called with `compiling NAME (3 so far)` when one is begun, and with an empty text when
+            it and all that it needs are compiled.
     """
     _listeners.append(hear)
     try:
@@ -26,6 +26,6 @@ def heard_by(hear: Hear) -> Iterator[None]:
 
 
 def tell(text: str) -> None:
-    """Pass on what the compiler does."""
+    """Forward the events of the compiler."""
     for hear in tuple(_listeners):
         hear(text)

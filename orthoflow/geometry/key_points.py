@@ -1,4 +1,4 @@
-"""What key points need, whoever finds them: to cover a picture, and descriptors that compare."""
+"""Shared by all detectors of key points: even coverage of a picture, and comparable descriptors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _QUANTA: Final = 512.0
 def in_turns(
     cell: NDArray[np.intp], keys: Sequence[NDArray[np.floating] | NDArray[np.intp]], n_most: int
 ) -> NDArray[np.intp]:
-    """Positions (k,) of at most so many of n things, taken in turns from the cells of a grid.
+    """Return positions (k,) of up to `n_most` of n items, in rotation from the cells of a grid.
 
-    So they cover what the cells cover; within a cell, the first come first.
+    The selection covers what the cells cover; within a cell the first items are taken first.
 
     Args:
         cell: (n,) cell of each.
-        keys: (n,) each, what orders them; the last one first, as in `numpy.lexsort`.
-        n_most: at most so many.
+        keys: (n,) each, the sort keys; the last one is the primary key, as in `numpy.lexsort`.
+        n_most: maximum number of items.
     """
     order = np.lexsort((*keys, cell))
     turn = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
@@ -34,7 +34,7 @@ def in_turns(
 def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
     """RootSIFT of SIFT descriptors (n, 128) as whole numbers (Arandjelovic & Zisserman 2012).
 
-    Euclid's distance becomes Hellinger's.
+    The Euclidean distance becomes Hellinger's.
     """
     total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What an adjustment may change of a camera, and how pixels follow from pose and lens."""
+"""The camera parameters that an adjustment may change, and the derivatives of pixels by them."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.rotations import rotation_from_vector
 
 POSE_PARAMETERS: Final = 6
-# EXIF says the focal length to a whole number of millimetres, or of the full-frame equivalent, and
-# nothing of the focusing distance; nothing at all leaves what lenses usually are.
+# EXIF states the focal length in whole millimetres, or as the full-frame equivalent, and not the
+# focusing distance; without it the range of usual lenses remains.
 _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.35
-# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came
-# out wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
-# Pixels are square to a thousandth, which at the edge of a picture is more than a pixel.
+# Further properties of an uncalibrated lens. Fixed at zero they distort the pose: photos had 2.4
+# times the error that they stated, and 1.7 times the error that was necessary. Pixels are square to
+# a thousandth, which at the edge of a picture is more than a pixel.
 _ASPECT_SIGMA: Final = 1e-3
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
 _TANGENTIAL_SIGMA: Final = 1e-3
-# Which of the five distortion coefficients k1, k2, p1, p2, k3 a name means.
+# Which of the five distortion coefficients k1, k2, p1, p2, k3 a name refers to.
 _COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensFreedom:
-    """How far an adjustment may move the interior orientation; 0 holds it.
+    """Prior standard deviations of the interior orientation; 0 fixes a parameter.
 
     Attributes:
-        focal_sigma: standard deviation of ln(focal length) beforehand, common to fx and fy.
+        focal_sigma: prior standard deviation of ln(focal length), common to fx and fy.
         aspect_sigma: of ln(fy / fx).
         centre_sigma_px: of each coordinate of the principal point, pixels.
         k1_sigma: of k1.
@@ -53,12 +53,12 @@ class LensFreedom:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free ones, in the order in which every vector and matrix has them."""
+        """Names of the free parameters, in the order of every vector and matrix."""
         return tuple(name for name, sigma in self._all() if sigma > 0.0)
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
-        """Standard deviations of the free ones."""
+        """Prior standard deviations of the free parameters."""
         return np.array([sigma for _, sigma in self._all() if sigma > 0.0])
 
     def _all(self) -> tuple[tuple[str, float], ...]:
@@ -76,11 +76,11 @@ class LensFreedom:
 
 
 def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
-    """Return how far a lens that nobody calibrated may be from one without any errors.
+    """Return how far an uncalibrated lens may deviate from an ideal one.
 
     Args:
         longer_px: longer side of its photos.
-        has_exif: whether their file says the focal length.
+        has_exif: whether their EXIF states the focal length.
     """
     return LensFreedom(
         focal_sigma=_EXIF_SIGMA if has_exif else _UNKNOWN_SIGMA,
@@ -94,13 +94,13 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
 
 @dataclass(frozen=True, kw_only=True)
 class Linear:
-    """The projection of points at a camera.
+    """The projection of points by a camera.
 
     Attributes:
         pixels: (n, 2); NaN behind the camera.
         by_camera_point: (n, 2, 3) derivatives by the point in camera axes, pixels per metre.
-        by_parameters: (n, 2, 6 + free) by rotation vector (left of camera_from_world),
-            translation, then what is free of the lens.
+        by_parameters: (n, 2, 6 + free) by rotation vector (left of camera_from_world), translation,
+            then the free parameters of the lens.
     """
 
     pixels: NDArray[np.float64]
@@ -109,7 +109,7 @@ class Linear:
 
 
 def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
-    """Return a camera's values of what is free of the lens, the focal length as its logarithm."""
+    """Return the values of the free lens parameters of a camera, the focal length as its logarithm."""
     values = {
         "focal": math.log(camera.fx),
         "aspect": math.log(camera.fy / camera.fx),
@@ -153,12 +153,12 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     turned = (camera.rotation @ points.T).T
     x, y, z = turned.T + camera.translation[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Behind the camera there is no pixel: NaN makes its cost infinite.
+        # Behind the camera there is no pixel: NaN makes the cost infinite.
         z = np.where(z > 1e-9, z, np.nan)
         a, b = x / z, y / z
     bent = _bent(a, b, camera.distortion)
     ad, bd = bent.a, bent.b
-    # Points along the last axis of memory: every operation below goes over all of them.
+    # Points are the last axis in memory, so every operation below runs over all of them.
     by_point = np.empty((2, 3, len(points))).transpose(2, 0, 1)
     by_point[:, 0, 0] = camera.fx * bent.a_by_a / z
     by_point[:, 0, 1] = camera.fx * bent.a_by_b / z
@@ -166,12 +166,12 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     by_point[:, 1, 0] = camera.fy * bent.a_by_b / z
     by_point[:, 1, 1] = camera.fy * bent.b_by_b / z
     by_point[:, 1, 2] = -camera.fy * (bent.b_by_b * b + bent.a_by_b * a) / z
-    # What a step down adds along u.
+    # Contribution of y / z to u.
     leaning = camera.skew / camera.fy
     by_point[:, 0] += leaning * by_point[:, 1]
     n_free = POSE_PARAMETERS + len(lens.names)
     by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
-    # Derivative by a turn: -by_point times the cross product's matrix, written out.
+    # Derivative by a rotation: -by_point times the matrix of the cross product, written out.
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
         by_parameters[:, :, axis] = (
@@ -202,7 +202,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
 
 @dataclass(frozen=True, kw_only=True)
 class _Bent:
-    """Rays x / z and y / z after the distortion, with derivatives; 1 and 0 without one."""
+    """Return rays x / z and y / z after distortion, with derivatives; 1 and 0 without distortion."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
@@ -230,7 +230,7 @@ def _bent(a: NDArray[np.float64], b: NDArray[np.float64], distortion: NDArray[np
 def _lens_columns(
     a: NDArray[np.float64], b: NDArray[np.float64], bent: _Bent
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Derivatives of the bent ray by what of a lens is not its centre."""
+    """Return derivatives of the distorted ray by all lens parameters except the centre."""
     r2 = a * a + b * b
     return {
         "focal": (bent.a, bent.b),
@@ -243,5 +243,5 @@ def _lens_columns(
 
 
 def _factor(logarithm: float) -> float:
-    """At most e, so that a step too far cannot run away."""
+    """Return the change limited to a factor of e, so that an excessive step cannot diverge."""
     return math.exp(min(1.0, max(-1.0, logarithm)))

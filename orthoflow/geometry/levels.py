@@ -1,6 +1,6 @@
-"""Levels of colours: 8 bits per channel, or 16 of deep photos, which mean the same shares of white.
+"""Colour levels: 8 bits per channel, or 16 for deep photos, with the same shares of white.
 
-So 255 of 8 bits are 65535 of 16, and every level of 8 bits is one of 16: times 257.
+So 255 in 8 bits is 65535 in 16 bits, and every 8-bit level has an exact 16-bit one: times 257.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 Colours: TypeAlias = NDArray[np.uint8 | np.uint16]
 Level: TypeAlias = type[np.uint8] | type[np.uint16]
 
-# Grey of red, green and blue as they are (luma of Rec. 601), as OpenCV makes it.
+# Luma of red, green and blue as stored (Rec. 601), as in OpenCV.
 REC_601: Final = np.array([0.299, 0.587, 0.114])
-# Levels of 16 bits for one of 8.
+# 16-bit levels per 8-bit level.
 DEEPER: Final = 257
-# A picture is of one tone if so much of it is within a level of 256 of its median, or darker than
-# this share of white, or brighter than white less this share.
+# A picture has a single tone if this share of it is within a level of 256 of its median, or darker
+# than this share of white, or brighter than white less this share.
 _PLAIN_SHARE: Final = 0.98
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
 _TONE_SAMPLE: Final = 40_000
-# Smaller ones are not judged.
+# Smaller pictures are not judged.
 _TONE_CELLS_MIN: Final = 2000
 
 
@@ -37,7 +37,7 @@ def eight_bits(colours: Colours) -> NDArray[np.uint8]:
 
 
 def sixteen_bits(colours: Colours) -> NDArray[np.uint16]:
-    """Return colours in 16 bits: themselves, or 8 bits times 257, of which nothing is lost."""
+    """Return colours in 16 bits: themselves, or 8 bits times 257, which is lossless."""
     if colours.dtype == np.uint16:
         return colours.view(np.uint16)
     return colours.astype(np.uint16) * np.uint16(DEEPER)
@@ -49,7 +49,7 @@ def in_levels(colours: Colours, level: Level) -> Colours:
 
 
 def level_of(colours: Colours) -> Level:
-    """State in which bits colours are."""
+    """Return the number of bits of colours."""
     return np.uint16 if colours.dtype == np.uint16 else np.uint8
 
 
@@ -59,14 +59,14 @@ def plain_tone(
     """Whether a picture is nearly all black, white or one value.
 
     Args:
-        picture: (rows, cols) or (rows, cols, 3); NaN counts for nothing.
+        picture: (rows, cols) or (rows, cols, 3); NaN is ignored.
         mask: (rows, cols) states of the cells.
-        shown: states of those that show something.
-        white: the value of full brightness.
+        shown: the states of cells with content.
+        white: the value of maximum brightness.
 
     Returns:
-        `black`, `white` or `one value`, and the share of the cells that are; None for a picture
-        with tones, or of few cells.
+        `black`, `white` or `one value`, and the share of such cells; None for a picture with tones,
+        or with few cells.
 
     >>> ramp, mask = np.linspace(0.0, 1.0, 2000)[None], np.ones((1, 2000), dtype=np.uint8)
     >>> plain_tone(0.0 * ramp, mask, (1,), white=1.0), plain_tone(ramp, mask, (1,), white=1.0)

@@ -1,10 +1,11 @@
-"""The narrow gaps of a raster, told from windows.
+"""Narrow gaps of a raster, as distinguished from windows.
 
-A disc holds a cell of a set where, in some column that it crosses, the cell of the set nearest to
-its middle row is within it. So distances down columns are found first; then each row asks the
-columns to its left and right. Both go along rows without branches, 32 cells at once.
+A disc around a cell contains a member of a set if, in some column of the disc, the member nearest
+to the middle row is within the disc. Distances along columns are therefore found first; then each
+row checks the columns to its left and right. Both run along rows without branches, 32 cells at a
+time.
 
-Loads numba: methods import it where they run.
+This module loads numba: methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ def narrow_gaps(
 ) -> NDArray[np.int64]:
     """Find the void cells of narrow gaps.
 
-    A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
-    opening of the void cells, so that windows and outlines keep their shape to the cell. Cells
-    outside the raster count as void. A measured cell lies within the radius of each cell found.
+    A gap is narrow where no disc of the radius fits into it: what remains void is the morphological
+    opening of the void cells, so windows and outlines keep their shape to the cell. Cells outside
+    the raster count as void. Every cell found has a measured cell within the radius.
 
     Args:
         is_measured: (rows, cols).
-        radius_cells: radius of the disc; 0 finds no gap.
-        threads: how many threads work.
+        radius_cells: radius of the disc; with 0 no gap is found.
+        threads: number of threads.
 
     Returns:
         (k,) flat indices, ascending.
@@ -38,7 +39,7 @@ def narrow_gaps(
     if radius_cells == 0:
         return np.empty(0, dtype=np.int64)
     rows, columns = is_measured.shape
-    # Framed with void, so that discs may lie half outside the raster.
+    # Padded with void cells, so that discs may extend beyond the raster.
     framed: NDArray[np.bool_] = np.pad(is_measured, radius_cells)
     is_touched = _met_by_discs(framed, radius_cells, threads=threads)
     is_open = _met_by_discs(~is_touched, radius_cells, threads=threads)
@@ -49,7 +50,7 @@ def narrow_gaps(
 def _met_by_discs(
     is_in_set: NDArray[np.bool_], radius_cells: int, *, threads: int
 ) -> NDArray[np.bool_]:
-    """Cells (rows, cols) about which a disc holds a cell of a set; outside there is none."""
+    """Report the cells (rows, cols) whose disc contains a member of a set; there is none outside."""
     rows, columns = is_in_set.shape
     steps = np.arange(-radius_cells, radius_cells + 1)
     heights = np.floor(np.sqrt(radius_cells**2 - steps**2)).astype(np.uint8)
@@ -66,12 +67,12 @@ def _met_by_discs(
 def find_distances_down(
     is_in_set: NDArray[np.bool_], most: int, distances: NDArray[np.uint8], first: int, end: int
 ) -> None:
-    """Find how far above or below the nearest cell of a set is, in some columns.
+    """Find the distance to the nearest member of a set above or below, in some columns.
 
     Args:
         is_in_set: (rows, cols).
-        most: distances are not counted beyond this.
-        distances: (rows, cols) set.
+        most: larger distances are not counted.
+        distances: (rows, cols) output.
         first: first column.
         end: the column after the last one.
     """
@@ -101,13 +102,13 @@ def find_discs(
     first: int,
     end: int,
 ) -> None:
-    """Report which cells of some rows a disc holds a cell of the set.
+    """Report which cells of some rows have a member of the set in their disc.
 
     Args:
-        distances: (rows, cols + 2 radius) of `find_distances_down`, with columns more on both
+        distances: (rows, cols + 2 radius) from `find_distances_down`, padded with columns on both
             sides.
-        heights: (2 radius + 1,) how far the disc reaches up and down in each of its columns.
-        is_met: (rows, cols) set.
+        heights: (2 radius + 1,) half height of the disc in each of its columns.
+        is_met: (rows, cols) output.
         first: first row.
         end: the row after the last one.
     """

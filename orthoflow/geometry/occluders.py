@@ -1,4 +1,4 @@
-"""A whole cloud as seen from photos: which of its points stand before others."""
+"""Which points of a whole cloud hide others from photos."""
 
 from __future__ import annotations
 
@@ -24,32 +24,31 @@ from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
-# Small enough to tell a chair's legs apart, large enough to hold a few points of each surface.
+# Small enough to separate a chair's legs, large enough to hold a few points of each surface.
 _VOXEL_CELLS: Final = 6.0
-# No scanner measures nearer to itself; what it reports from there are errors, and many in little
-# space.
+# No scanner measures at such short range: points there are errors, and many in a small volume.
 _BLIND_M: Final = 0.3
-# Where fewer of a station's rays end than one in this many, nothing stands: the others went
-# through. A rod of a millimetre stops more of those that meet a cube of 0.2 m.
+# Where fewer than one in this many of a station's rays end, there is nothing: the others passed. A
+# rod of a millimetre stops more of the rays that meet a cube of 0.2 m.
 _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
-# Half of what a surface that is scanned as finely as the wall has in 3 x 3 x 3 voxels.
+# Half of the points that a surface scanned as finely as the wall has in 3 x 3 x 3 voxels.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# The corner of a surface holds a quarter of that, and its edge half.
+# The corner of a surface holds a quarter of them, and its edge half.
 _CORNER_SHARE: Final = 0.25
-# Of the pairs of points there: nearer to 1 in 27 than to 1 in 9.
+# Share of the pairs of points: closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """Where points may stand in the way, and how far apart they lie there.
+    """The region in which points may hide others, and their spacing there.
 
     Attributes:
         low: (3,) float64 metres from the cloud's origin.
         high: (3,) float64 metres from the cloud's origin.
-        spacing_m: between neighbouring points of a surface, about.
+        spacing_m: approximate spacing of neighbouring points of a surface.
     """
 
     low: NDArray[np.float64]
@@ -59,14 +58,14 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Occluders:
-    """A cloud ready to be looked at from any of the photos.
+    """A cloud prepared for rendering from any of the photos.
 
     Attributes:
         origin: (3,) float64 metres.
         points: float32 offsets from the origin.
-        around: how many points lie about each.
+        around: number of points around each.
         n_least: points with fewer about them, in 3 x 3 x 3 voxels, are outliers.
-        threads: how many threads look at once; it does not show in the result.
+        threads: number of threads for one view; it does not change the result.
     """
 
     origin: NDArray[np.float64]
@@ -86,17 +85,17 @@ def occluders_before(
     n_least: int,
     threads: int,
 ) -> Occluders:
-    """Count the points between cameras and walls, to know outliers and the gaps between points.
+    """Count the points between cameras and walls, to detect outliers and estimate point spacing.
 
     Args:
         cloud: the whole cloud.
-        slabs: of the walls; nothing beyond the box about them and the cameras can hide them.
+        slabs: of the walls; nothing outside the box around them and the cameras can hide them.
         cameras: all of them.
-        spacing_m: between neighbouring points of a wall, about; not of cells that are coarser, as
-            the larger the space that is looked at, the more stray points of a dense scan it holds.
-        stations_world: (s, 3) metres, where scanners stood, if that is known.
-        n_least: points with fewer about them are outliers, in a box that is small enough for its
-            voxels to hold as few points as they should.
+        spacing_m: approximate spacing of the points of a wall; not the side of coarser cells,
+            because the larger the voxels, the more stray points of a dense scan they hold.
+        stations_world: (s, 3) metres, positions of the scanner, if known.
+        n_least: points with fewer neighbours are outliers, in a box small enough for its voxels to
+            hold the intended number of points.
         threads: see `Occluders`.
     """
     places = [camera.centre_world for camera in cameras]
@@ -116,12 +115,12 @@ def occluders_in(
     n_least: int,
     threads: int,
 ) -> Occluders:
-    """Count the points in a box, to know outliers and the gaps between points.
+    """Count the points in a box, to detect outliers and estimate point spacing.
 
     Args:
         cloud: the whole cloud.
         box: nothing outside of it hides anything.
-        stations_world: (s, 3) metres, where scanners stood, if that is known.
+        stations_world: (s, 3) metres, positions of the scanner, if known.
         n_least: see `Occluders`.
         threads: see `Occluders`.
     """
@@ -145,7 +144,7 @@ def occluders_in(
         stations = np.unique(stations_world, axis=0) - cloud.origin
         _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
         _forget_around(grid, stations)
-    # What is as thin as a line has that many more points in larger voxels.
+    # A linear object has that many more points in larger voxels.
     n_asked = math.ceil(n_least * larger)
     return Occluders(
         origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
@@ -153,7 +152,7 @@ def occluders_in(
 
 
 def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
-    """Look at the cloud through a camera."""
+    """Render the cloud through a camera."""
     reduction = max(1, -(-max(camera.width, camera.height) // _LONGEST_SIDE_PX))
     shape = (-(-camera.height // reduction), -(-camera.width // reduction))
     flat = camera.shifted(occluders.origin).flat
@@ -180,7 +179,7 @@ def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
 
 
 def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
-    """Return the depth buffer of an empty world."""
+    """Return the depth buffer of an empty scene."""
     return DepthBuffer(
         nearest=np.full((1, 1), np.inf, dtype=np.float32),
         reduction=float(max(camera.width, camera.height)),
@@ -188,9 +187,9 @@ def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
 
 
 def _closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depths without holes of a pixel or two: nothing near lets a wall shine through.
+    """Fill holes of a pixel or two, so that no wall is visible through a nearer surface.
 
-    The nearest, then the farthest of 3 x 3 pixels, one axis after the other.
+    Take the nearest, then the farthest of 3 x 3 pixels, one axis after the other.
     """
     for choose in (np.minimum, np.maximum):
         for axis in range(2):
@@ -207,15 +206,15 @@ def _part(points: Offsets, piece: slice) -> Offsets:
 
 
 def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_few: float) -> None:
-    """Take no surface to be where few points are spread over all 27 voxels, as none spreads them.
+    """Reject voxels whose few points are spread over all 27 voxels, which no surface does.
 
-    Of all pairs of points, one in 27 lies in one voxel where they stray, one in 9 on a surface and
-    one in 3 along a line.
+    Of all pairs of points, one in 27 shares a voxel if points are scattered, one in 9 on a surface
+    and one in 3 along a line.
 
     Args:
         counts: of 27 voxels, changed in place.
         squares: of the counts of single voxels, changed in place.
-        n_few: a surface has more.
+        n_few: a surface has more points than this.
     """
     _sum_neighbours(squares)
     places = np.nonzero((counts > 1) & (counts < n_few))
@@ -227,11 +226,11 @@ def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_fe
 def _forget_passed(
     grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
 ) -> None:
-    """Take no surface to be where nearly all rays of the stations that lead there went on.
+    """Reject voxels which nearly all rays of the stations passed through.
 
-    Stray points of a dense scan lie closely enough to look like a surface, near its station most of
-    all; but of the rays about each of them hardly one ended there. A cloud that was thinned has as
-    few points near its stations, but not fewer than a surface has.
+    Stray points of a dense scan can be as close together as those of a surface, most of all near a
+    station; but hardly any of the rays in their direction ended there. A thinned cloud has as few
+    points near its stations, but not fewer than a surface has.
     """
     every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
     places = np.column_stack([axis[every] for axis in points]).astype(np.float64)
@@ -240,7 +239,7 @@ def _forget_passed(
     middles = grid.low + grid.side_m * (
         np.array(np.unravel_index(filled, grid.counts.shape)).T + 0.5
     )
-    # Each station is taken to have all points, so that their mean is what all together have.
+    # Each station is assumed to have all points, so that the mean is that of all together.
     rays = np.zeros(len(filled))
     for station in stations:
         per_sr = weight * _points_per_sr(places - station) / len(stations)
@@ -252,7 +251,7 @@ def _forget_passed(
 
 
 def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How many points lie in a direction: (rows, columns) of elevation and azimuth."""
+    """Count the points per direction: (rows, columns) of elevation and azimuth."""
     counts = np.zeros((_N_ELEVATIONS, 2 * _N_ELEVATIONS))
     np.add.at(counts, _directions(ways), 1.0)
     edges = np.sin(np.linspace(-0.5 * math.pi, 0.5 * math.pi, _N_ELEVATIONS + 1))
@@ -260,7 +259,7 @@ def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row of elevation and column of azimuth of each way (n, 3)."""
+    """Return the row of elevation and the column of azimuth of each direction (n, 3)."""
     elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1])) / math.pi + 0.5
     azimuth = np.arctan2(ways[:, 1], ways[:, 0]) / math.pi + 1.0
     rows, columns = ((_N_ELEVATIONS * each).astype(np.intp) for each in (elevation, azimuth))
@@ -268,7 +267,7 @@ def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
-    """Take no surface to be where a scanner is blind."""
+    """Reject voxels at ranges below the minimum of a scanner."""
     for station in stations:
         middle = (station - grid.low) / grid.side_m - 0.5
         reach = _BLIND_M / grid.side_m

@@ -1,4 +1,4 @@
-"""The border to OpenCV, which has the centre of the first pixel at (0, 0) instead of (0.5, 0.5)."""
+"""Conversion to and from OpenCV, where the centre of the first pixel is (0, 0), not (0.5, 0.5)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-# What a pixel coordinate of ours is larger by.
+# Difference between our pixel coordinates and OpenCV's.
 HALF_PIXEL: Final = 0.5
 
 
 class Lens(Protocol):
-    """What a camera matrix is made of: pixels, first pixel centre at (0.5, 0.5)."""
+    """The elements of a camera matrix: pixels, first pixel centre at (0.5, 0.5)."""
 
     @property
     def fx(self) -> float: ...  # noqa: D102 - as `Intrinsics` has it
@@ -27,17 +27,17 @@ class Lens(Protocol):
 
 
 def to_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Pixel coordinates of ours as OpenCV counts them; the type stays."""
+    """Convert our pixel coordinates to OpenCV's; the type is kept."""
     return pixels - HALF_PIXEL
 
 
 def from_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
-    """OpenCV's pixel coordinates as ours; the type stays."""
+    """Convert OpenCV's pixel coordinates to ours; the type is kept."""
     return pixels + HALF_PIXEL
 
 
 def opencv_matrix(lens: Lens) -> NDArray[np.float64]:
-    """Camera matrix (3, 3) for OpenCV, whose own functions overlook the skew in it."""
+    """Return the camera matrix (3, 3) for OpenCV, whose own functions ignore the skew in it."""
     return np.array(
         [
             [lens.fx, lens.skew or 0.0, lens.cx - HALF_PIXEL],

@@ -16,20 +16,20 @@ from orthoflow.geometry.directions import basis_from_up
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
 from orthoflow.geometry.planes import Plane
 
-# How far a wall's points may end before the corner that it makes with the next.
+# Maximum distance between the end of a wall's points and its corner with the next wall.
 _JOINED_M: Final = 1.0
-# Walls as near before one another, facing the same way, are one wall with relief.
+# Walls this close in front of each other that face the same way are one wall with relief.
 _RELIEF_M: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class RoomOutline:
-    """What a room is bounded by.
+    """The boundary of a room.
 
     Attributes:
         walls: indices of the planes that bound it and join another, in the order of the chains.
-        chains_world: outlines at the height of the floor, (n, 3) metres each; walls that follow
-            one another share a point.
+        chains_world: outlines at the height of the floor, (n, 3) metres each; consecutive walls
+            share a point.
         closed: for each chain whether its last point joins its first.
         faces_world: (w, 4, 3) metres, faces of `walls` from floor to ceiling: top left, bottom
             left, bottom right, top right as the viewer sees them.
@@ -71,13 +71,13 @@ _End = tuple[int, int]
 def room_outline(
     planes: Sequence[Plane], corners_world: NDArray[np.float64], up: NDArray[np.float64]
 ) -> RoomOutline:
-    """Join the walls of a room to its outline.
+    """Join the walls of a room into its outline.
 
-    Of walls with relief the first of their planes counts. A wall ends where its line crosses
-    that of the next, if its points come within a metre of there; else where its points end.
+    Of the planes of a wall with relief the first counts. A wall ends where its line crosses that of
+    the next, if its points come within a metre of there; otherwise where its points end.
 
     Args:
-        planes: planes, the normals into the room, those of most points first.
+        planes: planes, the normals into the room, sorted by number of points, largest first.
         corners_world: (k, 4, 3) metres, rectangles of their points, top left first,
             counter-clockwise for the viewer.
         up: (3,) unit vector.
@@ -106,7 +106,7 @@ def room_outline(
 def _level(
     planes: Sequence[Plane], corners: NDArray[np.float64], up: NDArray[np.float64]
 ) -> int | None:
-    """The largest level plane that faces a direction."""
+    """Return the largest level plane that faces a direction."""
     limit = math.cos(math.radians(LEVEL_LIMIT_DEG))
     areas = {
         k: float(np.linalg.norm(np.cross(quad[1] - quad[0], quad[3] - quad[0])))
@@ -119,7 +119,7 @@ def _level(
 def _bounding(
     planes: Sequence[Plane], corners: NDArray[np.float64], basis: NDArray[np.float64]
 ) -> list[_Wall]:
-    """The walls, without those that are relief on one before them."""
+    """Return the walls without those that are relief on an earlier one."""
     limit = math.sin(math.radians(LEVEL_LIMIT_DEG))
     upright = [
         _Wall(
@@ -133,14 +133,14 @@ def _bounding(
     ]
     kept: list[_Wall] = []
     for wall in upright:
-        # A rectangle without a width, which no detector gives, is nowhere along a wall.
+        # A rectangle of zero width, which no detector returns, has no position along a wall.
         if wall.length_m > 0.0 and not any(_is_relief(wall, larger) for larger in kept):
             kept.append(wall)
     return kept
 
 
 def _is_relief(wall: _Wall, larger: _Wall) -> bool:
-    """Whether a wall lies before or behind most of a larger one and faces the same way."""
+    """Whether a wall is in front of or behind most of a larger one and faces the same way."""
     if float(wall.plane.normal @ larger.plane.normal) < math.cos(math.radians(LEVEL_LIMIT_DEG)):
         return False
     middle = wall.corners.mean(axis=0)
@@ -154,7 +154,7 @@ def _is_relief(wall: _Wall, larger: _Wall) -> bool:
 
 
 def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
-    """Ends of walls that meet, each with one other, the nearest first."""
+    """Return pairs of wall ends that meet, the nearest first."""
     candidates: list[tuple[float, _End, _End]] = []
     for (i, first), (j, second) in combinations(enumerate(walls), 2):
         crossing = _crossing(first, second)
@@ -176,7 +176,7 @@ def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
 
 
 def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
-    """Where two walls' lines cross in plan."""
+    """Return the intersection of the lines of two walls in plan."""
     along = [wall.ends[1] - wall.ends[0] for wall in (first, second)]
     matrix = np.column_stack([along[0], -along[1]])
     size = first.length_m * second.length_m
@@ -188,10 +188,10 @@ def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
 
 
 def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool]]:
-    """Walls that follow one another, each with the end at which it is entered; whether closed."""
+    """Return chains of walls, each wall with the end at which it is entered, and whether it is closed."""
     left = set(range(count))
     chains: list[tuple[list[_End], bool]] = []
-    # From free ends first, so that what is not closed is walked from its beginning.
+    # Free ends first, so that an open chain is followed from its beginning.
     free = [(k, side) for k, side in product(range(count), (0, 1)) if (k, side) not in joints]
     for start in [*free, *((k, 0) for k in range(count))]:
         if start[0] not in left:
@@ -236,7 +236,7 @@ def _corner_in_plan(
 def _face(
     walls: Sequence[_Wall], place: int, joints: dict[_End, _End], levels: Sequence[Plane | None]
 ) -> NDArray[np.float64]:
-    """Corners (4, 3) of a wall between its neighbours, ceiling and floor."""
+    """Return the corners (4, 3) of a wall between its neighbours, ceiling and floor."""
     own = walls[place]
     sides = []
     for side, (top, bottom) in enumerate(((0, 1), (3, 2))):
@@ -260,7 +260,7 @@ def _on_line(
     level: Plane | None,
     near: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Where a line meets floor or ceiling; without one, the place on it nearest to a point."""
+    """Return where a line meets floor or ceiling; without one, its point nearest to a given point."""
     point, direction = line
     if level is None:
         return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)

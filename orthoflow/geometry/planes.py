@@ -1,4 +1,4 @@
-"""Planes in space: construction, signed distances, the angles the literature prints, rectangles."""
+"""Planes in space: construction, signed distances, the angles used in the literature, rectangles."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Plane:
             raise GeometryError(f"a plane needs a unit normal of shape (3,), got {self.normal!r}")
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distances (n,) of points (n, 3) in metres, positive on the viewer's side."""
+        """Return signed distances (n,) of points (n, 3) in metres, positive on the viewer's side."""
         return points_world @ self.normal - self.offset_m
 
     def flipped(self) -> Plane:
@@ -61,7 +61,7 @@ def plane_through(points_world: NDArray[np.float64]) -> Plane:
 
 
 def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Angle between two unit vectors in degrees, 0..180, exact for small angles too."""
+    """Return the angle between two unit vectors in degrees, 0..180, accurate for small angles too."""
     cross = float(np.linalg.norm(np.cross(first, second)))
     return math.degrees(math.atan2(cross, float(first @ second)))
 
@@ -69,8 +69,8 @@ def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -
 def omega_phi_deg(normal: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[float, float]:
     """Direction (omega 0..360) and inclination (phi -90..90) of a normal, in degrees.
 
-    markiewicz2015 equation 3: n = (cos phi cos omega, cos phi sin omega, sin phi), taken in the
-    (e1, e2, up) frame of `basis_from_up`.
+    markiewicz2015 equation 3: n = (cos phi cos omega, cos phi sin omega, sin phi), in the (e1, e2,
+    up) frame of `basis_from_up`.
     """
     first, second, height = basis_from_up(up) @ normal
     omega = math.degrees(math.atan2(second, first)) % 360.0

@@ -1,4 +1,4 @@
-"""The points of a cloud in the one form that compiled passes take them."""
+"""The points of a cloud in the form that compiled passes require."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Offsets(NamedTuple):
 
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
-    """Return arrays, mapped files among them, in the one form that kernels are compiled for."""
+    """Return arrays, including mapped files, in the form for which kernels are compiled."""
     views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
     for view in views:
         view.flags.writeable = False

@@ -1,9 +1,9 @@
-"""Compiled passes that lay points into the cells of a raster.
+"""Compiled passes that bin points into the cells of a raster.
 
-A pass works on one chunk of the cloud after the other. `project_points` transforms a chunk and
-keeps what falls into the raster, in the order of the points; the passes then run over the kept
-entries, each thread on the cells it owns. Every cell is therefore visited in the order of the
-points whatever the number of threads, and no result depends on it, sums of floats included.
+A pass processes one chunk of the cloud after the other. `project_points` transforms a chunk and
+keeps the points inside the raster, in order; the passes then run over these entries, each thread on
+the cells it owns. Every cell is therefore visited in the order of the points for any number of
+threads, and no result depends on it, including sums of floats.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, inlined, kernel_part
 from orthoflow.geometry.point_kernels import Offsets
 
-# Points handled by one task; an entry slot exists for each, so that tasks never wait for another.
+# Points per task; an entry slot exists for each, so that tasks never wait for each other.
 BLOCK: Final = 8192
 # Points transformed together; their coordinates stay in the first-level cache.
 _LANE: Final = 256
-# Cells are dealt out to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
-# rows, and a thread that meets its own points in long runs is not slowed by the others'.
+# Cells are assigned to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
+# rows, and a thread that meets its own points in long runs is not slowed down by the others'.
 _RUN_SHIFT: Final = 17
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
-# One cell in one record: a scan along columns touches another row of the raster with every point,
-# and one cache line for each is what the passes wait for.
+# One record per cell: a scan along columns accesses another row of the raster with every point, and
+# the passes are limited by one cache line for each.
 WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
-# The same record with the bits of its floats as whole numbers.
+# The same record with the bits of its floats as integers.
 _WINNER_BITS: Final = np.dtype(
     [("depth_m", "i4"), ("square", "i4"), ("point", "u4"), ("n_points", "u4")]
 )
-# Cells whose channels are fetched one after the other: their winners stay in the nearest cache.
+# Cells whose channels are fetched one after the other: their winners stay in the first-level cache.
 _RUN_OF_VALUES: Final = 1024
 
 
 class Target(NamedTuple):
-    """The raster that points are laid into.
+    """The raster into which points are binned.
 
     Attributes:
         wall_from_offset: (3, 4) float64; rows give column, row and depth in metres of an offset.
-        behind_m: smallest depth that counts.
-        front_m: largest depth that counts.
+        behind_m: smallest accepted depth.
+        front_m: largest accepted depth.
         height: number of rows.
         width: number of columns.
     """
@@ -55,7 +55,7 @@ class Target(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Points of one chunk that fall into the raster, `n_inside[b]` from slot `b * BLOCK` on.
+    """Points of one chunk that lie inside the raster, `n_inside[b]` from slot `b * BLOCK` on.
 
     Attributes:
         cells: int32, row * width + column.
@@ -95,7 +95,7 @@ def project_points(
             stop = min(lane + _LANE, end)
             part = Offsets(offsets.x[lane:stop], offsets.y[lane:stop], offsets.z[lane:stop])
             after = slot + stop - lane
-            # A scan comes in order: most lanes are wholly inside or wholly outside.
+            # A scan is ordered: most lanes are entirely inside or entirely outside.
             n_inside = _set_cells(part, target, entries.cells[slot:after])
             if n_inside == 0:
                 continue
@@ -112,7 +112,7 @@ def project_points(
 def leave_out(
     is_left_out: NDArray[np.bool_], entries: Entries, first_block: int, end_block: int
 ) -> None:
-    """Drop the entries of some points from blocks of `entries`; what stays keeps its order.
+    """Drop the entries of some points from blocks of `entries`; the rest keeps its order.
 
     Args:
         is_left_out: (n,) of the points of the cloud.
@@ -129,13 +129,13 @@ def leave_out(
         entries.n_inside[block] = _close_up(entries, begin, after) - begin
 
 
-# Each of the loops below writes one array and has no branches, so that the processor takes several
-# points at once. float64 on purpose: the passes wait for memory, not for arithmetic.
+# Each loop below writes one array and has no branches, so that it is vectorised. float64 on
+# purpose: the passes are limited by memory, not by arithmetic.
 
 
 @kernel_part
 def _set_cells(part: Offsets, target: Target, cells: NDArray[np.int32]) -> int:
-    """Set the cell of each point, -1 outside, and give how many are inside."""
+    """Set the cell of each point, -1 outside, and return the number inside."""
     m = target.wall_from_offset
     u0, u1, u2, u3 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
     v0, v1, v2, v3 = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
@@ -184,7 +184,7 @@ def _set_squares(part: Offsets, m: NDArray[np.float64], squares: NDArray[np.floa
 
 @kernel_part
 def _close_up(entries: Entries, slot: int, after: int) -> int:
-    """Move entries with a cell to the front, in their order, and give the slot after the last."""
+    """Move entries with a cell to the front, in order, and return the slot after the last."""
     for k in range(slot, after):
         cell = entries.cells[k]
         entries.cells[slot] = cell
@@ -203,7 +203,7 @@ def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers
 
 @compiled
 def empty_cells(winners: NDArray[np.void], first: int, end: int) -> None:
-    """Make some cells of `WINNER` such that nobody has won them yet."""
+    """Initialise some cells of `WINNER` without a winner."""
     for cell in range(first, end):
         winner = winners[cell]
         winner.depth_m = np.float32(-np.inf)
@@ -221,12 +221,12 @@ def take_values(
     first: int,
     end: int,
 ) -> None:
-    """Return some cells the values of the points that won them.
+    """Fetch for some cells the values of the points that won them.
 
     Args:
         winners: (cells,) of `WINNER`.
         values: (points of the cloud, channels).
-        nothing: for cells without a point of their own.
+        nothing: value for cells without a point of their own.
         taken: (cells, channels), overwritten.
         first: first cell.
         end: the cell after the last one.
@@ -252,7 +252,7 @@ def find_places(
     first: int,
     end: int,
 ) -> None:
-    """Find where the points that won some cells lie.
+    """Find the positions of the points that won some cells.
 
     Args:
         cells: (n,) flat indices.
@@ -260,8 +260,8 @@ def find_places(
         offsets: of the cloud.
         wall_from_offset: (3, 4) as in `Target`.
         places: (rows, cols, 2) to the right of and below the centre, overwritten at the cells.
-        first: first of `cells` to visit.
-        end: the one after the last.
+        first: first item of `cells` to visit.
+        end: the item after the last one.
     """
     m = wall_from_offset
     for cell in cells[first:end]:
@@ -279,12 +279,12 @@ def find_places(
 
 @inlined
 def _rank(depth_bits, square_bits):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Order of points as whole numbers: larger depths first, then smaller squares.
+    """Return an integer sort key of points: descending depth, then ascending squared distance.
 
-    Bits of floats, those of negative ones turned over, are in the order of their values; there is
-    no depth of -0.0 (see `wall_from_offset`), and squares are never negative. Whole numbers are
-    compared and chosen without branches: which of a cell's points wins cannot be foreseen, and
-    wrong guesses took half of the pass.
+    Bits of floats, inverted for negative ones, sort like their values; depths of -0.0 do not occur
+    (see `wall_from_offset`), and squares are never negative. Integers are compared and selected
+    without branches: which point wins a cell is unpredictable, and mispredicted branches took half
+    of the pass.
     """
     ordered = np.int64(depth_bits ^ ((depth_bits >> np.int32(31)) & np.int32(0x7FFFFFFF)))
     return (ordered << 32) - np.int64(square_bits)
@@ -297,14 +297,14 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
     Args:
         entries: one chunk.
         winners: (cells,) of `WINNER`, updated; depths start at minus infinity.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     winners_in_bits = winners.view(_WINNER_BITS)
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         end = first + entries.n_inside[block]
-        # Unsigned, an index is not looked at for being negative.
+        # An unsigned index needs no check for negative values.
         cells = entries.cells[first:end].view(np.uint32)
         depths, squares = entries.depths_m[first:end], entries.squares[first:end]
         depth_bits, square_bits = depths.view(np.int32), squares.view(np.int32)
@@ -329,8 +329,8 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
     Args:
         entries: one chunk.
         winners: (cells,) of `WINNER`, updated; squares start at infinity.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     for block in range(entries.n_inside.size):
         first = block * BLOCK

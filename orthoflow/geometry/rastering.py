@@ -1,6 +1,6 @@
-"""Laying a cloud into the raster of a wall: streams the points, gives arrays per cell.
+"""Binning a cloud into the raster of a wall: streams the points, returns arrays per cell.
 
-Loads numba through `raster_kernels`: methods import it where they run.
+This module loads numba through `raster_kernels`: methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Slab
 from orthoflow.geometry.threads import in_parts, in_threads
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
-# wait for each other seldom.
+# rarely wait for each other.
 _CHUNK: Final = 1 << 20
 
-# Who lends to a gap is among the cells nearest to it, or a cell farther.
+# A gap is filled from the cells nearest to it, or from cells one farther.
 _BESIDE_GAPS_CELLS: Final = 2
 
 _Value = TypeVar("_Value", bound=np.generic)
 
 
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transform (3, 4) from offsets of a cloud in metres to (column, row, depth in metres).
+    """Return the transform (3, 4) from offsets of a cloud (m) to (column, row, depth in metres).
 
-    The difference of the two origins is taken once, in float64: with survey coordinates of 10^6 m
-    nothing is lost.
+    The difference of the two origins is taken once, in float64, so that survey coordinates of 10^6
+    m lose no precision.
     """
     axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
-    # Added to +0.0, no place or depth is ever -0.0, which is smaller than +0.0 only by its bits.
+    # Adding +0.0 avoids -0.0, which sorts below +0.0 by its bits.
     return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])
 
 
@@ -48,17 +48,17 @@ def entries_inside(
     rows: slice | None = None,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> Iterator[Entries]:
-    """Return the points inside a slab, chunk by chunk, in their order.
+    """Yield the points inside a slab, chunk by chunk, in order.
 
-    The yielded arrays are overwritten by the next chunk. Blocks of points whose box lies beside
+    The yielded arrays are overwritten by the next chunk. Blocks of points whose box does not meet
     the slab are not read.
 
     Args:
         points: of the cloud.
         slab: of the wall.
-        threads: how many threads work.
-        rows: of the raster that are asked for; points in others may be left out. None for all.
-        is_left_out: (n,) points that do not count; None where all do.
+        threads: number of threads.
+        rows: the rows of the raster that are needed; points in others may be omitted. None for all.
+        is_left_out: (n,) points to ignore; None to use all.
     """
     frame = slab.frame
     target = Target(
@@ -82,7 +82,7 @@ def entries_inside(
 
 
 def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
-    """First point and the one after the last of chunks that may hold points inside."""
+    """Yield the first point, and the one after the last, of chunks that may have points inside."""
     n_points, boxes_m = points.x.size, points.boxes_m
     if boxes_m is None:
         edges = np.array([[0, n_points]])
@@ -99,16 +99,16 @@ def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[
 def _may_hold_points(
     boxes_m: NDArray[np.float64], target: Target, rows: slice | None
 ) -> NDArray[np.bool_]:
-    """Which boxes (n, 2, 3) meet a slab, or may: they stand askew to it."""
+    """Report which boxes (n, 2, 3) may meet a slab, which need not be aligned to the axes."""
     axes = target.wall_from_offset[:, :3]
     middles = boxes_m.mean(axis=1) @ axes.T + target.wall_from_offset[:, 3]
     halves = 0.5 * (boxes_m[:, 1] - boxes_m[:, 0]) @ np.abs(axes).T
     first_row, end_row = (0, target.height) if rows is None else (rows.start, rows.stop)
     low = np.array([0.0, first_row, target.behind_m])
     high = np.array([target.width, end_row, target.front_m])
-    # What is lost by rounding is far less.
+    # Far more than is lost by rounding.
     slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
-    # A box with a coordinate that is not a number compares with nothing, and is not left out.
+    # A box with a NaN coordinate compares false, and is kept.
     is_beside = (middles + halves < low - slack) | (middles - halves > high + slack)
     found: NDArray[np.bool_] = ~is_beside.any(axis=1)
     return found
@@ -118,8 +118,8 @@ def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
     """Run passes one after the other, each thread on the cells it owns.
 
     Args:
-        threads: how many threads; a power of two of them is used.
-        passes: take the number of owners and the owner whose cells to visit.
+        threads: number of threads, rounded down to a power of two.
+        passes: functions of the number of owners and the owner whose cells to visit.
     """
     owners = 1 << (max(1, threads).bit_length() - 1)
 
@@ -137,15 +137,15 @@ def topmost_points(
     threads: int,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.void]:
-    """The point nearest to the viewer in each cell: the rule of skarlatos2012.
+    """Return the point nearest to the viewer in each cell: the rule of skarlatos2012.
 
     Ties go to the point nearer the centre of its cell, then to the lower index.
 
     Args:
         points: of the cloud.
         slab: of the wall.
-        threads: how many threads work.
-        is_left_out: (n,) points that do not count; None where all do.
+        threads: number of threads.
+        is_left_out: (n,) points to ignore; None to use all.
 
     Returns:
         (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
@@ -157,7 +157,7 @@ def topmost_points(
 
 
 def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
-    """Return cells that nobody has won yet."""
+    """Return cells without winners."""
     winners = np.empty(n_cells, dtype=WINNER)
     in_parts(partial(kernels.empty_cells, winners), n_cells, threads=threads)
     return winners
@@ -166,13 +166,13 @@ def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
 def values_of_winners(
     winners: NDArray[np.void], values: NDArray[_Value], nothing: float, *, threads: int
 ) -> NDArray[_Value]:
-    """Values (cells, channels) of the points that won the cells.
+    """Return the values (cells, channels) of the points that won the cells.
 
     Args:
         winners: (cells,) of `raster_kernels.WINNER`.
         values: (n, channels) of the points of the cloud.
-        nothing: for cells without a point of their own.
-        threads: how many threads work.
+        nothing: value for cells without a point of their own.
+        threads: number of threads.
     """
     taken = np.empty((winners.size, values.shape[1]), dtype=values.dtype)
     seen = np.asarray(values).view(np.ndarray)
@@ -186,11 +186,11 @@ def values_of_winners(
 def places_of_winners(
     points: OffsetPoints, slab: Slab, winners: NDArray[np.void], *, threads: int
 ) -> NDArray[np.float32]:
-    """Where the points lie that won the cells beside gaps, between which these are filled.
+    """Return the positions of the points that won cells next to gaps, from which these are filled.
 
     Returns:
-        (cells, 2) to the right of and below the centre, in cells; 0 in cells that no void one lies
-        near, NaN in cells without a point of their own.
+        (cells, 2) right of and below the centre, in cells; 0 in cells without a void cell nearby,
+        NaN in cells without a point of their own.
     """
     is_beside = (winners["n_points"] == 0).reshape(slab.frame.shape)
     for grown in (is_beside, is_beside.T):

@@ -1,8 +1,8 @@
 """Resection: the pose of one camera from points of its photo that are known in the world.
 
 A weighted least-squares adjustment (Gauss-Markov, damped after Levenberg and Marquardt) with the
-full lens model. The observations are the pixels; that the points themselves are uncertain enters
-each pixel's covariance.
+full lens model. The observations are the pixels; the uncertainty of the points enters the
+covariance of each pixel.
 """
 
 from __future__ import annotations
@@ -34,24 +34,25 @@ from orthoflow.geometry.rotations import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
-# A step that gains so little of some hundred points' squares moved no parameter by more than a
-# hundredth of its standard deviation, and the next one would by far less.
+# A step that reduces the sum of squares by so little, with a few hundred points, moves no parameter
+# by more than a hundredth of its standard deviation, and the next one by far less.
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
-# A point whose own uncertainty covers more of the image's longer side agrees with any pixel.
+# A point whose own uncertainty covers more than this share of the image's longer side agrees with
+# any pixel.
 _BLUR_MOST_SHARE: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenPoints(Rows):
-    """Points seen in one photo and known in the world.
+    """Points seen in one photo with known world coordinates.
 
     Attributes:
         pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64, of each pixel coordinate.
-        sigma_m: (n,) float64, of each world coordinate.
+        sigma_px: (n,) float64, standard deviation of each pixel coordinate.
+        sigma_m: (n,) float64, standard deviation of each world coordinate.
     """
 
     pixels_photo: NDArray[np.float64]
@@ -62,18 +63,17 @@ class SeenPoints(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Resection:
-    """An adjusted camera and how good it is.
+    """An adjusted camera and its accuracy.
 
     Attributes:
         camera: the camera.
-        covariance: (p, p) float64 of rotation vector (left of camera_from_world), translation,
-            then what was free of the lens in the order of `LensFreedom.names`; as large as the
-            residuals say.
-        sigma0: standard deviation of unit weight: 1 where the sigmas of the points were right.
-        variance_factor: how much larger `covariance` is than for sigmas taken as they are, mean
-            over its axes: sigma0 squared, or more where residuals of neighbouring points agree, so
+        covariance: (p, p) float64 of rotation vector (left of camera_from_world), translation, then
+            the free lens parameters in the order of `LensFreedom.names`; scaled by the residuals.
+        sigma0: standard deviation of unit weight: 1 if the sigmas of the points are right.
+        variance_factor: ratio of `covariance` to the one that follows from the given sigmas, mean
+            over its axes: sigma0 squared, or more if residuals of neighbouring points agree, so
             that the points are not independent.
-        lens: what was free.
+        lens: which parameters were free.
     """
 
     camera: ViewingCamera
@@ -85,13 +85,13 @@ class Resection:
 
 @dataclass(frozen=True, kw_only=True)
 class Misfit:
-    """How points fit a camera.
+    """The fit of points to a camera.
 
     Attributes:
         residuals_px: (n, 2) float64 observed - computed; NaN where the camera cannot see the point.
-        normalised: (n,) float64 length of the residual in units of its expected standard
-            deviation (chi with 2 degrees of freedom); inf where the camera cannot see the point,
-            and where the point lies so near to it that it could be anywhere in the image.
+        normalised: (n,) float64 length of the residual in units of its expected standard deviation
+            (chi with 2 degrees of freedom); inf where the camera cannot see the point, and where
+            the point is so close to it that it could be anywhere in the image.
     """
 
     residuals_px: NDArray[np.float64]
@@ -110,14 +110,14 @@ def adjust(
     """Adjust a camera to the points it sees.
 
     Args:
-        seen: the points, at least as many as the unknowns need.
+        seen: the points, at least as many as the unknowns require.
         start: the camera to start from.
-        prior: its interior orientation is what is known beforehand of what is free of the lens;
-            that of `start` by default.
-        lens: what of the interior orientation is free; nothing by default.
+        prior: its interior orientation is the prior of the free lens parameters; by default that of
+            `start`.
+        lens: which parameters of the interior orientation are free; none by default.
         groups: (n,) group of each point, e.g. a cell of the image, within which residuals may be
             correlated; None takes all as independent.
-        soft_limit: residuals beyond so many standard deviations count less (Huber).
+        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -136,7 +136,7 @@ def stated(
     groups: NDArray[np.intp] | None = None,
     soft_limit: float = math.inf,
 ) -> Resection:
-    """State how good the camera is that `fitted` found, with the same arguments as `adjust`.
+    """Return the accuracy of the camera that `fitted` found, with the same arguments as `adjust`.
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -149,7 +149,7 @@ def stated(
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the points of a photo do not determine its pose") from error
-    # What the prior says of the lens, the points need not.
+    # The points need not determine what the prior does.
     from_prior = float((np.diag(cofactors)[POSE_PARAMETERS:] / lens.sigmas**2).sum())
     redundancy = 2 * len(seen) - n_free + from_prior
     sigma0 = math.sqrt(float((errors.residuals**2).sum()) / redundancy)
@@ -178,7 +178,7 @@ def fitted(
     lens: LensFreedom | None = None,
     soft_limit: float = math.inf,
 ) -> ViewingCamera:
-    """Return the camera that `adjust` finds, without saying how good it is.
+    """Return the camera that `adjust` finds, without its accuracy.
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -190,7 +190,7 @@ def fitted(
 def first_step(
     seen: SeenPoints, camera: ViewingCamera, lens: LensFreedom, *, soft_limit: float = math.inf
 ) -> NDArray[np.float64]:
-    """Return how an adjustment of more unknowns would first change a camera (6 + free,).
+    """Return the first step of an adjustment with more unknowns (6 + free,).
 
     Raises:
         GeometryError: too few points, or they do not determine the pose.
@@ -201,11 +201,11 @@ def first_step(
 
 
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
-    """Report how points fit a camera, each against its own expected deviation."""
+    """Compute the fit of points to a camera, each against its own expected deviation."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
     linear = linearised(near, seen.points_world - middle, LensFreedom())
-    # Beyond the fold of a lens model there is no pixel.
+    # Beyond the radius where a lens model folds back there is no pixel.
     folds = camera.distortion.any()
     pixels = near.project(seen.points_world - middle)[:, :2] if folds else linear.pixels
     residuals = seen.pixels_photo - pixels
@@ -221,7 +221,7 @@ def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
 def predicted_covariances(
     resection: Resection, points_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariances (n, 2, 2) in pixels squared of where the camera sees points (n, 3)."""
+    """Return covariances (n, 2, 2) in pixels squared of the projections of points (n, 3)."""
     by_parameters = linearised(resection.camera, points_world, resection.lens).by_parameters
     return by_parameters @ resection.covariance @ by_parameters.transpose(0, 2, 1)
 
@@ -237,9 +237,9 @@ def pixels_by_point(
 def moved_origin(
     camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
 ) -> NDArray[np.float64]:
-    """Derivative (n_free, n_free) of a camera by the parameters of the one shifted by `middle`.
+    """Return the derivative (n_free, n_free) of a camera by those of the one shifted by `middle`.
 
-    t = t_local - R middle; a turn w left of R moves R middle by w x (R middle).
+    t = t_local - R middle; a rotation w left of R moves R middle by w x (R middle).
     """
     derivative = np.eye(n_free)
     derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
@@ -247,7 +247,7 @@ def moved_origin(
 
 
 def whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns (n, 2, c) in units of standard deviation: the inverse Cholesky factor applied."""
+    """Return columns (n, 2, c) whitened by the inverse Cholesky factor."""
     first = np.sqrt(covariances[:, 0, 0])
     mixed = covariances[:, 0, 1] / first
     second = np.sqrt(covariances[:, 1, 1] - mixed**2)
@@ -265,7 +265,7 @@ class _Errors:
 
 
 class _Problem:
-    """The adjustment of one camera, in a world whose origin is near the points."""
+    """The adjustment of one camera, in a world with its origin near the points."""
 
     def __init__(
         self, seen: SeenPoints, lens: LensFreedom, prior: ViewingCamera, soft_limit: float
@@ -306,7 +306,7 @@ class _Problem:
         return step
 
     def errors(self, camera: ViewingCamera) -> _Errors:
-        """Residuals and derivatives in units of their standard deviation, far ones softened."""
+        """Return residuals and derivatives in standard deviations, large ones downweighted."""
         seen = self._seen
         linear = linearised(camera, seen.points_world, self.lens)
         residuals = seen.pixels_photo - linear.pixels
@@ -328,7 +328,7 @@ class _Problem:
     def adjusted_points(
         self, camera: ViewingCamera, errors: _Errors, cofactors: NDArray[np.float64]
     ) -> AdjustedPoints:
-        """Return the points with what their errors do to the camera."""
+        """Return the points with the effect of their errors on the camera."""
         linear = linearised(camera, self._seen.points_world, LensFreedom())
         by_place = whiten(
             _pixel_covariances(linear, self._seen), linear.by_camera_point @ camera.rotation
@@ -356,19 +356,19 @@ class _Problem:
         return normal
 
     def _from_prior(self, camera: ViewingCamera) -> NDArray[np.float64]:
-        """Prior - current value of the free interior parameters."""
+        """Return prior minus current value of the free interior parameters."""
         return lens_values(self._prior, self.lens) - lens_values(camera, self.lens)
 
 
 def _problem(
     seen: SeenPoints, prior: ViewingCamera, lens: LensFreedom | None, soft_limit: float
 ) -> tuple[NDArray[np.float64], _Problem]:
-    """The adjustment relative to the middle of the points, and that middle.
+    """Return the adjustment relative to the middle of the points, and that middle.
 
-    Survey coordinates would cost digits.
+    Survey coordinates would lose digits.
     """
     freedom = LensFreedom() if lens is None else lens
-    # What is known of the lens beforehand determines it as far as the points do not.
+    # Prior knowledge of the lens determines what the points do not.
     if 2 * len(seen) < POSE_PARAMETERS + 2:
         raise GeometryError(
             f"a resection with {POSE_PARAMETERS} unknowns got only {len(seen)} points"

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 
 def signed_area(ring: NDArray[np.float64]) -> float:
-    """Area that a ring (n, 2), not closed, goes round (Gauss's formula), in its units squared.
+    """Return the area enclosed by an open ring (n, 2) by Gauss's formula, in its units squared.
 
-    Positive where it turns from the first axis to the second. Far from the origin digits are lost:
-    give places from one of its points.
+    Positive if it turns from the first axis to the second. Digits are lost far from the origin:
+    pass coordinates relative to one of its points.
 
     >>> signed_area(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]))
     2.0

@@ -1,4 +1,4 @@
-"""Measures of scatter that single wild values do not move."""
+"""Measures of scatter that single outliers do not change."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def median_deviation(values: NDArray[np.floating], middle: float | None = None) 
 
     Args:
         values: at least one.
-        middle: deviations are taken from here; None for the median.
+        middle: deviations are taken from this value; None for the median.
     """
     middle = float(np.median(values)) if middle is None else middle
     return NMAD_FACTOR * float(np.median(np.abs(values - middle)))

@@ -1,4 +1,4 @@
-"""Things kept as arrays with a row each: some of them, and those of several together."""
+"""Dataclasses of arrays with one row per item: selection and concatenation."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """What a dataclass is made of whose arrays have one row per thing; other fields tell of all."""
+    """Base of dataclasses whose arrays have one row per item; other fields describe all items."""
 
     def __len__(self) -> int:
         return len(next(iter(_arrays(self).values())))
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
-        """Return some of the things; views for a slice."""
+        """Return some of the items; views for a slice."""
         return replace(self, **{name: array[chosen] for name, array in _arrays(self).items()})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Put the things of several together, at least one; what tells of all is the first's."""
+        """Concatenate the items of several, at least one; fields that describe all are the first's."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
 

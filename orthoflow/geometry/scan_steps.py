@@ -1,4 +1,4 @@
-"""How far apart the points of a wall lie, told from a raster of counts."""
+"""Estimate of the point spacing on a wall from a raster of counts."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from numpy.typing import NDArray
 
 
 def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Distance between neighbouring points on the wall, estimated from the points per cell.
+    """Estimate the distance between neighbouring points on the wall from the points per cell.
 
-    Cells are joined, 2 x 2, until a block that holds points holds at least four on average: from
-    then on chance hardly leaves a block of scanned surface empty, so that the blocks show the
-    scanned area.
+    Cells are joined 2 x 2 until a block that holds points holds at least four on average: from then
+    on hardly any block of scanned surface is empty by chance, so that the blocks show the scanned
+    area.
 
     Args:
         count: (rows, cols) points per cell.
         gsd_m: side of a cell in metres.
 
     Returns:
-        Side of the square that each point has for itself, metres; 0 without points.
+        Side of the square per point, metres; 0 without points.
     """
-    # Sums over ever larger blocks stay below the number of points, which 32 bits hold.
+    # Sums over ever larger blocks stay below the number of points, which fits into 32 bits.
     blocks, side_m = count, gsd_m
     while blocks.any():
         per_block = blocks.sum(dtype=np.int64) / np.count_nonzero(blocks)
@@ -32,7 +32,7 @@ def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
 
 
 def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Sums of 2 x 2 blocks; at the right and below what is left over counts as it is."""
+    """Return sums of 2 x 2 blocks; a remaining row or column counts as it is."""
     rows, columns = blocks.shape
     sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
     for first_row in (0, 1):

@@ -1,11 +1,11 @@
 """Compiled ray casting in a scene of rectangles, through a tree of bounding boxes.
 
 The nearest hit is exact: the tree only skips what a ray cannot meet, and of two rectangles at the
-same distance the one with the smaller index wins, so no order of visiting shows.
+same distance the one with the smaller index wins, so the order of traversal does not matter.
 
-One kernel serves scanner, cameras and truth: whatever shoots rays lays them out in numpy, since
-every kernel more costs a second at the first run. It releases the interpreter lock and works on a
-range of rays, so that plain threads share the work.
+One kernel serves scanner, cameras and truth: their rays are prepared in numpy, since every further
+kernel costs a second at the first run. It releases the interpreter lock and works on a range of
+rays, so that threads share the work.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_par
 
 Index: TypeAlias = int | np.int64
 
-# A ray does not meet what it starts on.
+# A ray does not meet the surface on which it starts.
 _NEAREST: Final = 1e-9
 
 
 class CastTable(NamedTuple):
-    """A scene laid out for ray casting, relative to the scene's origin, along the boxes' axes.
+    """A scene prepared for ray casting, relative to its origin, along the axes of the boxes.
 
     Attributes:
         axes: (3, 3) float64 rotation from the scene's axes into those of the boxes.
@@ -60,8 +60,8 @@ class Ray(NamedTuple):
 def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Distance at which a ray meets one rectangle, in units of its direction; inf without."""
-    # Single numbers on purpose: a row as an array would be counted in and out of use each time.
+    """Return the distance to a rectangle along a ray, in units of its direction; inf if it misses."""
+    # Scalars on purpose: a row as an array would be reference-counted with each use.
     r = rectangles
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz
     if abs(facing) < 1e-12:
@@ -122,7 +122,7 @@ def cast_rays(
         table: the scene.
         starts: (3, n), or (3, 1) for all rays, metres from the scene's origin along its axes.
         ways: (3, n) directions along the scene's axes; their lengths are the units of t.
-        t: (n,) how far to look; filled with the distance of a hit, left where there is none.
+        t: (n,) maximum distance; set to the distance of a hit, unchanged without one.
         rectangle: (n,) filled; -1 without a hit.
     """
     rectangles, holes, nodes, axes = table.rectangles, table.holes, table.nodes, table.axes
@@ -140,7 +140,7 @@ def cast_rays(
         ray = Ray(x, y, z, dx, dy, dz)
         inverse = Ray(x, y, z, _inverse(dx), _inverse(dy), _inverse(dz))
         best_t, best = t[i], np.int64(-1)
-        # Trying first what the ray before hit spares most boxes; it changes no result.
+        # Trying the previous ray's hit first skips most boxes; it does not change the result.
         if guess >= 0:
             distance = _hit_distance(rectangles, holes, guess, ray)
             if distance < best_t:

@@ -1,4 +1,4 @@
-"""Shooting rays at a simulated scene: what they meet, and what colour is there.
+"""Ray casting in a simulated scene: which surface a ray meets, and its colour there.
 
 Import this module where it is used: it loads compiled kernels.
 """
@@ -16,7 +16,7 @@ from orthoflow.geometry.scene_kernels import CastTable, cast_rays
 from orthoflow.geometry.scenes import Scene, SurfaceRole
 from orthoflow.geometry.texture_kernels import PaintTable, paint_points
 
-# So many that arrays of one number per ray stay in the processor's cache.
+# Rays per batch, so that arrays of one number per ray stay in the processor's cache.
 RAYS_AT_ONCE: Final = 1 << 14
 
 
@@ -25,8 +25,8 @@ class Hits:
     """Where rays first meet a scene.
 
     Attributes:
-        t: (n,) float64 distance in units of the ray's direction, inf where nothing is met.
-        rectangle: (n,) int32 row of the scene, -1 where nothing is met.
+        t: (n,) float64 distance in units of the ray's direction, inf without a hit.
+        rectangle: (n,) int32 row of the scene, -1 without a hit.
     """
 
     t: NDArray[np.float64]
@@ -34,7 +34,7 @@ class Hits:
 
 
 class SceneRays:
-    """A scene laid out once for many rays.
+    """A scene prepared once for many rays.
 
     Starts and points are metres from the scene's origin. Arrays hold one row per coordinate,
     (3, n): numpy works on such rows several times as fast as on one row per point.
@@ -54,7 +54,7 @@ class SceneRays:
 
     @cached_property
     def objects(self) -> SceneRays:
-        """The free-standing objects alone; rectangles count among them."""
+        """Return the free-standing objects alone; rectangles are numbered among them."""
         return SceneRays(self._scene.only(self._scene.role == SurfaceRole.OBJECT))
 
     def cast(
@@ -64,12 +64,12 @@ class SceneRays:
         *,
         within: NDArray[np.float64] | float = np.inf,
     ) -> Hits:
-        """Find what rays meet first.
+        """Find the first hit of rays.
 
         Args:
             starts: (3, n), or (3, 1) for all.
             ways: (3, n) directions of any length, the unit of distances.
-            within: (n,) or one distance beyond which nothing counts.
+            within: (n,) or one maximum distance.
         """
         n_rays = ways.shape[1]
         t = np.empty(n_rays)
@@ -102,12 +102,12 @@ class SceneRays:
 def points_on(
     starts: NDArray[np.float64], ways: NDArray[np.float64], hits: Hits
 ) -> NDArray[np.float64]:
-    """Points (3, n) that rays meet; the start where they meet nothing."""
+    """Return the points (3, n) that rays meet; the start of rays without a hit."""
     return starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
 
 
 def _cast_table(scene: Scene) -> CastTable:
-    """Lay a scene out for ray casting, with its tree of bounding boxes."""
+    """Prepare a scene for ray casting, with its tree of bounding boxes."""
     tree = _BoxTree(scene)
     holes = np.searchsorted(scene.hole_rectangle, np.arange(len(scene) + 1))
     turned = scene.turned(tree.axes)
@@ -133,10 +133,10 @@ def _cast_table(scene: Scene) -> CastTable:
 
 
 class _BoxTree:
-    """Bounding boxes over rectangles, split where rays have the least to do.
+    """Bounding boxes over rectangles, split where the cost of rays is lowest.
 
-    The boxes lie along the axes of that rectangle which makes them smallest: in a room most others
-    are parallel or square to it, and their boxes are as thin as they are.
+    The boxes are aligned with the rectangle that makes them smallest: in a room most others are
+    parallel or perpendicular to it, and their boxes are thin.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -148,7 +148,7 @@ class _BoxTree:
             return
         self.axes = _tightest_axes(scene)
         corners = scene.corners_m() @ self.axes.T
-        # A micrometre of slack: a rectangle along the axes must not have an empty box.
+        # A tolerance of a micrometre: a rectangle along the axes must not have an empty box.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
         self._add(np.arange(len(scene)))
@@ -168,10 +168,11 @@ class _BoxTree:
         self.links[node] = (len(self.boxes), first, first)
 
     def _cheapest_half(self, members: NDArray[np.int64]) -> NDArray[np.bool_] | None:
-        """Choose the members of the first child; None when a leaf is cheaper.
+        """Choose the members of the first child; None if a leaf is cheaper.
 
-        The cost of a child is its number of rectangles times the surface of its box, which is how
-        often rays come by (Goldsmith and Salmon 1987); visiting a node costs about one rectangle.
+        The cost of a child is its number of rectangles times the surface of its box, which is
+        proportional to the probability of a hit (Goldsmith and Salmon 1987); visiting a node costs
+        about one rectangle.
         """
         if len(members) == 1:
             return None
@@ -196,7 +197,7 @@ def _surface_m2(sides: NDArray[np.float64]) -> float:
 
 
 def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Surfaces (n, k) of boxes round the first 1, 2, ... members of k orders, (n, k, 3) each."""
+    """Return surfaces (n, k) of boxes around the first 1, 2, ... members of k orders (n, k, 3)."""
     sides = np.maximum.accumulate(high) - np.minimum.accumulate(low)
     x, y, z = sides[..., 0], sides[..., 1], sides[..., 2]
     surfaces: NDArray[np.float64] = x * y + y * z + z * x

@@ -1,4 +1,4 @@
-"""Looking at a simulated scene: square to a wall, as a true orthoimage, and through cameras.
+"""Views of a simulated scene: the true orthoimage of a wall, and photos.
 
 Import this module where it is used: it loads compiled kernels.
 """
@@ -19,9 +19,9 @@ from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_
 from orthoflow.geometry.scenes import Scene, Viewers
 from orthoflow.geometry.threads import in_runs
 
-# A viewer sees a point when nothing is hit more than this before it, metres.
+# A viewer sees a point if the first hit is at most this far in front of it, metres.
 _SEEN_WITHIN_M: Final = 0.0005
-# A camera does when nothing is hit more than this share of its distance before it.
+# A camera does if the first hit is at most this share of its distance in front of it.
 _SEEN_WITHIN_SHARE: Final = 2e-4
 
 
@@ -31,14 +31,15 @@ class TrueOrthoimage:
 
     Attributes:
         frame: where the cells lie.
-        rgb: (rows, cols, 3) float32, 0..255, mean over the cell; NaN where nothing is, or where no
-            colour was wanted.
-        depth_m: (rows, cols) float32 along the normal at the cell's centre; NaN where nothing is.
+        rgb: (rows, cols, 3) float32, 0..255, mean over the cell; NaN where nothing is hit or no
+            colour was requested.
+        depth_m: (rows, cols) float32 along the normal at the cell's centre; NaN where nothing is
+            hit.
         rectangle: (rows, cols) int32 row of the scene at the centre; -1 where nothing is.
-        seen: (rows, cols) bool, a viewer sees that surface point; not told of cells that were
-            not to be judged.
+        seen: (rows, cols) bool, a viewer sees that surface point; undefined in cells that were not
+            judged.
         behind_object: (rows, cols) bool, a free-standing object hides that point from a viewer or
-            from the front; told of the same cells.
+            from the front; undefined in cells that were not judged.
     """
 
     frame: WallFrame
@@ -51,17 +52,17 @@ class TrueOrthoimage:
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """What of a true orthoimage is wanted, and how finely.
+    """Options of a true orthoimage.
 
     Attributes:
-        buffer_front_m: surfaces further in front of the plane do not exist for the image.
+        buffer_front_m: surfaces further in front of the plane are ignored.
         buffer_behind_m: likewise behind.
-        viewers: who may see the surface; without, nobody does.
+        viewers: positions from which the surface is seen; without them no cell is seen.
         supersample: colours are the mean of supersample^2 rays per cell.
-        coloured: (rows, cols) bool, cells whose colour is wanted; None for all.
-        judged: (rows, cols) bool, cells of which `seen` and `behind_object` are wanted; None for
+        coloured: (rows, cols) bool, cells whose colour is requested; None for all.
+        judged: (rows, cols) bool, cells whose `seen` and `behind_object` are requested; None for
             all.
-        cores: number of threads; changes no result.
+        cores: number of threads; does not change the result.
     """
 
     buffer_front_m: float
@@ -83,7 +84,7 @@ def render_frame(
     supersample: int = 3,
     cores: int = 1,
 ) -> TrueOrthoimage:
-    """Render the true orthoimage of a frame, all of every cell.
+    """Render the true orthoimage of a frame completely.
 
     Args:
         scene: the scene.
@@ -130,11 +131,11 @@ def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoima
 
 @dataclass(frozen=True, kw_only=True)
 class SeenPoints:
-    """What pixels look at.
+    """The surface points that pixels show.
 
     Attributes:
-        points: (n, 3) float64 metres from the scene's origin, NaN where nothing is.
-        rectangle: (n,) int32 row of the scene, -1 where nothing is.
+        points: (n, 3) float64 metres from the scene's origin, NaN without a hit.
+        rectangle: (n,) int32 row of the scene, -1 without a hit.
     """
 
     points: NDArray[np.float64]
@@ -142,11 +143,11 @@ class SeenPoints:
 
 
 class SceneCameras:
-    """A scene laid out once for many cameras.
+    """A scene prepared once for many cameras.
 
     Args:
         scene: the scene.
-        cores: number of threads; changes no result.
+        cores: number of threads; does not change the result.
     """
 
     def __init__(self, scene: Scene, *, cores: int = 1) -> None:
@@ -159,7 +160,8 @@ class SceneCameras:
     ) -> NDArray[np.float32]:
         """Take a photo (rows, columns, 3), grey levels 0..255, without noise.
 
-        Colours are means of supersample^2 rays per pixel, at random places that hang on the seed.
+        Colours are means of supersample^2 rays per pixel, at random positions that depend on the
+        seed.
         """
         image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
         near = camera.shifted(self._origin)
@@ -172,7 +174,7 @@ class SceneCameras:
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
-        """Find what pixels (n, 2) look at; they may lie outside the image, NaN sees nothing."""
+        """Find what pixels (n, 2) show; they may lie outside the image, NaN shows nothing."""
         pixels = np.asarray(pixels_photo, dtype=np.float64)
         points = np.full((len(pixels), 3), np.nan)
         rectangle = np.full(len(pixels), -1, dtype=np.int32)
@@ -191,7 +193,7 @@ class SceneCameras:
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which surface points (n, 3), metres from the scene's origin, a camera sees; NaN is not.
+        """Report which surface points (n, 3), metres from the scene's origin, a camera sees.
 
         A point hidden by less than 0.02 % of its distance counts as seen.
         """
@@ -204,7 +206,7 @@ class SceneCameras:
         return seen
 
     def cast(self, starts: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
-        """Find what rays meet first.
+        """Find the first hit of rays.
 
         Args:
             starts: (n, 3) or (3,) metres from the scene's origin.
@@ -237,7 +239,7 @@ def pixel_directions(
 
 
 class _Renderer:
-    """Fills a true orthoimage; cells are numbered row by row."""
+    """Computes a true orthoimage; cells are numbered row by row."""
 
     def __init__(self, scene: Scene, truth: TrueOrthoimage, rendering: Rendering) -> None:
         frame, front_m = truth.frame, rendering.buffer_front_m
@@ -246,7 +248,7 @@ class _Renderer:
         self._n_sub = rendering.supersample
         self._front_m = front_m
         self._reach_m = front_m + rendering.buffer_behind_m
-        # One long row each, views that share their memory.
+        # One long row each, as views of the same memory.
         self._rgb = truth.rgb.reshape(-1, 3)
         self._depth_m = truth.depth_m.reshape(-1)
         self._rectangle = truth.rectangle.reshape(-1)
@@ -260,7 +262,7 @@ class _Renderer:
         self._step_v = frame.gsd_m * frame.v_world[:, None]
 
     def look(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Fill depths and rectangles of cells (n,); give the points (3, n) at their centres."""
+        """Set depths and rectangles of cells (n,); return the points (3, n) at their centres."""
         starts = self._starts(cells, 0.5, 0.5)
         ways = np.broadcast_to(-self._normal, starts.shape)
         hits = self._rays.cast(starts, ways, within=self._reach_m)
@@ -272,7 +274,7 @@ class _Renderer:
     def shows_something(
         self, cells: NDArray[np.int64], wanted: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_]:
-        """Which cells (n,) show a surface, and are wanted."""
+        """Report which cells (n,) show a surface and are requested."""
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
@@ -292,7 +294,7 @@ class _Renderer:
         cells: NDArray[np.int64],
         points: NDArray[np.float64],
     ) -> None:
-        # A little slack: straight up must be seen although its sine may round above one.
+        # A small tolerance: straight up must be seen although its sine may round above one.
         lowest = math.sin(math.radians(viewers.lowest_elevation_deg)) - 1e-12
         highest = math.sin(math.radians(viewers.highest_elevation_deg)) + 1e-12
         ways = points - position
@@ -306,13 +308,13 @@ class _Renderer:
         self._behind_object[cells[blocked][by_object.rectangle >= 0]] = True
 
     def colour(self, cells: NDArray[np.int64]) -> None:
-        """Fill the mean colours of cells whose centre shows something."""
+        """Set the mean colours of cells whose centre shows a surface."""
         n_sub = self._n_sub
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
             # A sheared grid: n^2 different positions in either direction, so that edges along rows
-            # or columns, which walls are full of, are not rounded to thirds of a cell.
+            # or columns, which are frequent on walls, are not rounded to thirds of a cell.
             i, j = sub % n_sub, sub // n_sub
             starts = self._starts(
                 cells, (i + (j + 0.5) / n_sub) / n_sub, (j + (n_sub - i - 0.5) / n_sub) / n_sub
@@ -324,7 +326,7 @@ class _Renderer:
         self._rgb[cells[shown]] = (sums[:, shown] / n_hits[shown]).T
 
     def _starts(self, cells: NDArray[np.int64], right: float, down: float) -> NDArray[np.float64]:
-        """Points (3, n) before places in cells, where looking begins."""
+        """Return the starts (3, n) of rays in front of positions in cells."""
         rows, columns = np.divmod(cells, self._width)
         return self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
 
@@ -332,7 +334,7 @@ class _Renderer:
 def _exposed(
     rays: SceneRays, camera: ViewingCamera, rows: tuple[int, int], n_sub: int, seed: int
 ) -> NDArray[np.float32]:
-    """Mean colours (rows, columns, 3) of the rays of some rows of pixels."""
+    """Return mean colours (rows, columns, 3) of the rays of some rows of pixels."""
     first, last = rows
     shape = (last - first, camera.width)
     columns, lines = np.arange(camera.width), np.arange(first, last)
@@ -350,11 +352,11 @@ def _exposed(
 
 
 def _pixel_ways(camera: ViewingCamera, first: int, last: int) -> tuple[NDArray[np.float64], ...]:
-    """Direction of the first corner of each pixel of some rows, and how it changes inside it.
+    """Return the direction of the first corner of each pixel, and its change inside the pixel.
 
     A ray at (s, t) of a pixel has the direction base + s right + t down + s t twist, (3, rows,
-    columns) each: those of the corners are exact, and the lens bends the rays between by less than
-    1e-5 of a pixel from that.
+    columns) each: those of the corners are exact, and between them the lens deviates by less than
+    1e-5 of a pixel.
     """
     u, v = np.meshgrid(
         np.arange(camera.width + 1, dtype=np.float64), np.arange(first, last + 1, dtype=np.float64)

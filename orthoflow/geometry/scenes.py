@@ -1,7 +1,7 @@
-"""Simulated scenes of textured rectangles: what there is, wherever the world lies.
+"""Simulated scenes of textured rectangles, independent of the position of the world's origin.
 
-What a ray hits and what it sees there is in `orthoflow.geometry.scene_rays`, apart from here so
-that products can hold a scene without loading compiled kernels.
+Ray casting is in `orthoflow.geometry.scene_rays`, separate so that products can hold a scene
+without loading compiled kernels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ N_TEXTURE_PARAMS = 8
 
 
 class SurfaceRole(IntEnum):
-    """What a rectangle is in the room."""
+    """The role of a rectangle in the room."""
 
     WALL = 0
     RELIEF = 1
@@ -28,7 +28,7 @@ class SurfaceRole(IntEnum):
 
 
 class TextureKind(IntEnum):
-    """How a rectangle is painted; `texture_params` says with what.
+    """The pattern of a rectangle; `texture_params` has its parameters.
 
     All are functions of the position (a, b) in the rectangle, so they can be evaluated exactly
     anywhere, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
@@ -143,13 +143,13 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewers:
-    """Where somebody or something looks from, all round, within a range of elevations.
+    """Positions from which a scene is seen all around, within a range of elevations.
 
     Attributes:
         positions_world: (s, 3) float64 metres.
         up: (3,) float64 unit vector.
-        lowest_elevation_deg: lowest direction that is seen, above the horizon positive.
-        highest_elevation_deg: highest direction that is seen.
+        lowest_elevation_deg: lowest visible direction, above the horizon positive.
+        highest_elevation_deg: highest visible direction.
     """
 
     positions_world: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The points of a cloud, block by block, and the slab around a wall's plane in which they count."""
+"""The points of a cloud, block by block, and the slab around a wall's plane that limits them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.threads import in_parts
 
-# Coordinates come at the speed of memory, or of the disk, which two threads keep busy.
+# Coordinates are read at the speed of memory or of the disk, which two threads saturate.
 _BOXING_THREADS: Final = 2
 
 
 class OffsetPoints(Protocol):
-    """What the raster passes read of a `PointCloud`."""
+    """The part of a `PointCloud` that raster passes read."""
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -36,18 +36,18 @@ class OffsetPoints(Protocol):
 
     @property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """What `block_boxes_m` gives of these points; None for too few to be worth it."""
+        """The result of `block_boxes_m` for these points; None for too few to be worth it."""
 
 
-# Points of a box: their coordinates stay in the processor's cache while it is found.
+# Points of a box: their coordinates stay in the processor's cache while it is computed.
 BOXED_POINTS: Final = 1 << 16
 
 
 def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
-    """Boxes (blocks, 2, 3) of `BOXED_POINTS` points each: lowest and highest offsets, metres.
+    """Return boxes (blocks, 2, 3) of `BOXED_POINTS` points: lowest and highest offsets, metres.
 
-    A scan comes in order, so that the points of a block lie together, and a pass over one wall
-    need not read those of the others.
+    A scan is ordered, so the points of a block are close together, and a pass over one wall need
+    not read those of the others.
     """
     n_blocks = -(-len(points.x) // BOXED_POINTS)
     boxes_m = np.empty((n_blocks, 2, 3), dtype=np.float32)
@@ -64,12 +64,12 @@ def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
-    """The raster of a wall and how far in front of and behind its plane points count.
+    """The raster of a wall and the range of depths in front of and behind its plane.
 
     Attributes:
         frame: where the cells lie.
-        front_m: reach towards the viewer, measured from the plane.
-        behind_m: reach away from the viewer, positive.
+        front_m: range towards the viewer, measured from the plane.
+        behind_m: range away from the viewer, positive.
     """
 
     frame: WallFrame

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
 
-# The small functions carry explicit types: otherwise each constant they are called with would
-# compile a version of its own, which costs seconds at the first run.
+# The small functions have explicit types: otherwise each constant argument would compile a version
+# of its own, which costs seconds at the first run.
 
 
 class Shade(NamedTuple):
@@ -44,14 +44,14 @@ class PaintTable(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """What is painted on a spot.
+    """The pattern at a point.
 
     Attributes:
         light: lighter or darker, about -1..1.
         warmth: redder or bluer, about -1..1.
         paint: how much of the ground a coloured ornament covers, 0..1.
         hue: colour of that ornament, 0..1 round the colour circle.
-        other: `light` as another wavelength sees it.
+        other: `light` as seen at another wavelength.
     """
 
     light: float
@@ -72,7 +72,7 @@ def mixed_bits(value: np.uint64) -> np.uint64:
 
 @typed_kernel_part("f8(u8, i8)")
 def uniform(state: np.uint64, draw: int) -> float:
-    """Number in [0, 1) that depends on the 64-bit state and the number of the draw only."""
+    """Return a number in [0, 1) that depends only on the 64-bit state and the index of the draw."""
     bits = mixed_bits(np.uint64(state) + np.uint64(draw + 1) * np.uint64(0x9E3779B97F4A7C15))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
@@ -90,14 +90,14 @@ def cell_state(i: int, j: int, seed: int) -> np.uint64:
 
 @typed_kernel_part("f8(u8, i8)")
 def _lattice_value(column: np.uint64, j: int) -> float:
-    """Number in [0, 1) of the lattice point j of a column."""
+    """Return a number in [0, 1) of the lattice point j of a column."""
     bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @typed_kernel_part("f8(f8, f8, i8)")
 def _value_noise(a: float, b: float, seed: int) -> float:
-    """Smooth noise -1..1 on the unit lattice."""
+    """Return smooth noise -1..1 on the unit lattice."""
     i, j = math.floor(a), math.floor(b)
     s, t = a - i, b - j
     s = s * s * s * (s * (s * 6.0 - 15.0) + 10.0)
@@ -110,7 +110,7 @@ def _value_noise(a: float, b: float, seed: int) -> float:
 
 @typed_kernel_part("f8(f8, f8, f8, i8)")
 def _stains(a: float, b: float, period: float, seed: int) -> float:
-    """Three octaves of noise, about -1..1; the finest lattice is a sixth of the period."""
+    """Return three octaves of noise, about -1..1; the finest lattice is a sixth of the period."""
     return (
         0.5 * _value_noise(a / period, b / period, seed)
         + 0.3 * _value_noise(2.7 * a / period + 7.3, 2.7 * b / period + 1.9, seed + 1)
@@ -120,7 +120,7 @@ def _stains(a: float, b: float, period: float, seed: int) -> float:
 
 @typed_kernel_part("f8(f8, f8, i8)")
 def _wear(a: float, b: float, seed: int) -> float:
-    """Fine detail of every surface: grain on a lattice of 11 mm, and cracks 2 to 4 mm wide."""
+    """Return the fine detail of a surface: grain on a lattice of 11 mm, cracks 2 to 4 mm wide."""
     grain = 0.3 * _value_noise(a / 0.011, b / 0.011, seed)
     crack = abs(_value_noise(a / 0.13, b / 0.13, seed + 1))
     return grain - 0.8 * max(0.0, 1.0 - crack / 0.03)
@@ -128,9 +128,10 @@ def _wear(a: float, b: float, seed: int) -> float:
 
 @typed_kernel_part("UniTuple(f8, 2)(f8, f8, f8, i8)")
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
-    """Ornament of the lattice cell at (a, b): (how much paint 0 or 1, its hue 0..1).
+    """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, its hue 0..1).
 
-    Each cell has a flower of its own: number of petals, size, turn, hue and place are hashed.
+    Each cell has a flower of its own: number of petals, size, rotation, hue and position are
+    hashed.
     """
     i, j = math.floor(a / period), math.floor(b / period)
     state = cell_state(i, j, seed)
@@ -145,7 +146,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
         return 1.0, (uniform(state, 5) + 0.5) % 1.0
     if radius < outline * (0.72 + 0.28 * wave):
         return 1.0, uniform(state, 5)
-    # A painted ring and the lines of a lattice round the flowers, a fortieth of the period wide.
+    # A painted ring and the lines of a lattice around the flowers, a fortieth of the period wide.
     if abs(radius - 0.42) < 0.0125 and uniform(state, 6) > 0.4:
         return 1.0, uniform(state, 7)
     edge = 0.5 - max(abs(a / period - i - 0.5), abs(b / period - j - 0.5))
@@ -178,7 +179,7 @@ def _grain(a: float, b: float, period: float, seed: int) -> float:
 
 @kernel_part
 def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Pattern:
-    """What is painted at (a, b)."""
+    """Return the pattern at (a, b)."""
     period, seed = params[5], int(params[6])
     light = _stains(a, b, period, seed)
     warmth = 0.7 * _value_noise((a + 11.0) / period, (b - 7.0) / period, seed + 10)
@@ -202,7 +203,7 @@ def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Patt
     elif kind == 4:
         light = _grain(a, b, period, seed + 40)
         other = 0.5 * light + 0.5 * warmth
-    # Dirt in cracks is dark for the laser too, if less so.
+    # Dirt in cracks is dark for the laser too, but less so.
     return Pattern(light + wear, warmth, paint, hue, other + 0.5 * wear)
 
 
@@ -241,7 +242,8 @@ def paint_points(
 ) -> None:
     """Fill `painted` (4, n) = red, green, blue 0..255, reflectance 0..1 of points (3, n).
 
-    Points on rectangle -1 are left as they are; one off its rectangle gets the colour of its foot.
+    Points on rectangle -1 are unchanged; one off its rectangle gets the colour of its projection
+    onto it.
     """
     frames = table.frames
     for i in range(rectangle.shape[0]):

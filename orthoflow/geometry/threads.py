@@ -1,7 +1,7 @@
-"""The one way to share work over threads: fixed parts, and results in the order of the parts.
+"""Work shared by threads: fixed parts, and results in the order of the parts.
 
-What a part works on does not hang on the number of threads, or does not show in the result; so
-results have the same bits for any number of them. Compiled kernels let other threads run.
+The parts do not depend on the number of threads, or do not affect the result; so results have the
+same bits for any number of them. Compiled kernels release the interpreter lock.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _Result = TypeVar("_Result")
 
 
 def has_room_for_threads() -> bool:
-    """Whether threads may be started: one that finds no memory then is waited for without end."""
+    """Whether threads may be started: starting one without free memory would block forever."""
     limit = address_space()
     return limit is None or limit >= _ROOM_FOR_THREADS
 
 
 def start_beside(work: Callable[[], object]) -> Thread | None:
-    """Start what need not be done in a thread of its own; None where there is no room for it."""
+    """Start a task that can also run in the calling thread; None if no thread can be started."""
     if not has_room_for_threads():
         return None
     thread = Thread(target=work, daemon=True)
@@ -37,11 +37,11 @@ def start_beside(work: Callable[[], object]) -> Thread | None:
 
 
 def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = None) -> None:
-    """Run tasks at the same time.
+    """Run tasks concurrently.
 
     Args:
-        tasks: what to run.
-        threads: so many at once; None for all of them.
+        tasks: functions to run.
+        threads: maximum number at the same time; None for all of them.
     """
     if len(tasks) == 1 or not has_room_for_threads():
         for task in tasks:
@@ -55,7 +55,7 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 def in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
-    """Give a function's results item by item, so many computed at once; None: one per processor."""
+    """Yield a function's results item by item, `threads` computed at once; None: one per processor."""
     if not has_room_for_threads():
         yield from map(function, items)
         return
@@ -68,7 +68,7 @@ def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
 
     Args:
         n_items: length of the range.
-        n_parts: how many.
+        n_parts: number of parts.
         multiple: parts begin at multiples of this.
     """
     n_units = -(-n_items // multiple)

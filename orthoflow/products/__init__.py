@@ -1,4 +1,4 @@
-"""What steps hand to each other: frozen dataclasses of named arrays and JSON, one per type."""
+"""The data that steps exchange: frozen dataclasses of named arrays and JSON, one per type."""
 
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.input_files import InputFiles

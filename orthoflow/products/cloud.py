@@ -1,4 +1,4 @@
-"""The point cloud: offsets from an origin, what the scanner measured with them, where it stood."""
+"""The point cloud: offsets from an origin, the scanner's measurements, and its stations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.slabs import BOXED_POINTS, block_boxes_m
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
-# A cloud with fewer blocks is passed over as a whole.
+# A cloud with fewer blocks is always read as a whole.
 _BLOCKS_LEAST: Final = 16
 
 
@@ -22,21 +22,21 @@ _BLOCKS_LEAST: Final = 16
 class PointCloud(Product):
     """Points of one or several scans in one world frame.
 
-    The world point i is `origin + (x[i], y[i], z[i])`. Survey coordinates of 10^6 m lose nothing:
-    float32 holds offsets only.
+    The world point i is `origin + (x[i], y[i], z[i])`. Float32 holds offsets only, so survey
+    coordinates of 10^6 m lose no precision.
 
     Attributes:
         origin: (3,) float64 metres.
-        x: (n,) float32 metres from the origin; y and z alike. Three contiguous arrays, because
+        x: (n,) float32 metres from the origin; y and z likewise. Three contiguous arrays, because
             hot passes read them at memory speed.
         up: (3,) float64 unit vector in world axes.
-        intensity: (n,) float32, 0..1, NaN for points without intensity; None where none has.
+        intensity: (n,) float32, 0..1, NaN for points without intensity; None if no point has one.
         rgb: (n, 3) uint8 sRGB, or None.
-        has_rgb: (n,) bool, which points have a colour; None where all have (or none, with `rgb`).
+        has_rgb: (n,) bool, which points have a colour; None if all have (or none, with `rgb`).
         scan: (n,) uint16 index of the scan the point is from, or None.
-        row: (n,) uint32 position in the scan's grid, or None; column alike.
-        stations: (s, 3) float64 metres, where the scanner (or the viewer) stood, or None.
-        stations_source: `file`, `view_from` (the user said it) or None without stations.
+        row: (n,) uint32 position in the scan's grid, or None; column likewise.
+        stations: (s, 3) float64 metres, positions of the scanner (or the viewer), or None.
+        stations_source: `file`, `view_from` (given by the user) or None without stations.
         source: how the data were read: files, unit, ranges before normalising, counts dropped; for
             people.
     """
@@ -108,19 +108,19 @@ class PointCloud(Product):
 
     @cached_property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """Boxes (blocks, 2, 3) of the points as they follow each other; None for a few blocks.
+        """Return boxes (blocks, 2, 3) of consecutive points; None for a few blocks.
 
-        Found when somebody asks for them first, by one pass over the points.
+        Computed on first use, by one pass over the points.
         """
         return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 
     def points_world(self, index: NDArray[np.int64] | slice = slice(None)) -> NDArray[np.float64]:
-        """World points (m, 3) float64 of a selection; a copy, so keep selections small."""
+        """Return world points (m, 3) float64 of a selection; a copy, so keep selections small."""
         offsets = np.column_stack([self.x[index], self.y[index], self.z[index]])
         return self.origin + offsets.astype(np.float64)
 
     def require_points(self, n_least: int) -> None:
-        """Refuse a cloud that no method can work on.
+        """Refuse a cloud that no method can process.
 
         Raises:
             ProductError: fewer than `n_least` points, or coordinates that are not finite.

@@ -1,4 +1,4 @@
-"""The files a source reads: a workflow's inputs as its steps see them."""
+"""The files that a source reads: a workflow's inputs as its steps see them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judging products: surveyed check points, the truth of a simulated scene, and what was found."""
+"""Inspection of products: surveyed check points, the truth of a simulated scene, and findings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from orthoflow.products.product import (
 
 @dataclass(frozen=True, kw_only=True)
 class CheckPoints(Product):
-    """Surveyed points that took no part in anything they check.
+    """Surveyed points that were not used in anything they check.
 
     Attributes:
         names: names of the points.
@@ -35,8 +35,8 @@ class CheckPoints(Product):
         places_m: (n, 2) float64 measured X and Y as the orthoimage's GeoTIFF has them, metres in
             the plane of the wall, or east and north of a map; NaN where not measured so. None
             where no point was.
-        shown_world: (n, 3) float64 metres, what is shown where the point was measured; NaN where
-            not measured so. None where no point was.
+        shown_world: (n, 3) float64 metres, the world point shown where the point was measured; NaN
+            where not measured so. None where no point was.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -71,10 +71,10 @@ class TakenPhoto:
 
     Attributes:
         photo: file name.
-        wall: name of the wall it was meant for.
+        wall: name of the wall that it is aimed at.
         gsd_m: side of a pixel on the wall where the optical axis meets it.
         obliquity_deg: angle between the optical axis and the wall's normal.
-        roll_deg: turn about the optical axis.
+        roll_deg: rotation about the optical axis.
     """
 
     photo: str
@@ -86,15 +86,15 @@ class TakenPhoto:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Product):
-    """What a simulated scene really is.
+    """The truth of a simulated scene.
 
     Attributes:
-        scene: the surfaces, with their colours; can be seen from anywhere.
+        scene: the surfaces with their colours; can be rendered from anywhere.
         planes: the planes a detector should find.
         labels: (n,) int16 per point of the simulated cloud: index into `planes`, -1 for none.
         stations: (s, 3) float64 metres, where the scanner stood.
-        lowest_elevation_deg: lowest direction that the scanner saw, above the horizon positive.
-        highest_elevation_deg: highest direction that it saw.
+        lowest_elevation_deg: lowest direction of the scanner, above the horizon positive.
+        highest_elevation_deg: highest direction of the scanner.
         n_spoilt: points of the cloud that are gross outliers or mix the distances of two surfaces.
         cameras: true orientations of the photos, or None without photos.
         photos: how the photos were taken, in the order of `cameras`.
@@ -119,13 +119,13 @@ class Truth(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One number that an inspection gives.
+    """One number that an inspection returns.
 
     Attributes:
         name: metric name, unit in the name where it has one.
         value: the number.
         unit: unit, `1` for shares and counts.
-        wall: index in `Walls` of the wall it speaks of, -1 for all together.
+        wall: index in `Walls` of the wall that the number describes, -1 for all together.
     """
 
     name: str
@@ -136,7 +136,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspection(Product):
-    """Displacements measured in orthoimages, and what they add up to.
+    """Displacements measured in orthoimages, and their statistics.
 
     Attributes:
         wall: (n,) int32 index in `Walls` of the wall of each measured point.
@@ -145,7 +145,7 @@ class Inspection(Product):
         kind: (n,) uint8 class of the point; `kinds` names them.
         kinds: names of the classes.
         findings: the numbers.
-        details: what else the method says, JSON, for people.
+        details: further statements of the method, JSON, for people.
     """
 
     type_name: ClassVar[str] = "inspection"

@@ -1,4 +1,4 @@
-"""Openings of walls: windows, doors, niches, and what nobody saw."""
+"""Openings of walls: windows, doors, niches, and areas without data."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue, Product, Tolerance, require_shapes
 
-# Through it the laser saw what lies behind the wall; its back was measured; nothing came back.
+# The laser saw what lies behind the wall; the back was measured; nothing returned.
 OpeningKind = Literal["through", "niche", "no data"]
 
 _CORNERS_LEAST: Final = 3
 
 
 class OutlineSource(IntEnum):
-    """What a side of an outline was found by.
+    """What the position of a side of an outline was found from.
 
     Attributes:
         DEPTH: the depths of the wall's raster.
-        IMAGE: a photo, between the depths.
+        IMAGE: a photo, to a fraction of a cell.
         UNSEEN: nothing: the wall beside it was not measured.
     """
 
@@ -43,19 +43,19 @@ class Opening:
         wall: number of the wall, the place of its plane in `planes.json`.
         wall_name: what the wall is called.
         kind: `through` (the laser saw what lies behind the wall), `niche` (its back was measured)
-            or `no data` (nothing came back).
+            or `no data` (nothing returned).
         outline_m: (n, 2) float64 X and Y as the wall's GeoTIFF has them (metres along the wall and
             height, or east and north of a map), counter-clockwise, not closed.
         outline_world: (n, 3) float64 metres, the same corners on the wall's plane.
-        side_sigma_m: (n,) float64 standard deviation of each side, across it, from corner i to the
-            next; NaN for sides that nobody saw.
+        side_sigma_m: (n,) float64 standard deviation of each side, perpendicular to it, from corner
+            i to the next; NaN for sides that were not seen.
         side_source: (n,) uint8 `OutlineSource` of each side.
         area_m2: area of the outline.
         width_m: extent along the wall's u.
         height_m: extent along the wall's v.
         sill_m: height of its lowest corner above the lower edge of the wall's raster.
         seen_share: share of the outline along which the wall beside it was measured.
-        depth_m: how far the back lies behind the wall's face, median; None where none was measured.
+        depth_m: distance of the back behind the wall's face, median; None where none was measured.
         crs: coordinate system of `outline_m`, as `WallFrame.crs`.
     """
 
@@ -102,26 +102,26 @@ class Opening:
 
     @property
     def edge_sigma_m(self) -> float | None:
-        """Standard deviation of its sides that were seen, root mean square; None without any."""
+        """Return the RMS standard deviation of the sides that were seen; None without any."""
         seen = self.side_sigma_m[np.isfinite(self.side_sigma_m)]
         return math.sqrt(float(np.mean(seen**2))) if len(seen) else None
 
     @property
     def said(self) -> str:
-        """What it is, for a drawing: `niche 0.250 m deep, 0.80 x 1.86 m`."""
+        """Return its description in a drawing: `niche 0.250 m deep, 0.80 x 1.86 m`."""
         deep = f" {self.depth_m:.3f} m deep" if self.kind == "niche" and self.depth_m else ""
         return f"{self.kind}{deep}, {self.width_m:.2f} x {self.height_m:.2f} m"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Openings(Product):
-    """Openings of all walls that were looked at.
+    """Openings of all walls that were searched.
 
     Attributes:
         openings: by wall, then from left to right.
-        walls: numbers of the walls that were looked at, also those without openings.
-        map_crs: coordinate system of the world, where some wall's raster names it.
-        details: what else the method says, JSON, for people.
+        walls: numbers of the walls that were searched, including those without openings.
+        map_crs: coordinate system of the world, if some wall's raster names it.
+        details: further statements of the method, JSON, for people.
     """
 
     type_name: ClassVar[str] = "openings"
@@ -138,5 +138,5 @@ class Openings(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def of_wall(self, number: int) -> tuple[Opening, ...]:
-        """Openings of one wall, by the number of its plane."""
+        """Return the openings of one wall, by the number of its plane."""
         return tuple(opening for opening in self.openings if opening.wall == number)

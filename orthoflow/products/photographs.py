@@ -1,4 +1,4 @@
-"""Photographs, what is known of their cameras, ties to the walls, and their orientation."""
+"""Photographs, their camera data, ties to the walls, and their orientation."""
 
 from __future__ import annotations
 
@@ -99,11 +99,10 @@ class Photo:
         exif_orientation: EXIF tag 1..8, 1 without one.
         exif_focal_px: focal length from EXIF in pixels, or None.
         intrinsics: calibration if known, or None.
-        mask: PNG of the same pixels, white where they may be used; None where all may
+        mask: PNG of the same size, white where pixels may be used; None if all may
             (`files.images`).
-        camera: which camera and focal length took it, the same text for photos of one lens; empty
-            where nobody knows.
-        folder: of the file below the input, empty where all photos lie in one.
+        camera: camera and focal length, the same text for photos of one lens; empty if unknown.
+        folder: folder of the file below the input, empty if all photos are in one.
     """
 
     name: str
@@ -134,7 +133,7 @@ class Photos(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Product):
-    """Calibrated cameras, by photo name or pattern; the first that matches a photo holds.
+    """Calibrated cameras, by photo name or pattern; the first that matches a photo applies.
 
     Attributes:
         patterns: photo names or shell patterns.
@@ -148,10 +147,10 @@ class Calibration(Product):
 
 
 class TieRole(IntEnum):
-    """What a tie is used for.
+    """The role of a tie.
 
     Attributes:
-        CONTROL: it holds the photo.
+        CONTROL: used to orient the photo.
         CHECK: withheld from the orientation, to check it.
         REJECTED: it contradicts the others, or its photo is not oriented.
     """
@@ -163,16 +162,16 @@ class TieRole(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class TieWall:
-    """What an orientation has to know of a wall that ties lie on.
+    """The properties of a wall that an orientation needs to use its ties.
 
     Attributes:
         name: label of the wall.
         corners_world: four corners of its raster as (x, y, z) in metres: top-left, then
             counter-clockwise for the viewer, as `WallFrame.corners_world` gives them.
         normal_world: unit vector (x, y, z) to the viewer; no photo is taken from behind it.
-        gsd_m: side of a cell of its raster, metres; None where there is none, and then no error
-            can be too large in cells.
-        plane_index: position of its plane in `Planes`; None where nobody says.
+        gsd_m: side of a cell of its raster, metres; None without a raster, and then no error is too
+            large in cells.
+        plane_index: position of its plane in `Planes`; None if unknown.
     """
 
     name: str = ""
@@ -191,7 +190,7 @@ class TieWall:
 
     @classmethod
     def of(cls, wall: Wall) -> Self:
-        """Return what ties say of a rastered wall."""
+        """Return the description of a rastered wall for ties."""
         frame = wall.frame
         return cls(
             name=wall.name,
@@ -204,32 +203,33 @@ class TieWall:
 
 @dataclass(frozen=True, kw_only=True)
 class Ties(Product):
-    """Points seen in a photo and known on a wall.
+    """Points seen in a photo with a known position on a wall.
 
-    A matcher need not fill in `walls` and `search_radius_px`, but orientations are judged better
-    with them: without `walls`, the points of the ties stand in for them, and neither the side of a
+    A matcher may leave `walls` and `search_radius_px` empty, but orientations are judged better
+    with them: without `walls` the points of the ties are used instead, and neither the side of a
     wall nor its cells are known.
 
     Attributes:
         photo_names: names the column `photo` refers to.
         photo: (n,) int32 index into `photo_names`.
-        wall: (n,) int32 index of the wall, -1 where nobody said.
+        wall: (n,) int32 index of the wall, -1 if unknown.
         pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64 standard deviation of each of u and v, as whoever measured the tie
-            states it, before any adjustment.
-        sigma_m: (n,) float64 the same of each of x, y and z. An adjustment expects of u and v the
-            variance sigma_px² plus that of sigma_m, turned into pixels by the derivative of the
+        sigma_px: (n,) float64 standard deviation of each of u and v, as stated by the method that
+            measured the tie, before any adjustment.
+        sigma_m: (n,) float64 the same of each of x, y and z. An adjustment expects for u and v the
+            variance sigma_px² plus that of sigma_m, converted to pixels by the derivative of the
             projection.
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed - computed, NaN before an orientation.
-        walls: the walls that the column `wall` refers to; empty when the matcher does not say.
-        by_hand: (n,) uint8, 1 for ties that a person measured; None where nobody did. These are
-            never withheld, and their sigmas are believed.
-        search_radius_px: one per photo name: the photo was searched no farther than this from
-            where a tie was expected, so that wrong ties lie within it, too; None where all of the
-            photo was searched, and empty when all of every photo was.
-        details: what else the method says, JSON, for people only.
+        walls: the walls to which the column `wall` refers; empty if the matcher does not state
+            them.
+        by_hand: (n,) uint8, 1 for ties measured by a person; None if there are none. They are never
+            withheld, and their sigmas are not estimated.
+        search_radius_px: one per photo name: the photo was searched no farther than this from the
+            expected position of a tie, so wrong ties lie within it, too; None if the whole photo
+            was searched, and empty if this holds for all photos.
+        details: further statements of the method, JSON, for people only.
     """
 
     type_name: ClassVar[str] = "ties"
@@ -286,7 +286,7 @@ class Ties(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a tie has no place, no error, or names a photo that is not there.
+            ProductError: a tie has no position, no error, or names a photo that is not there.
         """
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m"):
             if not np.isfinite(getattr(self, name)).all():
@@ -297,7 +297,7 @@ class Ties(Product):
         _require_photos("ties", self.photo_names, others)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall for people: the place of its plane in `planes.json`."""
+        """Return the number of a wall as people see it: the place of its plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
@@ -308,15 +308,15 @@ class Camera:
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or the reason in one sentence; without `ok` the rest is None.
+        status: `ok`, or the reason in one sentence; unless it is `ok`, the rest is None.
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
-        covariance: (6, 6) float64 of the pose as estimated, or None: of a small turn dr applied
-            after the rotation R0, exp(dr) R0, a rotation vector in camera axes, radians; then of
+        covariance: (6, 6) float64 of the pose as estimated, or None: first a small rotation vector
+            dr applied after the rotation R0, exp(dr) R0, in camera axes, radians; then
             `translation_camera_from_world`, metres.
         sigma0_px: the stated error of a tie's pixel coordinate (median `Ties.sigma_px` of the
-            control) times the standard deviation of unit weight, which is 1 where the ties deviate
+            control) times the standard deviation of unit weight, which is 1 if the ties deviate
             from the pose as `Ties` states.
         sigma_wall_m: error on the wall that `covariance` (and that of an estimated lens) predicts,
             one standard deviation, metres.
@@ -353,19 +353,19 @@ class ResidualRow:
         axis: `u` or `v` of the photo.
         unit: `px` of the photo, `cell` of the wall's raster, or `mm` on the wall: px times the
             median size of a pixel there.
-        n: how many.
+        n: number of residuals.
         mean: their mean.
         shift_p: probability of such a mean by chance (Student's t, two-sided); None for one tie.
         sd: standard deviation.
         median: their median.
         nmad: 1.4826 times the median absolute deviation from the median.
-        skewness: third standardised moment; None where nothing varies.
+        skewness: third standardised moment; None if nothing varies.
         rmse: root mean square.
-        p95: 95 % of them are no longer than this.
-        max: length of the longest.
+        p95: length that 95 % of them do not exceed.
+        max: largest length.
         beyond_own: share beyond twice the coordinate's own RMSE.
-        beyond_cells: share beyond two cells of the wall's raster; None where no cell is known.
-        beyond_any: share of ties of which u or v lies beyond twice its own RMSE.
+        beyond_cells: share beyond two cells of the wall's raster; None if the cell is unknown.
+        beyond_any: share of ties of which u or v is beyond twice its own RMSE.
     """
 
     photo: str
@@ -394,9 +394,9 @@ class Cameras(Product):
     Attributes:
         cameras: one per photo, in the photos' order.
         ties: the ties with their roles and residuals after the orientation, or None.
-        residual_table: the residuals of the oriented photos as surveyors ask for them; may be
-            empty.
-        details: what else the method says, JSON, for people only.
+        residual_table: statistics of the residuals of the oriented photos as used in surveying; may
+            be empty.
+        details: further statements of the method, JSON, for people only.
     """
 
     type_name: ClassVar[str] = "cameras"
@@ -417,7 +417,8 @@ class Cameras(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: an orientation is no rotation, is not finite, or is of an unknown photo.
+            ProductError: an orientation is not a rotation, is not finite, or is of an unknown
+                photo.
         """
         for camera in self.cameras:
             rotation = camera.rotation_camera_from_world
@@ -448,7 +449,7 @@ class Cameras(Product):
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
-    """Refuse names of photos that are not among the photos of a step, where it has some."""
+    """Refuse names of photos that are not among the photos of a step, if it has some."""
     for product in others.values():
         known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
         unknown = [name for name in names if known is not None and name not in known]

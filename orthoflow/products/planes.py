@@ -1,4 +1,4 @@
-"""Planes found in a cloud, and which point belongs to which."""
+"""Planes found in a cloud, and the plane of each point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 SideSource = Literal["stations", "photos", "guess", "given"]
-# What a plane is called before its number: level and slope are neither floor nor ceiling nor wall.
+# Prefix of a plane's name; a level or sloping plane is neither floor nor ceiling nor wall.
 PlaneKind = Literal["wall", "floor", "ceiling", "level", "slope"]
 
 _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
@@ -25,14 +25,14 @@ _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "guess": "guess",
 }
-# That of markiewicz2015.
+# The value of markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
 
 
 def plane_name(kind: PlaneKind, place: int) -> str:
     """Name a plane, and the wall rastered over it, by its place in `planes.json`.
 
-    The files `wall_<place>_*` bear the same number, whatever the plane is.
+    The files `wall_<place>_*` have the same number, whatever the plane is.
 
     >>> plane_name("floor", 3)
     'floor 3'
@@ -42,14 +42,14 @@ def plane_name(kind: PlaneKind, place: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Thickness of the cloud where its points are of one class.
+    """Thickness of the cloud for the points of one class.
 
     Attributes:
         low: smallest value of the class, in its unit.
         high: largest value of the class.
-        n_points: points that were measured.
+        n_points: number of measured points.
         sigma_m: robust standard deviation of their distances.
-        name: of the class, where it has one.
+        name: name of the class, if it has one.
     """
 
     low: float
@@ -61,16 +61,16 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """Thickness of the cloud on one plane; classes are empty where nothing is known of them.
+    """Thickness of the cloud on one plane; classes are empty if nothing is known of them.
 
     Attributes:
-        sigma_m: robust standard deviation of the distances, relief apart.
+        sigma_m: robust standard deviation of the distances, without relief.
         width_95_m: width that holds 95 % of them.
         scan_step_m: distance between neighbouring points on the plane, median.
         incidence_deg: by the angle of incidence.
         range_m: by the distance from the scanner.
         intensity: by the intensity, 0..1.
-        material: by the materials that were named.
+        material: by named material.
     """
 
     sigma_m: float
@@ -90,9 +90,9 @@ class ScanRow:
         row: number of the row.
         scan: number of the scan.
         n_points: points of the row on the plane.
-        sigma_m: robust standard deviation of their distances, relief apart; None where the row is
-            too thin for one.
-        material: by the materials that were named.
+        sigma_m: robust standard deviation of their distances, without relief; None if the row has
+            too few points.
+        material: by named material.
     """
 
     row: int
@@ -118,14 +118,15 @@ class Planes(Product):
         names: k short labels as `plane_name` gives them, e.g. `wall 0`, `floor 3`.
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
         part_plane: (p,) int32 index of the plane a part lies on, or None.
-        viewpoint: how the normals' side was chosen: `stations`, `view_from`, `given` or `guess`.
-        side_from: the same per plane, where planes differ; empty where all are as `viewpoint` says.
-        tolerance_m: distance within which points counted when the planes were found; a method that
-            does not say is taken to have used that of markiewicz2015.
-        thickness: of the cloud on each plane, None where too few points show it; empty where
-            nobody measured it.
-        scan_row: of a cloud that knows its rows, the row that shows most of the first plane.
-        details: what else the method says about itself, JSON.
+        viewpoint: how the side of the normals was chosen: `stations`, `view_from`, `given` or
+            `guess`.
+        side_from: the same per plane, if planes differ; empty if `viewpoint` holds for all.
+        tolerance_m: distance within which points counted when the planes were found; the default is
+            that of markiewicz2015.
+        thickness: of the cloud on each plane, None where it has too few points; empty if it was not
+            measured.
+        scan_row: for a cloud with rows, the row that shows most of the first plane.
+        details: further statements of the method about itself, JSON.
     """
 
     type_name: ClassVar[str] = "planes"
@@ -192,7 +193,7 @@ class Planes(Product):
             )
 
     def to_payload(self) -> Payload:
-        """Return the planes as arrays and JSON; what all planes share is said once."""
+        """Return the planes as arrays and JSON; values common to all planes are stored once."""
         payload = super().to_payload()
         if self.side_from:
             return payload
@@ -203,13 +204,13 @@ class Planes(Product):
         return len(self.offset)
 
     def side_source(self, index: int) -> SideSource:
-        """How it is known from which side a plane is seen."""
+        """Return how the visible side of a plane was determined."""
         return (
             self.side_from[index] if self.side_from else _SIDE_SOURCES.get(self.viewpoint, "guess")
         )
 
     def turned(self, index: int) -> Planes:
-        """Return the planes with one seen from its other side."""
+        """Return the planes with one of them seen from its other side."""
         corners, parts = self.corners.copy(), self.part_corners
         # From behind, right is left: the top-left corner of one side is the other's top-right.
         corners[index] = corners[index, ::-1]
@@ -232,7 +233,7 @@ class Planes(Product):
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:
-        """Standard deviation of a plane's direction, about the axis where it is largest."""
+        """Return the standard deviation of a plane's direction, about the axis where it is largest."""
         largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
@@ -255,9 +256,9 @@ class Planes(Product):
             )
 
     def sigma_offset_m(self, index: int) -> float:
-        """Standard deviation of a plane's position at the middle of its rectangle.
+        """Return the standard deviation of a plane's position at the middle of its rectangle.
 
-        The offset itself belongs to the origin, which may be far away.
+        The offset itself refers to the origin, which may be far away.
         """
         at_middle = np.append(self.corners[index].mean(axis=0), -1.0)
         return math.sqrt(max(0.0, float(at_middle @ self.covariance[index] @ at_middle)))
@@ -265,7 +266,7 @@ class Planes(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLabels(Product):
-    """For each point of a cloud the plane it belongs to.
+    """The plane to which each point of a cloud belongs.
 
     Attributes:
         plane_index: (n,) int16, position in `Planes`, or -1 for none.

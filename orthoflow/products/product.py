@@ -1,4 +1,4 @@
-"""What every product is: a frozen dataclass that turns into named arrays plus JSON, and back."""
+"""The base of all products: a frozen dataclass that converts to named arrays plus JSON, and back."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Array: TypeAlias = NDArray[np.generic]
 Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
-# Arrays of more than this are memory-mapped, whatever their product: nobody holds them in memory.
+# Larger arrays are memory-mapped, whatever their product.
 _LARGE_BYTES: Final = 1 << 30
-# What values that do not go with each other may raise where a product looks at itself.
+# What inconsistent values may raise while a product checks itself.
 _NO_SENSE: Final = (
     *(AttributeError, IndexError, KeyError),
     *(TypeError, ValueError, GeometryError),
@@ -33,7 +33,7 @@ _NO_SENSE: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far two values of one field may lie apart and still count as equal.
+    """How far two values of one field may differ and still count as equal.
 
     Attributes:
         limit: largest absolute difference, in `unit`.
@@ -46,7 +46,7 @@ class Tolerance:
 
 @dataclass(frozen=True, kw_only=True)
 class Payload:
-    """A product as it is stored: what store, record and comparison see.
+    """A product as stored: what store, record and comparison see.
 
     Attributes:
         type_name: name of the product type, e.g. `planes`.
@@ -75,7 +75,7 @@ class Product:
         mapped: store contiguous and memory-map on reading (for products of scan size; any product
             of more than 1 GiB is).
         embedded: put the arrays into the record, not only their digest.
-        tolerances: field name -> how far replays may differ; fields not named must be equal.
+        tolerances: field name -> permitted difference of replays; other fields must be equal.
     """
 
     type_name: ClassVar[str]
@@ -105,7 +105,7 @@ class Product:
             others: inputs and other outputs of the step by port.
 
         Raises:
-            ProductError: the product contradicts one of them, or holds values that make no sense.
+            ProductError: the product contradicts one of them, or holds invalid values.
         """
 
     @classmethod
@@ -132,10 +132,10 @@ class Product:
 
 
 def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:
-    """Refuse arrays that do not go with each other; those that are None are left out.
+    """Refuse arrays whose shapes do not match; those that are None are ignored.
 
     Raises:
-        ProductError: an array has another shape than wanted.
+        ProductError: an array has an unexpected shape.
     """
     for name, (array, shape) in wanted.items():
         if array is not None and np.shape(array) != shape:
@@ -180,7 +180,7 @@ def _json_scalar(value: object, name: str) -> JsonValue:
 
 
 class _LackingFieldsError(ProductError):
-    """What was stored has no value for a field without a default."""
+    """A stored product has no value for a field without a default."""
 
 
 def _decode_fields(
@@ -200,7 +200,7 @@ def _decode_fields(
     except ProductError:
         raise
     except _NO_SENSE as error:
-        # Arrays of too few dimensions, where a product looks at its own before it judges them.
+        # Arrays with too few dimensions, which a product may access before it checks them.
         raise ProductError(f"a stored {cls.__name__} makes no sense: {error}") from error
 
 
@@ -249,10 +249,10 @@ def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:
 
 
 def _of_kind(hint: object, value: object, name: str) -> object:
-    """Return a stored value that its field can hold; whoever seals a record may store any.
+    """Return a stored value if its field can hold it; the author of a record may store anything.
 
     Raises:
-        ProductError: it is of another kind.
+        ProductError: it has another type.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise ProductError(f"the stored {name} must be finite, got {value}")
@@ -265,7 +265,7 @@ def _of_kind(hint: object, value: object, name: str) -> object:
 
 @cache
 def _kinds(hint: object) -> tuple[type, ...] | None:
-    """Types that a decoded value of a field may have; None for any."""
+    """Return the types that a decoded value of a field may have; None for any."""
     found: list[type] = []
     for candidate in _alternatives(hint):
         origin = typing.get_origin(candidate) or candidate

@@ -1,4 +1,4 @@
-"""Rasters in a wall's plane: the surface, photos laid onto it, and the finished orthoimage."""
+"""Rasters in a wall's plane: the surface, photos projected onto it, and the finished orthoimage."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
-# Percentiles of larger rasters are told from some of their rows.
+# Percentiles of larger rasters are estimated from some of their rows.
 _CELLS_ASKED: Final = 1 << 25
-# What the intensity of a wall is: of the laser; the grey of the colours instead; or there is none.
+# What the intensity of a wall is: that of the laser; the grey of the colours instead; or none.
 IntensitySource = Literal["laser", "luminance", "none"]
 
 
@@ -29,9 +29,9 @@ class SurfaceMask(IntEnum):
     """Where a wall's depth comes from.
 
     Attributes:
-        VOID: from nowhere; it is NaN.
-        MEASURED: from points in the cell.
-        RECOVERED: from cells beside it, over a small gap.
+        VOID: nowhere; it is NaN.
+        MEASURED: points in the cell.
+        RECOVERED: neighbouring cells, over a small gap.
     """
 
     VOID = 0
@@ -40,12 +40,12 @@ class SurfaceMask(IntEnum):
 
 
 class LayerMask(IntEnum):
-    """What one source could paint.
+    """What one source shows of a cell.
 
     Attributes:
         OUTSIDE: the source does not show the cell.
         PAINTED: it has a colour.
-        OCCLUDED: something stands between the cell and the camera.
+        OCCLUDED: an object is between the cell and the camera.
         NO_SURFACE: no depth is known there.
     """
 
@@ -56,12 +56,12 @@ class LayerMask(IntEnum):
 
 
 class OrthoMask(IntEnum):
-    """What became of a cell of an orthoimage.
+    """The state of a cell of an orthoimage.
 
     Attributes:
         NONE: no source shows it.
-        PAINTED: its colour is a source's.
-        FILLED: its colour is that of cells beside it.
+        PAINTED: its colour comes from a source.
+        FILLED: its colour comes from neighbouring cells.
         OCCLUDED: hidden from every source that could show it.
         NO_SURFACE: no depth is known there.
     """
@@ -90,7 +90,7 @@ class Wall:
         rgb: (rows, cols, 3) uint8, or None.
         rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
         percentiles_m: (rows, cols, k) float32 metres, `Walls.percentiles` of the depths in the
-            cell, NaN in cells without points; None if not wanted.
+            cell, NaN in cells without points; None if not requested.
     """
 
     frame: WallFrame
@@ -115,18 +115,18 @@ class Walls(Product):
     """One raster per chosen plane.
 
     Attributes:
-        walls: in the order of the planes; `wall.plane_index` says which plane.
+        walls: in the order of the planes; `wall.plane_index` is the index of its plane.
         up: (3,) float64 unit vector.
-        intensity_source: `laser`, `luminance` (no laser intensity: grey of the colours stands
-            in) or `none`.
-        buffer_front_m: how far in front of the planes points were taken, at most.
-        buffer_behind_m: how far behind, at most.
-        buffers_m: the same of each wall, in front and behind; empty where all walls have these.
-        percentiles: which percentiles (0..100) of the depths in a cell each `Wall.percentiles_m`
-            has, in its order; empty if none were wanted.
-        included: numbers of the planes that each wall shows, so that they are no walls of their
-            own; empty where nobody says.
-        details: what else the method says, JSON.
+        intensity_source: `laser`, `luminance` (no laser intensity: grey of the colours instead) or
+            `none`.
+        buffer_front_m: maximum distance of points in front of the planes.
+        buffer_behind_m: maximum distance behind them.
+        buffers_m: the same for each wall, in front and behind; empty if all walls have these.
+        percentiles: percentiles (0..100) of the depths in a cell that `Wall.percentiles_m` holds,
+            in order; empty if none were requested.
+        included: numbers of the planes that each wall shows, so that they are not walls of their
+            own; empty if unknown.
+        details: further statements of the method, JSON.
     """
 
     type_name: ClassVar[str] = "walls"
@@ -169,7 +169,7 @@ class Walls(Product):
                 )
 
     def slab(self, index: int) -> Slab:
-        """The raster of a wall, and how far before and behind its plane points were taken."""
+        """Return the slab of a wall: its raster, and the depths around its plane."""
         front_m, behind_m = (
             self.buffers_m[index] if self.buffers_m else (self.buffer_front_m, self.buffer_behind_m)
         )
@@ -183,11 +183,11 @@ class Walls(Product):
         return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
 
     def spacing_m(self) -> float:
-        """The coarser of the finest raster's cells and the points' spacing on it, about."""
+        """Return the finest raster's cell size, or the point spacing on it if that is larger."""
         return max(min(wall.frame.gsd_m for wall in self.walls), self.points_apart_m())
 
     def points_apart_m(self) -> float:
-        """The points' spacing on the finest raster, about, however coarse its cells are."""
+        """Return the approximate point spacing on the finest raster, however coarse it is."""
         wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
         n_known = n_points = 0
         for rows in row_bands(wall.depth_m.shape):
@@ -200,14 +200,14 @@ class Walls(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """One source (a photo, or the cloud itself) laid onto one wall.
+    """One source (a photo, or the cloud itself) projected onto one wall.
 
     Attributes:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
-        source: what painted it, e.g. a photo's name, or `cloud`.
-        rgb: (rows, cols, 3) uint8, or uint16 of deep photos (all layers of a block alike), 0 where
-            not painted; `geometry.levels` has both as one.
+        source: name of the source, e.g. a photo's name, or `cloud`.
+        rgb: (rows, cols, 3) uint8, or uint16 of deep photos (the same for all layers of a block), 0
+            where not painted; `geometry.levels` converts between them.
         mask: uint8 `LayerMask`; cells of value 1 are painted.
         quality: float32, larger is better, comparable between the layers of one wall; 0 where
             not painted.
@@ -233,10 +233,10 @@ class Layers(Product):
     Attributes:
         layers: grouped by wall in the order of `Walls`, then by source.
         names: name of each wall, by its index.
-        plane_indices: position of each wall's plane in `Planes`, by its index; empty where nobody
-            says, and then the index stands for it.
-        icc_profile: colour profile that all sources share, or None: sRGB, or not known.
-        details: what else the method says, JSON.
+        plane_indices: position of each wall's plane in `Planes`, by its index; if empty, the index
+            is used.
+        icc_profile: colour profile common to all sources, or None: sRGB or unknown.
+        details: further statements of the method, JSON.
     """
 
     type_name: ClassVar[str] = "layers"
@@ -255,7 +255,7 @@ class Layers(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall for people: the place of its plane in `planes.json`."""
+        """Return the number of a wall as people see it: the place of its plane in `planes.json`."""
         return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
 
     def name(self, wall: int) -> str:
@@ -272,15 +272,15 @@ class Orthoimage:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
         name: label of the wall.
-        rgb: (rows, cols, 3) uint8, or uint16 of deep photos, as the sources have them, 0 where
-            nothing is shown; `geometry.eight_bits` gives them in 8 bits.
+        rgb: (rows, cols, 3) uint8, or uint16 of deep photos, as in the sources, 0 where nothing is
+            shown; `geometry.eight_bits` converts to 8 bits.
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
-        source: int16 index into `sources`, -1 where nothing painted the cell.
-        sources: what painted it, e.g. photo names, or `cloud`.
-        plane_index: position of the wall's plane in `Planes`; None where nobody says.
-        error_m: float32 expected error of a place measured in the image, one standard deviation of
-            u and of v, metres; NaN where it is not known. None where nothing is known of it.
-        n_check_points: how many independent points check the photos on this wall.
+        source: int16 index into `sources`, -1 where not painted.
+        sources: names of the sources, e.g. photo names, or `cloud`.
+        plane_index: position of the wall's plane in `Planes`; None if unknown.
+        error_m: float32 expected error of a point measured in the image, one standard deviation of
+            u and of v, metres; NaN where unknown. None if unknown everywhere.
+        n_check_points: number of independent points that check the photos on this wall.
     """
 
     frame: WallFrame
@@ -299,9 +299,9 @@ class Orthoimage:
 
     @property
     def expected_mm(self) -> tuple[float, float]:
-        """Median and 95th percentile of the expected error, millimetres; NaN where none is known.
+        """Return median and 95th percentile of the expected error, millimetres; NaN if unknown.
 
-        Of large images, told from some of their rows.
+        Estimated from some of the rows of large images.
         """
         if self.error_m is None:
             return math.nan, math.nan
@@ -314,7 +314,7 @@ class Orthoimage:
 
     @property
     def number(self) -> int:
-        """Number of the wall for people: the place of its plane in `planes.json`."""
+        """The number of the wall as people see it: the place of its plane in `planes.json`."""
         return self.wall if self.plane_index is None else self.plane_index
 
 
@@ -324,9 +324,9 @@ class Orthoimages(Product):
 
     Attributes:
         images: one per wall.
-        icc_profile: colour profile of the colours, or None: sRGB, or not known.
-        layers: what each source shows by itself, where that was asked for; None otherwise.
-        details: what else the method says, JSON.
+        icc_profile: colour profile of the colours, or None: sRGB or unknown.
+        layers: what each source shows by itself, if requested; None otherwise.
+        details: further statements of the method, JSON.
     """
 
     type_name: ClassVar[str] = "orthoimages"

@@ -1,4 +1,4 @@
-"""Areas of a wall that lie behind it or show nothing, and what kind of opening each is."""
+"""Areas of a wall that lie behind its face or are empty, and the kind of opening of each."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 from orthoflow.products import OpeningKind, SurfaceMask, Wall
 from orthoflow_plugins.segment.sight_lines import SightLines
 
-# What is narrower joins no areas.
+# Narrower connections do not join areas.
 _NECK_CELLS: Final = 3
-# Of the cells of an area: crossed by rays, or empty, from which on it is called so.
+# Shares of the cells of an area, crossed by rays or empty, that decide its kind.
 _CROSSED_LEAST: Final = 0.1
 _EMPTY_LEAST: Final = 0.5
-# When so much of what was measured lies behind a plane, the plane is not the wall's face.
+# If this share of the measured cells lies behind a plane, the plane is not the wall's face.
 _FACE_LEAST: Final = 0.5
 _CELLS_TOLD: Final = 1 << 25
 
 
 @dataclass(frozen=True, kw_only=True)
 class AreaRule:
-    """What counts as an opening.
+    """The criteria of an opening.
 
     Attributes:
-        behind_m: cells so far behind the wall's face, or farther, are not of it.
-        width_least_m: a square of this side fits into an opening.
+        behind_m: cells at least this far behind the wall's face do not belong to it.
+        width_least_m: side of a square that must fit into an opening.
         area_least_m2: smallest area.
-        seen_least: share of the outline along which the wall's face was measured, at least.
+        seen_least: minimum share of the outline along which the wall's face was measured.
     """
 
     behind_m: float
@@ -41,16 +41,16 @@ class AreaRule:
 
 @dataclass(frozen=True, kw_only=True)
 class Relief:
-    """What each cell of a wall, or of every nth of its rows and columns, is.
+    """The class of each cell of a wall, or of every nth of its rows and columns.
 
     Attributes:
         gsd_m: side of these cells.
-        step: cells of the wall to one of these.
+        step: cells of the wall per cell of these.
         is_face: (rows, cols) bool, measured, and not behind the wall.
         is_open: (rows, cols) bool, behind it or empty, and not hidden.
-        is_empty: (rows, cols) bool, no depth is known.
-        is_crossed: (rows, cols) bool, rays went through.
-        depth_m: (rows, cols) float32 before the plane, NaN where empty.
+        is_empty: (rows, cols) bool, depth unknown.
+        is_crossed: (rows, cols) bool, rays passed through.
+        depth_m: (rows, cols) float32 in front of the plane, NaN where empty.
         face_m: depth of the wall's face, 0 where that is the plane.
     """
 
@@ -70,9 +70,9 @@ class Area:
 
     Attributes:
         corner: row and column of the first cell of `cells` in the relief.
-        cells: (rows, cols) bool, those of the opening, without holes, and a rim of others.
+        cells: (rows, cols) bool, those of the opening, without holes, with a margin.
         kind: see `OpeningKind`.
-        depth_m: how far its back lies behind the wall's face; None where nothing was measured.
+        depth_m: distance of its back behind the wall's face; None if nothing was measured.
     """
 
     corner: tuple[int, int]
@@ -85,9 +85,9 @@ def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
     """Classify cells as face, open or hidden.
 
     Args:
-        wall: the wall; of one with more than 32 million cells every nth row and column is taken.
-        lines: what rays show about empty cells; None without a cloud, and then none is hidden.
-        rule: from which depth on a cell is behind the wall.
+        wall: the wall; with more than 32 million cells every nth row and column is used.
+        lines: what rays show about empty cells; without them (None) no cell is hidden.
+        rule: includes the depth from which on a cell is behind the wall.
     """
     import cv2
 
@@ -103,7 +103,7 @@ def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
     face_m = _face_m(depth_m[~is_empty], rule.behind_m)
     with np.errstate(invalid="ignore"):
         is_behind = ~is_empty & (depth_m <= face_m - rule.behind_m)
-    # Single cells, of noise or between points, decide nothing.
+    # Single cells, from noise or between points, are ignored.
     is_open = cv2.medianBlur((is_behind | (is_empty & ~is_hidden)).astype(np.uint8), 5) > 0
     return Relief(
         gsd_m=step * wall.frame.gsd_m,
@@ -118,23 +118,23 @@ def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
 
 
 def _face_m(depths_m: NDArray[np.float32], behind_m: float) -> float:
-    """Depth of the face of a wall: its plane, or the middle of what lies behind if that is more.
+    """Return the depth of a wall's face: its plane, or the median of the cells behind it.
 
-    A detector may have put the plane over the fronts of pilasters, or across them.
+    A detector may have placed the plane on the fronts of pilasters, or between them and the wall.
     """
     deeper = depths_m[depths_m <= -behind_m]
     return float(np.median(deeper)) if len(deeper) > _FACE_LEAST * len(depths_m) else 0.0
 
 
 def open_areas(relief: Relief, rule: AreaRule) -> Iterator[Area]:
-    """Return the areas large and wide enough, from the largest."""
+    """Return the areas that are large and wide enough, largest first."""
     import cv2
 
     neck = cv2.getStructuringElement(cv2.MORPH_RECT, (_NECK_CELLS, _NECK_CELLS))
     cells = cv2.morphologyEx(relief.is_open.astype(np.uint8), cv2.MORPH_OPEN, neck)
     wide = max(1, round(rule.width_least_m / relief.gsd_m))
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (wide, wide))
-    # What lies beyond the raster must not make an area wide.
+    # Cells beyond the raster must not widen an area.
     cores = cv2.erode(cells, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(cells, connectivity=4)
     is_wide = np.zeros(n_areas, dtype=np.bool_)
@@ -155,7 +155,7 @@ def open_areas(relief: Relief, rule: AreaRule) -> Iterator[Area]:
 
 
 def _without_holes(own: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells with a rim of one cell that is none of them; bars and panes across are theirs."""
+    """Return cells with an empty margin of one cell; bars and panes across are included."""
     import cv2
 
     framed = np.pad(own, 1).astype(np.uint8)

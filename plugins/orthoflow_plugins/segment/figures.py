@@ -1,4 +1,4 @@
-"""Pictures of openings: a wall with the outlines that were found on it."""
+"""Figures of openings: a wall with the outlines found on it."""
 
 from __future__ import annotations
 

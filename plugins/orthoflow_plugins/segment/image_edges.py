@@ -1,4 +1,4 @@
-"""Sides of outlines moved to where the orthoimage has an edge, finer than cells."""
+"""Sides of outlines moved to edges of the orthoimage, to a fraction of a cell."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from orthoflow_plugins.segment.outlines import Outline
 
 _LONG_CELLS: Final = 20.0
 _ENDS_CELLS: Final = 4.0
-# Profiles across a side, so far to both sides, in steps.
+# Length of the profiles across a side, in steps to both sides.
 _REACH_CELLS: Final = 4.0
 _STEP_CELLS: Final = 0.25
-# The same edge must be seen in so many pieces of a side.
+# The edge must be found in this many pieces of a side.
 _PIECES: Final = 5
 _PIECES_LEAST: Final = 4
-# Grey levels per cell: paler edges are stains. An edge stands out of the others so many times.
+# Grey levels per cell: weaker edges are stains. An edge must exceed the others by this factor.
 _CONTRAST_LEAST_GREY: Final = 4.0
 _CONTRAST_LEAST: Final = 3.0
-# What belongs to an edge: slopes of at least this share of the steepest.
+# Slopes of at least this share of the steepest belong to an edge.
 _EDGE_SHARE: Final = 0.2
-# What a picture shows at a step was laid there by the same depths, so it is no better than this.
+# At a step the picture was projected with the same depths, so it is no better than this.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# Where depth and picture differ by more sigmas of the depth, they show different things.
+# If depth and picture differ by more sigmas of the depth, they show different edges.
 _APART_SIGMAS: Final = 1.5
-# Another edge within reach that is nearly as strong could be the one.
+# Another edge within reach that is nearly as strong makes the choice ambiguous.
 _SECOND_MOST: Final = 0.6
 _PARALLEL: Final = 0.26
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moved:
-    """An outline after a look at the picture.
+    """An outline refined by the picture.
 
     Attributes:
         outline: it.
-        by_image: (n,) bool, sides that the picture placed.
+        by_image: (n,) bool, sides placed by the picture.
     """
 
     outline: Outline
@@ -46,7 +46,7 @@ class Moved:
 
 
 def moved_to_edges(outline: Outline, grey: NDArray[np.float32]) -> Moved:
-    """Move each long side that was seen to the edge of the picture that is surely the same.
+    """Move each long side that was seen to the matching edge of the picture, if unambiguous.
 
     Args:
         outline: in cells of the picture.
@@ -71,7 +71,7 @@ def moved_to_edges(outline: Outline, grey: NDArray[np.float32]) -> Moved:
 def _edge(
     grey: NDArray[np.float32], begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """How far outwards a side's edge lies in the picture, and its sigma, in cells."""
+    """Return how far outwards a side's edge is in the picture, and its sigma, in cells."""
     import cv2
 
     way = end - begin
@@ -103,14 +103,14 @@ def _edge(
             found.append(_STEP_CELLS * _middle(slopes, top))
     if len(found) < _PIECES_LEAST:
         return None
-    # Slopes lie half a cell in from the first offset.
+    # Slopes are half a cell inwards of the first offset.
     place = float(np.median(found)) - _REACH_CELLS + 0.5
     spread = float(np.std(found, ddof=1)) / np.sqrt(len(found))
     return place, float(np.hypot(_SIGMA_LEAST_CELLS, spread))
 
 
 def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of the mean profile over a cell, at each of its middles."""
+    """Return the change of the mean profile over a cell, at the middle of each."""
     mean = profiles.mean(axis=0)
     apart = round(1.0 / _STEP_CELLS)
     slopes: NDArray[np.float64] = mean[apart:] - mean[:-apart]
@@ -118,7 +118,7 @@ def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _middle(slopes: NDArray[np.float64], top: int) -> float:
-    """Where an edge lies: the middle of its slopes, which of a cell half covered is its border."""
+    """Return the position of an edge: the centroid of its slopes."""
     is_low = slopes < _EDGE_SHARE * slopes[top]
     before = np.flatnonzero(is_low[:top])
     behind = np.flatnonzero(is_low[top:])
@@ -129,7 +129,7 @@ def _middle(slopes: NDArray[np.float64], top: int) -> float:
 
 
 def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corners after each side moved outwards."""
+    """Return the corners after each side moved outwards."""
     ways = np.roll(corners, -1, axis=0) - corners
     along = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     outwards = np.column_stack([-along[:, 1], along[:, 0]])
@@ -137,7 +137,7 @@ def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArr
     for corner in range(len(corners)):
         pair = [corner - 1, corner]
         rows = outwards[pair]
-        # Only what is left of a corner counts when the sides run on in one line.
+        # A corner between sides that form one line moves with their mean.
         if abs(float(np.linalg.det(rows))) < _PARALLEL:
             moved[corner] += (shifts[pair] @ rows) / 2.0
         else:
