@@ -32,7 +32,7 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
         multiple: the height of all bands but the last is a multiple of this.
 
     Yields:
-        Yield the rows of each band, from the top.
+        The rows of each band, from the top.
     """
     height = max(1, _BAND_CELLS // max(1, shape[1]) // multiple) * multiple
     for first in range(0, shape[0], height):

@@ -291,7 +291,7 @@ def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[
 
 
 def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R (p, p) with R R' the covariance, enlarged a little where rounding made it indefinite."""
+    """Return R (p, p) with R R' the covariance, enlarged if rounding made it indefinite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:

@@ -108,7 +108,7 @@ class WallFrame:
 
     @property
     def raster_down(self) -> float:
-        """Return the change of Y per metre down the rows: -1, but 1 for ceilings (seen from below)."""
+        """Return the change of Y per metre down the rows: -1, or 1 for ceilings."""
         if self.up is None or self.raster_axes != "level":
             return -1.0
         return 1.0 if float(self.normal_world @ self.up) < 0.0 else -1.0

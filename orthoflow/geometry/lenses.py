@@ -109,7 +109,7 @@ class Linear:
 
 
 def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
-    """Return the values of the free lens parameters of a camera, the focal length as its logarithm."""
+    """Return the free lens parameters of a camera, the focal length as its logarithm."""
     values = {
         "focal": math.log(camera.fx),
         "aspect": math.log(camera.fy / camera.fx),
@@ -202,7 +202,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
 
 @dataclass(frozen=True, kw_only=True)
 class _Bent:
-    """Return rays x / z and y / z after distortion, with derivatives; 1 and 0 without distortion."""
+    """Rays x / z and y / z after distortion, with derivatives; 1 and 0 without distortion."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]

@@ -50,7 +50,7 @@ def narrow_gaps(
 def _met_by_discs(
     is_in_set: NDArray[np.bool_], radius_cells: int, *, threads: int
 ) -> NDArray[np.bool_]:
-    """Report the cells (rows, cols) whose disc contains a member of a set; there is none outside."""
+    """Report the cells (rows, cols) whose disc contains a member of a set."""
     rows, columns = is_in_set.shape
     steps = np.arange(-radius_cells, radius_cells + 1)
     heights = np.floor(np.sqrt(radius_cells**2 - steps**2)).astype(np.uint8)

@@ -188,7 +188,7 @@ def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
 
 
 def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool]]:
-    """Return chains of walls, each wall with the end at which it is entered, and whether it is closed."""
+    """Return chains of walls, each with the end at which it is entered; and whether they close."""
     left = set(range(count))
     chains: list[tuple[list[_End], bool]] = []
     # Free ends first, so that an open chain is followed from its beginning.
@@ -260,7 +260,7 @@ def _on_line(
     level: Plane | None,
     near: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return where a line meets floor or ceiling; without one, its point nearest to a given point."""
+    """Return where a line meets floor or ceiling, or else its point nearest to a given one."""
     point, direction = line
     if level is None:
         return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)

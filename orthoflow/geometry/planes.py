@@ -1,4 +1,4 @@
-"""Planes in space: construction, signed distances, the angles used in the literature, rectangles."""
+"""Planes in space: construction, signed distances, angles as in the literature, rectangles."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Plane:
             raise GeometryError(f"a plane needs a unit normal of shape (3,), got {self.normal!r}")
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return signed distances (n,) of points (n, 3) in metres, positive on the viewer's side."""
+        """Return signed distances (n,) of points (n, 3), metres, positive on the viewer's side."""
         return points_world @ self.normal - self.offset_m
 
     def flipped(self) -> Plane:
@@ -61,7 +61,7 @@ def plane_through(points_world: NDArray[np.float64]) -> Plane:
 
 
 def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the angle between two unit vectors in degrees, 0..180, accurate for small angles too."""
+    """Return the angle of two unit vectors in degrees, 0..180, accurate if small too."""
     cross = float(np.linalg.norm(np.cross(first, second)))
     return math.degrees(math.atan2(cross, float(first @ second)))
 

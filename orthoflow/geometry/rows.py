@@ -23,7 +23,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Concatenate the items of several, at least one; fields that describe all are the first's."""
+        """Concatenate the items of several; fields that describe all are the first's."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
 

@@ -60,7 +60,7 @@ class Ray(NamedTuple):
 def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Return the distance to a rectangle along a ray, in units of its direction; inf if it misses."""
+    """Return the distance to a rectangle along a ray, in units of its direction, or inf."""
     # Scalars on purpose: a row as an array would be reference-counted with each use.
     r = rectangles
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz

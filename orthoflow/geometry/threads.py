@@ -55,7 +55,7 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 def in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
-    """Yield a function's results item by item, `threads` computed at once; None: one per processor."""
+    """Yield a function's results, `threads` computed at once; None: one per processor."""
     if not has_room_for_threads():
         yield from map(function, items)
         return

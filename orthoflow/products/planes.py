@@ -233,7 +233,7 @@ class Planes(Product):
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:
-        """Return the standard deviation of a plane's direction, about the axis where it is largest."""
+        """Return the standard deviation of a plane's direction about its worst axis."""
         largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 

@@ -1,4 +1,4 @@
-"""The base of all products: a frozen dataclass that converts to named arrays plus JSON, and back."""
+"""The base of all products: a frozen dataclass that converts to and from named arrays and JSON."""
 
 from __future__ import annotations
 
