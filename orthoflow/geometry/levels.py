@@ -71,11 +71,12 @@ def plain_tone(
     >>> ramp, mask = np.linspace(0.0, 1.0, 2000)[None], np.ones((1, 2000), dtype=np.uint8)
     >>> plain_tone(0.0 * ramp, mask, (1,), white=1.0), plain_tone(ramp, mask, (1,), white=1.0)
     (('black', 1.0), None)
+    >>> plain_tone(ramp[..., None], 0 * mask, (1,), white=1.0)  # shows nothing
     """
     step = max(1, math.isqrt(mask.size // _TONE_SAMPLE))
     is_shown = np.isin(mask[::step, ::step], shown)
     cells = picture[::step, ::step][is_shown].astype(np.float64) / white
-    cells = cells.reshape(len(cells), -1)
+    cells = cells[:, None] if picture.ndim == 2 else cells
     cells = cells[np.isfinite(cells).all(axis=1)]
     if len(cells) < _TONE_CELLS_MIN:
         return None

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
@@ -20,11 +21,13 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
-from orthoflow.files.photo_files import HOW_TO_DEVELOP, read_exif
+from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, read_exif, unreadable
 from orthoflow.files.points.blocks import ScanFile
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
+from orthoflow.files.points.units import refuse_degrees
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.foreign_text import first_few
+from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.sdk.lines import text_of_path
 from orthoflow.workflow.source import shipped_workflow
 
@@ -58,6 +61,7 @@ class Recognised:
         n_posed: photos in a scan whose lens and pose it states.
         fields: what the points of a scan have besides coordinates, empty fields left out.
         lens: camera and focal length of a photo, as its EXIF data state them.
+        up: axis that surfaces show to be up, where that is plainly another one than z.
         advice: what to set or to give, as far as the data show it.
     """
 
@@ -68,6 +72,7 @@ class Recognised:
     n_posed: int = 0
     fields: frozenset[str] = frozenset()
     lens: str = ""
+    up: str = ""
     advice: tuple[str, ...] = ()
 
 
@@ -112,7 +117,7 @@ def _file(path: Path) -> Recognised:
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
         return Recognised(kind="other", path=path, summary="an orthoimage with its frame beside it")
     if suffix in PHOTO_SUFFIXES:
-        return Recognised(kind="photos", path=path, summary="a photo", n_photos=1, lens=_lens(path))
+        return _photo(path)
     readers: dict[str, Callable[[Path], Recognised]] = {
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),
@@ -133,49 +138,90 @@ def _raw(path: Path) -> Recognised:
     return Recognised(kind="unknown", path=path, summary=summary)
 
 
-def _lens(path: Path) -> str:
-    """Return what EXIF states of the lens; empty where it states no focal length."""
+def _photo(path: Path) -> Recognised:
     with path.open("rb") as file:
-        exif = read_exif(file.read(_HEAD_BYTES))
+        head = file.read(_HEAD_BYTES)
+    # HEIC is opened, and the rest of its kind is told by the first bytes.
+    problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
+    if problem:
+        return Recognised(kind="unknown", path=path, summary=problem)
+    exif = read_exif(head)
     lengths = {"mm": exif.focal_mm, "mm (35 mm equivalent)": exif.focal_35mm}
     stated = [f"{value:g} {unit}" for unit, value in lengths.items() if value]
-    return f"{exif.camera} {stated[0]}".strip() if stated else ""
+    lens = f"{exif.camera} {stated[0]}".strip() if stated else ""
+    return Recognised(kind="photos", path=path, summary="a photo", n_photos=1, lens=lens)
 
 
 def _scan(path: Path) -> Recognised:
     scan = open_scan(path)
+    unit = scan.scans[0].unit
+    if unit is not None:
+        refuse_degrees(path.name, unit)
     stated = {str(name) for name in scan.fields} & _FIELDS.keys()
-    fields, extent, is_finite = _seen_in(scan)
+    seen = _seen_in(scan, np.ones(3) if unit is None else np.array(unit.metres))
     is_e57 = path.suffix.lower() == E57_SUFFIX
     photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
-    for beginning, names in (("", fields), ("nothing in its fields for ", stated - fields)):
+    if unit is not None:
+        words.append(f"unit {unit.name} ({unit.source})")
+    for beginning, names in (
+        ("", seen.fields),
+        ("nothing in its fields for ", stated - seen.fields),
+    ):
         if names:
             listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
             words.append(f"{beginning}{listed}")
     if photos.n_images:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
+    up = seen.axis_up
+    advice = _about_extent(path.name, seen.extent_m, "m" if unit is None else unit.name)
+    if up:
+        advice.append(
+            f"{_word(path.name)}: by its surfaces {up} points up, not z: cloud.up is {up} in the "
+            f"workflow; make it -{up} where floors come out as ceilings"
+        )
     return Recognised(
         kind="scan",
         path=path,
         summary=", ".join(words),
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
-        fields=fields,
-        advice=_about_extent(path.name, extent) if is_finite else (),
+        fields=seen.fields,
+        up=up,
+        advice=tuple(advice),
     )
 
 
-def _seen_in(scan: ScanFile) -> tuple[frozenset[str], float, bool]:
-    """Look at the first points of a scan: fields that hold something, largest extent, any point."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """What the first points of a scan show: fields that hold something, points (n, 3) in metres."""
+
+    fields: frozenset[str]
+    points_m: NDArray[np.float64]
+
+    @property
+    def extent_m(self) -> float:
+        """The largest along an axis; 0 without a point."""
+        return float(np.ptp(self.points_m, axis=0).max()) if len(self.points_m) else 0.0
+
+    @property
+    def axis_up(self) -> str:
+        """The axis that is up where that is plainly not z, else empty."""
+        if not len(self.points_m):
+            return ""
+        offsets = (self.points_m - np.median(self.points_m, axis=0)).astype(np.float32)
+        quality = judge_quality(list(offsets.T), None)
+        axis = None if quality is None else quality.plainly_up(np.array([0.0, 0.0, 1.0]))
+        return "" if axis is None else "xyz"[axis]
+
+
+def _seen_in(scan: ScanFile, unit_m: NDArray[np.float64]) -> _Seen:
+    kept: list[NDArray[np.float64]] = []
     found: set[str] = set()
     n_seen = 0
     for block in scan.read():
-        points = block.points[np.isfinite(block.points).all(axis=1)]
-        if len(points):
-            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        kept.append(block.points[np.isfinite(block.points).all(axis=1)] * unit_m)
         values = {"intensity": block.intensity, "rgb": block.rgb}
         found |= {
             name for name, one in values.items() if one is not None and np.nan_to_num(one).any()
@@ -183,25 +229,19 @@ def _seen_in(scan: ScanFile) -> tuple[frozenset[str], float, bool]:
         n_seen += block.n_read
         if n_seen >= _LOOKED_AT:
             break
-    is_finite = bool(np.isfinite(low).all())
-    return frozenset(found), float((high - low).max()) if is_finite else 0.0, is_finite
+    return _Seen(fields=frozenset(found), points_m=np.concatenate([np.empty((0, 3)), *kept]))
 
 
-def _about_extent(name: str, extent: float) -> tuple[str, ...]:
-    """Ask for the unit where coordinates as metres are larger or smaller than what is scanned."""
-    if extent > _MAX_EXTENT_M:
-        text = (
-            f"{_word(name)} is {extent:,.0f} m long if its coordinates are metres; if they are "
-            "millimetres, set cloud.unit=mm"
-        )
-        return (text,)
-    if 0 < extent < _MIN_EXTENT_M:
-        text = (
-            f"{_word(name)} is {extent * 1000:.3g} mm long if its coordinates are metres: check "
-            "the unit that it was exported in"
-        )
-        return (text,)
-    return ()
+def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
+    """Ask for the unit where a scan is larger or smaller than what is scanned."""
+    if extent_m > _MAX_EXTENT_M:
+        size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
+    elif 0 < extent_m < _MIN_EXTENT_M:
+        size = f"{extent_m * 1000:.3g} mm"
+        hint = "check the unit that it was exported in, and set cloud.unit"
+    else:
+        return []
+    return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
 
 
 # Longer, and shorter, than what is scanned from a tripod.
@@ -410,10 +450,18 @@ class _Drafting:
         described = {name: _described(files) for name, files in taken.items() if files}
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", self.target.stem).strip("-") or self.recipe
         body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
-        text = f"{self._heading(start, described, left_out)}{body}\n{_without_stand_ins(steps)}"
+        text = f"{self._heading(start, described, left_out)}{body}\n{self._steps(steps)}"
         return Draft(
             recipe=self.recipe, text=text, inputs=described, left_out=left_out, advice=self._advice
         )
+
+    def _steps(self, steps: str) -> str:
+        """The steps of the recipe, with the axis that is up where scans show it."""
+        text = _without_stand_ins(steps)
+        axes = {item.up for item in self.by_kind["scan"]}
+        (up,) = axes if len(axes) == 1 else ("",)
+        reading = "in: {files: inputs.scan}\n"
+        return text.replace(reading, f"{reading}    params: {{up: {up}}}\n", 1) if up else text
 
     @property
     def _advice(self) -> list[str]:

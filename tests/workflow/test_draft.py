@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import laspy
 import numpy as np
+import pyproj
 import pytest
 from PIL import Image
 
@@ -25,6 +26,8 @@ CALIBRATION = """cameras:
   "*": {width: 40, height: 30, fx: 50, fy: 50, cx: 20, cy: 15, distortion: [0, 0, 0, 0, 0]}
 """
 TIES = "photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4,5\n"
+JPEG = b"\xff\xd8\xff"
+UNREAD = "which is not read: develop to TIFF of 16 bits or JPEG first, without lens corrections"
 POINTS = "name,x,y,z\nP1,1,2,3\nP2,2,2,3\n"
 
 
@@ -223,6 +226,37 @@ def test_a_scan_of_another_unit_is_asked_about(data: Path, scale: float, note: s
     assert note in "".join(out["advice"])
 
 
+def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path) -> None:
+    cloud = laspy.read(data / "hall.las")
+    for epsg, name in ((2260, "feet"), (4326, "degrees")):
+        cloud.header.vlrs.clear()
+        cloud.header.add_crs(pyproj.CRS.from_epsg(epsg))
+        cloud.write(str(data / f"{name}.las"))
+    out = said("new", data / "feet.las")
+    assert "unit us-ft (GeoTIFF keys + NAD83 / New York East (ftUS))" in out
+    assert "note:" not in out
+    result = asked("new", data / "degrees.las", "-o", "degrees.yaml")
+    assert result.exit_code == 2
+    assert "degrees.las states geographic coordinates in degrees" in result.output
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up: str) -> None:
+    # Two slopes on one floor, as a roof: by no other axis they are level and upright.
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(0.0, 4.0, (2, 60_000))
+    walls = np.array([[np.cos(a), np.sin(a), 0.0] for a in (0.4, 1.1, 1.8, 2.5)])
+    height = np.stack([np.zeros_like(u), np.zeros_like(u), v]).T
+    parts = [np.stack([u, v, 0.0 * u], axis=1), *(u[:, None] * wall + height for wall in walls)]
+    points = np.roll(np.concatenate(parts), "xyz".index(up) - 2, axis=1)
+    np.savetxt(data / "hall.xyz", np.column_stack([points, rng.uniform(0, 9, len(points))]))
+    out = said("new", data / "hall.xyz")
+    steps = Path("workflow.yaml").read_text()
+    assert (f"cloud.up is {up} in the workflow" in " ".join(out.split())) is (up != "z")
+    assert (f"    params: {{up: {up}}}\n" in steps) is (up != "z")
+    assert said("check", "workflow.yaml").startswith("workflow is fine")
+
+
 def test_photos_are_told_by_their_lenses(data: Path) -> None:
     for name, length in (("a", 24), ("b", 24), ("c", 50)):
         exif = Image.Exif()
@@ -333,8 +367,9 @@ def one(path: Path, content: str | bytes = "") -> Recognised:
 @pytest.mark.parametrize(
     ("name", "content", "kind", "said", "n_photos"),
     [
-        ("a.JPG", "", "photos", "a photo", 1),
-        ("a.png", "", "photos", "a photo", 1),
+        ("a.JPG", JPEG, "photos", "a photo", 1),
+        ("a.png", b"\x89PNG\r\n\x1a\n", "photos", "a photo", 1),
+        ("b.jpg", b"FUJIFILMCCD-RAW", "unknown", f"is camera raw (Fujifilm), {UNREAD}", 0),
         ("ties.csv", MORE_TIES, "ties", "2 ties measured in photos", 0),
         ("points.csv", POINTS, "checkpoints", "2 surveyed points", 0),
         ("lens.yaml", LENS, "calibration", "a calibration of a.jpg", 0),
@@ -343,7 +378,7 @@ def one(path: Path, content: str | bytes = "") -> Recognised:
     ],
 )
 def test_a_file_is_what_is_in_it(
-    tmp_path: Path, name: str, content: str, kind: str, said: str, n_photos: int
+    tmp_path: Path, name: str, content: str | bytes, kind: str, said: str, n_photos: int
 ) -> None:
     found = one(tmp_path / name, content)
     assert (found.kind, found.summary, found.n_photos) == (kind, said, n_photos)
@@ -373,7 +408,7 @@ def test_a_scan_says_how_many_points_it_has_and_what_of_each(tmp_path: Path) -> 
 
 
 def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> None:
-    alone = one(tmp_path / "wall.tif")
+    alone = one(tmp_path / "wall.tif", b"II*\0")
     assert alone.kind == "photos"
     (tmp_path / "wall.json").write_text("{}")
     (beside,) = recognised([tmp_path / "wall.tif"])
@@ -450,8 +485,8 @@ def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:
     run = tmp_path / "runs" / "first"
     (run / "figures").mkdir(parents=True)
     for name in ("run.h5", "sheet.png", "figures/plan.png"):
-        (run / name).touch()
-    (tmp_path / "photo.jpg").touch()
+        (run / name).write_bytes(JPEG)
+    (tmp_path / "photo.jpg").write_bytes(JPEG)
     found = {one.path: (one.kind, one.summary) for one in recognised([tmp_path])}
     assert found == {
         tmp_path / "photo.jpg": ("photos", "a photo"),

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from orthoflow.files.points import ScanFile
 from orthoflow.files.points.fields import may_be_intensity
+from orthoflow.geometry import UpDirection, up_vector
+from orthoflow.geometry.cloud_quality import CloudQuality
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import JsonValue, PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
@@ -149,6 +151,31 @@ NOT_FINITE: Final = DiagnosticSpec(
     severity="warning",
     text="{n_points} points with coordinates that are not finite were left out",
     rank_by="n_points",
+)
+OTHER_UP: Final = DiagnosticSpec(
+    code="scan-up-doubtful",
+    severity="warning",
+    text="{axis} looks like the axis that points up, not {up}: {share:.0%} of the surfaces are "
+    "level or upright by it, {share_up:.0%} by {up}",
+    remedy="{step}.up={axis}, or -{axis} where floors come out as ceilings",
+)
+THICK: Final = DiagnosticSpec(
+    code="scan-thick",
+    severity="warning",
+    text="the cloud is thicker than its point spacing: across surfaces, in pieces of about "
+    "{side_cm:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within {width_mm:.1f} mm), "
+    "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths are no "
+    "better than that",
+    remedy="look for noise, rough surfaces and scans that were joined without fitting",
+    rank_by="sigma_mm",
+)
+DISAGREE: Final = DiagnosticSpec(
+    code="scans-disagree",
+    severity="warning",
+    text="the scans disagree: where two show one surface they lie {apart_mm:.1f} mm apart across "
+    "it (median), while each scatters by {sigma_mm:.1f} mm",
+    remedy="register them again, or take one at a time",
+    rank_by="apart_mm",
 )
 RULES: Final = {
     "intensity_max": "intensity_max",
@@ -347,6 +374,40 @@ def report_summary(
         extent=_size(sides_m),
         left_out=", ".join(causes) or "none",
     )
+
+
+def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
+    """Say so where surfaces are level and upright by another axis than the one that is up."""
+    axis = None if quality is None else quality.plainly_up(up_vector(up))
+    if quality is None or axis is None:
+        return
+    by_up, by_other = (quality.square_shares(one)[1] for one in (up_vector(up), np.eye(3)[axis]))
+    ctx.report(OTHER_UP, axis="xyz"[axis], up=up, share=by_other, share_up=by_up)
+
+
+def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
+    """Report the numbers, and warn in words of a thick cloud and of scans that disagree."""
+    if quality is None:
+        return
+    sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m
+    ctx.metric("thickness_mm", sigma_mm, "mm")
+    ctx.metric("thickness_width_mm", 1e3 * quality.width_95_m, "mm")
+    ctx.metric("scan_step_mm", step_mm, "mm")
+    ctx.metric("thickness_scan_steps", quality.sigma_m / quality.scan_step_m, "1")
+    if quality.is_thick:
+        ctx.report(
+            THICK,
+            side_cm=1e2 * quality.side_m,
+            sigma_mm=sigma_mm,
+            width_mm=1e3 * quality.width_95_m,
+            step_mm=step_mm,
+        )
+    if quality.scans_apart_m is None:
+        return
+    apart_mm = 1e3 * quality.scans_apart_m
+    ctx.metric("scans_apart_mm", apart_mm, "mm")
+    if quality.disagrees:
+        ctx.report(DISAGREE, apart_mm=apart_mm, sigma_mm=sigma_mm)
 
 
 def _names(groups: Iterable[Sequence[str]]) -> list[str]:

@@ -18,11 +18,11 @@ from orthoflow.files.points.fields import Columns, columns_of_user, plain_name
 from orthoflow.files.points.formats import LAS, TEXT
 from orthoflow.files.points.units import UNITS_M, refuse_degrees
 from orthoflow.geometry import UpDirection, up_vector
+from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.assembly import CloudAssembly
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
-from orthoflow_plugins.read.quality import judge_quality, report_quality, warn_of_up
 from orthoflow_plugins.read.reporting import (
     COLOUR_LIMIT,
     COLOURS_GREY,
@@ -33,10 +33,12 @@ from orthoflow_plugins.read.reporting import (
     report_fields,
     report_notes,
     report_precision,
+    report_quality,
     report_scales,
     report_stations,
     report_summary,
     scan_json,
+    warn_of_up,
 )
 from orthoflow_plugins.read.scales import (
     IntensityScale,

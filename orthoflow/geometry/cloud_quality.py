@@ -14,10 +14,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.geometry.robust import median_deviation
-from orthoflow.sdk import DiagnosticSpec, StepContext
 
 # Sides of the pieces: the next where so few points lie in one that they tell nothing.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
@@ -53,31 +52,6 @@ _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
 _SQUARE_PLAIN: Final = 0.8
 _SQUARER_BY: Final = 0.15
-OTHER_UP: Final = DiagnosticSpec(
-    code="scan-up-doubtful",
-    severity="warning",
-    text="{axis} looks like the axis that points up, not {up}: {share:.0%} of the surfaces are "
-    "level or upright by it, {share_up:.0%} by {up}",
-    remedy="{step}.up={axis}, or -{axis} where floors come out as ceilings",
-)
-THICK: Final = DiagnosticSpec(
-    code="scan-thick",
-    severity="warning",
-    text="the cloud is thicker than its point spacing: across surfaces, in pieces of about "
-    "{side_cm:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within {width_mm:.1f} mm), "
-    "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths are no "
-    "better than that",
-    remedy="look for noise, rough surfaces and scans that were joined without fitting",
-    rank_by="sigma_mm",
-)
-DISAGREE: Final = DiagnosticSpec(
-    code="scans-disagree",
-    severity="warning",
-    text="the scans disagree: where two show one surface they lie {apart_mm:.1f} mm apart across "
-    "it (median), while each scatters by {sigma_mm:.1f} mm",
-    remedy="register them again, or take one at a time",
-    rank_by="apart_mm",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,40 +152,6 @@ def judge_quality(
         if len(pieces) >= _PIECES_LEAST:
             return _summed_up(pieces, side_m)
     return None
-
-
-def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
-    """Say so where surfaces are level and upright by another axis than the one that is up."""
-    axis = None if quality is None else quality.plainly_up(up_vector(up))
-    if quality is None or axis is None:
-        return
-    by_up, by_other = (quality.square_shares(one)[1] for one in (up_vector(up), np.eye(3)[axis]))
-    ctx.report(OTHER_UP, axis="xyz"[axis], up=up, share=by_other, share_up=by_up)
-
-
-def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
-    """Report the numbers, and warn in words of a thick cloud and of scans that disagree."""
-    if quality is None:
-        return
-    sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m
-    ctx.metric("thickness_mm", sigma_mm, "mm")
-    ctx.metric("thickness_width_mm", 1e3 * quality.width_95_m, "mm")
-    ctx.metric("scan_step_mm", step_mm, "mm")
-    ctx.metric("thickness_scan_steps", quality.sigma_m / quality.scan_step_m, "1")
-    if quality.is_thick:
-        ctx.report(
-            THICK,
-            side_cm=1e2 * quality.side_m,
-            sigma_mm=sigma_mm,
-            width_mm=1e3 * quality.width_95_m,
-            step_mm=step_mm,
-        )
-    if quality.scans_apart_m is None:
-        return
-    apart_mm = 1e3 * quality.scans_apart_m
-    ctx.metric("scans_apart_mm", apart_mm, "mm")
-    if quality.disagrees:
-        ctx.report(DISAGREE, apart_mm=apart_mm, sigma_mm=sigma_mm)
 
 
 def _indices_of_pieces(
@@ -354,8 +294,6 @@ def _farthest(
 
 def _step_m(on_surface: NDArray[np.float64]) -> float | None:
     """Median distance of points (n, 2) to the nearest other one; None where all are the same."""
-    from scipy.spatial import cKDTree
-
     distances, _ = cKDTree(on_surface).query(on_surface, k=2)
     apart = np.asarray(distances)[:, 1]
     apart = apart[apart > 0.0]

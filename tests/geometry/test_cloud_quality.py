@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read import quality as quality_module
-from orthoflow_plugins.read.quality import CloudQuality, judge_quality, report_quality, warn_of_up
+from orthoflow_plugins.read.reporting import report_quality, warn_of_up
 
+from orthoflow.geometry import cloud_quality
+from orthoflow.geometry.cloud_quality import CloudQuality, judge_quality
 from orthoflow.sdk import StepContext
 
 ASKEW = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
@@ -54,17 +55,17 @@ def test_thickness_and_step_are_those_of_the_scan(noise_m: float, step_m: float)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_of_a_large_cloud_a_part_says_as_much(monkeypatch: pytest.MonkeyPatch, axis: int) -> None:
     # As large as two hundred million points, in the way of looking: slabs across the longest axis.
-    monkeypatch.setattr("orthoflow_plugins.read.quality._LOOKED_AT_MOST", 4000)
+    monkeypatch.setattr("orthoflow.geometry.cloud_quality._LOOKED_AT_MOST", 4000)
     points = np.roll(wall(step_m=0.005, noise_m=0.002), axis, axis=1)
     looked_at = 0
-    measured = quality_module._measured
+    measured = cloud_quality._measured
 
     def counted(points: NDArray[np.float64], *rest: Any) -> Any:
         nonlocal looked_at
         looked_at += len(points)
         return measured(points, *rest)
 
-    monkeypatch.setattr("orthoflow_plugins.read.quality._measured", counted)
+    monkeypatch.setattr("orthoflow.geometry.cloud_quality._measured", counted)
     quality = judge_quality(offsets(points), None)
     assert quality is not None
     assert looked_at < 0.2 * len(points)
@@ -115,7 +116,7 @@ def test_pieces_of_thirty_points_are_looked_at_and_three_hundred_at_most() -> No
     corners = np.repeat(np.array(cubes) * 1.0, counts, axis=0)
     points = corners + rng.uniform(0.01, 0.99, corners.shape)
     points[0] = 0.0
-    found = list(quality_module._indices_of_pieces(offsets(points), 1.0))
+    found = list(cloud_quality._indices_of_pieces(offsets(points), 1.0))
     # One cube in three, of which six in seven have points enough.
     assert 700 / 3 * 0.7 < len(found) < 300
     for piece in found:
@@ -198,7 +199,7 @@ def shuffled(*values: float) -> NDArray[np.float64]:
 def test_a_piece_is_as_thick_as_its_points_lie_apart() -> None:
     even = shuffled(*np.linspace(-0.002, 0.002, 1600))
     scan = np.zeros(1600, dtype=np.uint16)
-    piece = quality_module._measured(square(even), scan, 0.1)
+    piece = cloud_quality._measured(square(even), scan, 0.1)
     assert piece is not None
     assert piece.sigma_m == pytest.approx(1.4826 * 0.001, rel=0.01)
     assert piece.width_95_m == pytest.approx(0.95 * 0.004, rel=0.005)
@@ -207,7 +208,7 @@ def test_a_piece_is_as_thick_as_its_points_lie_apart() -> None:
     # No more than 4000 points of a scan count, from its first on.
     several = np.concatenate([square(even), square(even), square(even)[:800], square(5.0 * even)])
     several[:, 0] += 0.0005 * np.repeat(np.arange(4), [1600, 1600, 800, 1600])
-    many = quality_module._measured(several, np.zeros(len(several), dtype=np.uint16), 0.1)
+    many = cloud_quality._measured(several, np.zeros(len(several), dtype=np.uint16), 0.1)
     assert many is not None
     assert many.sigma_m == pytest.approx(piece.sigma_m, rel=0.01)
 
@@ -233,7 +234,7 @@ def test_a_piece_is_one_surface_that_its_points_cover(
     points: NDArray[np.float64], is_surface: bool
 ) -> None:
     scan = np.zeros(len(points), dtype=np.uint16)
-    assert (quality_module._measured(points, scan, 0.1) is not None) is is_surface
+    assert (cloud_quality._measured(points, scan, 0.1) is not None) is is_surface
 
 
 def test_the_scan_farthest_from_the_fullest_one_tells_how_far_scans_lie_apart() -> None:
@@ -242,12 +243,12 @@ def test_the_scan_farthest_from_the_fullest_one_tells_how_far_scans_lie_apart() 
     scan = np.repeat(np.array([7, 2, 5], dtype=np.uint16), [1600, 800, 800])
     across = np.concatenate([part[:, 1] for part in points])
     middles = {one: float(np.median(across[scan == one])) for one in (7, 2, 5)}
-    apart, sigma = quality_module._farthest(across, scan, middles, 7)  # type: ignore[arg-type]
+    apart, sigma = cloud_quality._farthest(across, scan, middles, 7)  # type: ignore[arg-type]
     assert apart == pytest.approx(0.004)
     # A median of n values is 1.2533 / sqrt(n) times as sure as one of them.
     one, other = 1.4826 * 0.001 / np.sqrt(1600), 1.4826 * 0.002 / np.sqrt(800)
     assert sigma == pytest.approx(1.2533 * np.hypot(one, other))
-    piece = quality_module._measured(np.concatenate(points), scan, 0.1)
+    piece = cloud_quality._measured(np.concatenate(points), scan, 0.1)
     assert piece is not None
     assert piece.apart_m == pytest.approx(0.004, rel=0.02)
 
@@ -266,7 +267,7 @@ def test_the_scan_farthest_from_the_fullest_one_tells_how_far_scans_lie_apart() 
 def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
     sigma_m: float, sigma_apart_m: float, apart_m: float, disagrees: bool
 ) -> None:
-    piece = quality_module._Piece(
+    piece = cloud_quality._Piece(
         sigma_m=sigma_m,
         width_95_m=0.01,
         scan_step_m=0.002,
@@ -274,11 +275,11 @@ def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
         sigma_apart_m=sigma_apart_m,
         normal=ASKEW[0],
     )
-    found = quality_module._summed_up([piece] * 20, 0.1)
+    found = cloud_quality._summed_up([piece] * 20, 0.1)
     assert (found.scans_apart_m, found.sigma_apart_m) == (apart_m, sigma_apart_m)
     assert found.disagrees == disagrees
     # Nineteen pieces that two scans show say nothing.
-    few = quality_module._summed_up([piece] * 19, 0.1)
+    few = cloud_quality._summed_up([piece] * 19, 0.1)
     assert (few.scans_apart_m, few.sigma_apart_m, few.disagrees) == (None, 0.0, False)
     assert few.n_pieces == 19
 
