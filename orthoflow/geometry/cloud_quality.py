@@ -14,11 +14,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from orthoflow.geometry.robust import median_deviation
 
-# Sides of the pieces: the next where so few points lie in one that they tell nothing.
+# Sides of the pieces: the next where so few points lie in one that they show nothing.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
@@ -32,7 +31,7 @@ _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
 # Points whose cube is found; of larger clouds those in some slabs of cubes.
 _LOOKED_AT_MOST: Final = 4_000_000
-# Odd, with bits all over, so that the upper bits of a product hang on all of a number.
+# Odd, with bits all over, so that the upper bits of a product depend on all of a number.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
 # A piece is one surface if so many of its points lie near its plane, if they scatter by less than
 # this part of its side, and if they cover it both ways.
@@ -47,7 +46,7 @@ _SURE_SIGMAS: Final = 3.0
 _AGREE_M: Final = 0.001
 # A piece within this angle of level or of upright is one; noise turns the smallest by 2 degrees.
 _SQUARE_DEG: Final = 5.0
-# Where what is said to be up is up, hardly any building shows no level piece at all.
+# Where the stated direction is up, hardly any building shows no level piece at all.
 _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
 _SQUARE_PLAIN: Final = 0.8
@@ -83,7 +82,7 @@ class CloudQuality:
         """Share of the pieces that are level, and of those that are level or upright.
 
         Args:
-            up: (3,) unit vector that points up, or is said to.
+            up: (3,) unit vector that points up, as stated.
         """
         cosines = np.abs(self.normals @ up)
         is_level = cosines > np.cos(np.radians(_SQUARE_DEG))
@@ -93,7 +92,7 @@ class CloudQuality:
     def plainly_up(self, up: NDArray[np.float64]) -> int | None:
         """Axis 0, 1, 2 that is up by the directions of surfaces; None where `up` may be right.
 
-        A room square to the axes looks alike along all of them, and nothing is said of it. Nor is
+        A room square to the axes looks the same along all of them, so that None is returned. So it is
         of slopes and single walls: surfaces must be level or upright by one axis, some of them
         level, and by `up` none level and many askew.
         """
@@ -121,7 +120,7 @@ class CloudQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class _Piece:
-    """What one piece says; `apart_m` is NaN where one scan shows it."""
+    """What one piece shows; `apart_m` is NaN where one scan shows it."""
 
     sigma_m: float
     width_95_m: float
@@ -176,11 +175,11 @@ def _indices_of_pieces(
         chosen = start + np.flatnonzero(is_slab[slabs])
         found.append(chosen[is_asked[_hash(_cubes(offsets, lows, chosen, side_m))]])
     indices = np.concatenate(found)
-    # Equal hashes of other cubes are told apart by the cubes themselves.
+    # Equal hashes of other cubes are separated by the cubes themselves.
     x, y, z = (axis.astype(np.int64) for axis in _cubes(offsets, lows, indices, side_m))
     groups = x + (y << _CUBE_BITS) + (z << 2 * _CUBE_BITS)
     known = np.unique(groups)
-    # Of a dense cloud, a part of the pieces says as much.
+    # Of a dense cloud, a part of the pieces shows as much.
     known = known[:: max(1, len(indices) // _GATHERED_MOST)]
     is_known = np.isin(groups, known)
     indices, groups = indices[is_known], groups[is_known]
@@ -294,6 +293,8 @@ def _farthest(
 
 def _step_m(on_surface: NDArray[np.float64]) -> float | None:
     """Median distance of points (n, 2) to the nearest other one; None where all are the same."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - loads slowly, and here alone
+
     distances, _ = cKDTree(on_surface).query(on_surface, k=2)
     apart = np.asarray(distances)[:, 1]
     apart = apart[apart > 0.0]
