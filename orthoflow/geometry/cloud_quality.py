@@ -92,8 +92,8 @@ class CloudQuality:
     def plainly_up(self, up: NDArray[np.float64]) -> int | None:
         """Axis 0, 1, 2 that is up by the directions of surfaces; None where `up` may be right.
 
-        A room square to the axes looks the same along all of them, so that None is returned. So it is
-        of slopes and single walls: surfaces must be level or upright by one axis, some of them
+        A room square to the axes looks the same along all of them, so that None is returned, as of
+        slopes and single walls: surfaces must be level or upright by one axis, some of them
         level, and by `up` none level and many askew.
         """
         level, square = self.square_shares(up)
