@@ -9,15 +9,14 @@ import os
 import re
 import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final
 
 import click
 
-from orthoflow.catalog.catalog import Announced, Catalog, MethodEntry
+from orthoflow.catalog.catalog import Catalog, KindEntry, MethodEntry, ProductEntry
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.cli.commands import (
@@ -31,9 +30,6 @@ from orthoflow.cli.commands import (
 )
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
-
-if TYPE_CHECKING:
-    from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports
 
 _SUMMARIES: Final = {
     "list": "List every method, and what is wrong with plugins that do not load.",
@@ -59,112 +55,76 @@ def plugins_list(*, as_json: bool) -> int:
 
     `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
     """
-    catalog = discover_catalog()
-    methods = {name: entry.looked_at() for name, entry in catalog.methods.items()}
-    catalog = replace(catalog, methods=methods)
+    found = _listing(discover_catalog())
     if as_json:
-        echo_json(_catalog_json(catalog))
+        echo_json(found)
         return EXIT_GOOD
-    echo_table(
-        ("method", "state", "distribution", "summary"),
-        [
-            (
-                entry.spec.id,
-                entry.state,
-                f"{entry.distribution.name} {entry.distribution.version}",
-                entry.spec.summary,
-            )
-            for entry in catalog.methods.values()
-        ],
-    )
-    echo()
-    echo_table(
-        ("kind", "takes", "gives", "distribution", "summary"),
-        [
-            (
-                name,
-                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.inputs),
-                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.outputs),
-                str(kind.distribution),
-                kind.spec.summary,
-            )
-            for name, kind in catalog.kinds.items()
-        ],
-    )
-    echo()
-    echo_table(
-        ("product", "distribution", "summary"),
-        [
-            (name, str(product.distribution), product.spec.summary)
-            for name, product in catalog.products.items()
-        ],
-    )
-    problems = [
-        *(kind.problem for kind in catalog.kinds.values() if kind.problem),
-        *(product.problem for product in catalog.products.values() if product.problem),
-        *(entry.problem for entry in catalog.methods.values() if entry.problem),
-        *(str(broken) for broken in catalog.broken),
-    ]
+    for section, name, columns in (
+        ("methods", "id", ("state", "distribution", "summary")),
+        ("kinds", "name", ("in", "out", "distribution", "summary")),
+        ("products", "name", ("distribution", "summary")),
+    ):
+        header = (section.removesuffix("s"), *columns)
+        echo_table(header, [_row(one, (name, *columns)) for one in found[section]])
+        echo()
+    problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
-        echo("", "what is wrong:")
-    for problem in problems:
-        echo(f"- {problem}")
-    for broken in catalog.broken:
-        echo(f"`orthoflow plugins show {broken.entry_point}` prints its traceback")
+        echo("what is wrong:", *(f"- {problem}" for problem in problems))
+    for one in found["broken"]:
+        echo(f"`orthoflow plugins show {one['plugin']}` prints its traceback")
     return EXIT_GOOD
 
 
-def _catalog_json(catalog: Catalog) -> dict[str, object]:
+def _listing(catalog: Catalog) -> dict[str, list[dict[str, Any]]]:
+    methods = [entry.looked_at() for entry in catalog.methods.values()]
     return {
         "methods": [
-            {
-                "id": entry.spec.id,
-                "kind": entry.spec.kind,
-                **_announced_json(entry),
-                "summary": entry.spec.summary,
-            }
-            for entry in catalog.methods.values()
+            {"id": one.spec.id, "kind": one.spec.kind, **_announced(one)} for one in methods
         ],
         "kinds": [
             {
                 "name": name,
-                **_announced_json(kind),
-                "in": dict(kind.spec.inputs),
-                "out": dict(kind.spec.outputs),
-                "is_source": kind.spec.is_source,
-                "summary": kind.spec.summary,
+                "in": dict(one.spec.inputs),
+                "out": dict(one.spec.outputs),
+                "is_source": one.spec.is_source,
+                **_announced(one),
             }
-            for name, kind in catalog.kinds.items()
+            for name, one in catalog.kinds.items()
         ],
-        "products": [
-            {
-                "name": name,
-                **_announced_json(product),
-                "summary": product.spec.summary,
-            }
-            for name, product in catalog.products.items()
-        ],
+        "products": [{"name": name, **_announced(one)} for name, one in catalog.products.items()],
         "broken": [
             {
-                "plugin": broken.entry_point,
-                "module": broken.module,
-                "distribution": broken.distribution.name,
-                "version": broken.distribution.version,
-                "problem": str(broken),
-                "traceback": broken.traceback,
+                "plugin": one.entry_point,
+                "module": one.module,
+                "distribution": one.distribution.name,
+                "version": one.distribution.version,
+                "problem": str(one),
+                "traceback": one.traceback,
             }
-            for broken in catalog.broken
+            for one in catalog.broken
         ],
     }
 
 
-def _announced_json(entry: Announced) -> dict[str, object]:
+def _announced(entry: MethodEntry | KindEntry | ProductEntry) -> dict[str, object]:
     return {
         "state": entry.state,
         "problem": entry.problem,
         "distribution": entry.distribution.name,
         "version": entry.distribution.version,
+        "summary": entry.spec.summary,
     }
+
+
+def _row(entry: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
+    texts = {
+        name: ", ".join(value) if isinstance(value, dict) else str(value)
+        for name, value in entry.items()
+    }
+    texts["distribution"] += f" {entry['version']}"
+    if entry.get("is_source"):
+        texts["in"] = texts["out"] = "its methods' own"
+    return [texts[name] for name in columns]
 
 
 @click.command("show", cls=Command)
@@ -178,69 +138,76 @@ def plugins_show(method_id: str, *, as_json: bool) -> int:
     """
     catalog = discover_catalog()
     if failure := _failure(catalog, method_id):
-        _print_failure(failure, as_json=as_json)
+        if as_json:
+            echo_json(failure)
+        else:
+            _print_failure(failure)
         return EXIT_PLUGIN_MISSING
-    entry = catalog.method(method_id)
+    described = _described(catalog.method(method_id))
     if as_json:
-        echo_json(_method_json(entry))
+        echo_json(described)
     else:
-        _print_method(entry, entry.load())
+        _print_method(described)
     return EXIT_GOOD
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Failure:
-    """Why a plugin or a method cannot be loaded.
-
-    Attributes:
-        problem: one sentence.
-        distribution: who brought it.
-        target: the module or class that does not load.
-        traceback: of what it raised; empty when it loads and breaks a rule.
-    """
-
-    problem: str
+def _failure(catalog: Catalog, name: str) -> dict[str, str]:
+    """Why a plugin or a method cannot be loaded; empty where it can."""
     distribution: DistributionInfo
-    target: str
-    traceback: str
-
-
-def _failure(catalog: Catalog, name: str) -> _Failure | None:
     entry = catalog.methods.get(name)
     if entry is None:
         for broken in catalog.broken:
             if name in (broken.entry_point, broken.distribution.name) or broken.mentions(name):
-                return _Failure(
-                    problem=str(broken),
-                    distribution=broken.distribution,
-                    target=broken.module,
-                    traceback=broken.traceback,
-                )
-    elif entry.state == "fine":
+                problem, target, trace = str(broken), broken.module, broken.traceback
+                distribution = broken.distribution
+                break
+        else:
+            return {}
+    else:
+        if entry.state != "fine":
+            return {}
         try:
             entry.load()
         except PluginError as error:
             cause = error.__cause__
-            return _Failure(
-                problem=str(error),
-                distribution=entry.distribution,
-                target=entry.spec.target,
-                traceback="".join(traceback.format_exception(cause)) if cause else "",
-            )
-    return None
+            problem, target, distribution = str(error), entry.spec.target, entry.distribution
+            # A class that loads and breaks a rule has none.
+            trace = "".join(traceback.format_exception(cause)) if cause else ""
+        else:
+            return {}
+    return {
+        "state": "broken",
+        "problem": problem,
+        "distribution": distribution.name,
+        "version": distribution.version,
+        "target": target,
+        "traceback": trace,
+    }
 
 
-def _method_json(entry: MethodEntry) -> dict[str, object]:
+def _print_failure(failure: Mapping[str, str]) -> None:
+    echo(failure["problem"], "")
+    echo(f"distribution  {failure['distribution']} {failure['version']}")
+    echo("state         broken", f"from          {failure['target']}")
+    if failure["traceback"]:
+        echo("", *failure["traceback"].rstrip().split("\n"))
+
+
+def _described(entry: MethodEntry) -> dict[str, Any]:
     """Return everything that a method declares, as JSON.
 
     Raises:
         PluginError: the method's class cannot be loaded.
     """
+    from orthoflow.sdk import port_specs
+    from orthoflow.sdk.units import unit_of
+
     method = entry.load()
+    schema = method.Params.model_json_schema()
     return {
         "id": entry.spec.id,
         "summary": entry.spec.summary,
-        "description": _docstring(method),
+        "description": inspect.cleandoc(method.__doc__ or ""),
         "state": entry.state,
         "distribution": entry.distribution.name,
         "version": entry.distribution.version,
@@ -250,132 +217,94 @@ def _method_json(entry: MethodEntry) -> dict[str, object]:
         "citations": list(method.citations),
         "metrics": [dataclasses.asdict(one) for one in method.metric_specs()],
         "params": [
-            {"name": name, "type": type_, "default": default, "unit": unit, "description": text}
-            for name, type_, default, unit, text in _parameters(method.Params)
+            {
+                "name": name,
+                "type": _type_text(field, schema.get("$defs", {})),
+                "default": field.get("default"),
+                "unit": unit_of(name),
+                "description": field.get("description", ""),
+            }
+            for name, field in schema.get("properties", {}).items()
         ],
         "in": [
-            {"port": port, "product": type_name, "required": required}
-            for port, type_name, required in _ports(method.In)
+            {"port": one.name, "product": one.type_name, "required": one.required}
+            for one in port_specs(method.In).values()
         ],
-        "out": [{"port": port, "product": type_name} for port, type_name, _ in _ports(method.Out)],
+        "out": [
+            {"port": one.name, "product": one.type_name} for one in port_specs(method.Out).values()
+        ],
     }
 
 
-def _print_failure(failure: _Failure, *, as_json: bool) -> None:
-    if as_json:
-        echo_json(
-            {
-                "state": "broken",
-                "problem": failure.problem,
-                "distribution": failure.distribution.name,
-                "version": failure.distribution.version,
-                "target": failure.target,
-                "traceback": failure.traceback,
-            }
-        )
-        return
-    echo(failure.problem, "")
-    echo(f"distribution  {failure.distribution}")
-    echo("state         broken")
-    echo(f"from          {failure.target}")
-    if failure.traceback:
-        echo("", *failure.traceback.rstrip().split("\n"))
-
-
-def _print_method(entry: MethodEntry, method: type[Method]) -> None:
-    echo(f"{entry.spec.id}: {entry.spec.summary}", "")
-    if text := _docstring(method):
+def _print_method(method: Mapping[str, Any]) -> None:
+    echo(f"{method['id']}: {method['summary']}", "")
+    if text := method["description"]:
         echo(*text.split("\n"), "")
-    echo(f"distribution  {entry.distribution.name} {entry.distribution.version}")
-    echo(f"state         {entry.state}")
-    echo(f"class         {entry.spec.target}")
-    echo(f"determinism   {method.determinism}, result version {method.result_version}")
-    for citation in method.citations:
-        echo(f"citation      {citation}")
-    echo()
+    echo(f"distribution  {method['distribution']} {method['version']}")
+    echo(f"state         {method['state']}", f"class         {method['target']}")
+    echo(f"determinism   {method['determinism']}, result version {method['result_version']}")
+    echo(*(f"citation      {citation}" for citation in method["citations"]), "")
     ports = [
-        *(
-            ("in", port, type_name, "" if required else "optional")
-            for port, type_name, required in _ports(method.In)
-        ),
-        *(("out", port, type_name, "") for port, type_name, _ in _ports(method.Out)),
+        (way, one["port"], one["product"], "" if one.get("required", True) else "optional")
+        for way in ("in", "out")
+        for one in method[way]
     ]
     echo_table(("port", "name", "product", ""), ports)
-    if method.metrics:
+    if method["metrics"]:
         echo()
         echo_table(
             ("metric", "unit", "better", "what it is"),
-            [(one.name, one.unit, one.better, _metric_text(one)) for one in method.metric_specs()],
+            [
+                (one["name"], one["unit"], one["better"], _metric_text(one))
+                for one in method["metrics"]
+            ],
         )
-    parameters = _parameters(method.Params)
-    echo(*([""] if parameters else ["", "no parameters"]))
+    echo(*([""] if method["params"] else ["", "no parameters"]))
+    names = ("type", "default", "unit", "description")
     echo_table(
-        ("parameter", "type", "default", "unit", "description"),
+        ("parameter", *names),
         [
-            (name, type_, json.dumps(default) if default is not None else "", unit, text)
-            for name, type_, default, unit, text in parameters
+            (one["name"], *(_shown(one[name], is_json=name == "default") for name in names))
+            for one in method["params"]
         ],
     )
 
 
-def _metric_text(spec: MetricSpec) -> str:
-    label = re.sub(r"\{\d\}", "...", spec.label)
-    return ": ".join(part for part in (label, spec.description) if part)
+def _shown(value: object, *, is_json: bool) -> str:
+    if value is None:
+        return ""
+    return json.dumps(value) if is_json else str(value)
 
 
-def _docstring(method: type[Method]) -> str:
-    return inspect.cleandoc(method.__doc__ or "")
+def _metric_text(spec: Mapping[str, str]) -> str:
+    label = re.sub(r"\{\d\}", "...", spec["label"])
+    return ": ".join(part for part in (label, spec["description"]) if part)
 
 
-def _parameters(params: type[MethodParams]) -> list[tuple[str, str, object, str, str]]:
-    from orthoflow.sdk.units import unit_of
-
-    schema = params.model_json_schema()
-    definitions = schema.get("$defs", {})
-    return [
-        (
-            name,
-            _type_text(field, definitions),
-            field.get("default"),
-            unit_of(name),
-            field.get("description", ""),
-        )
-        for name, field in schema.get("properties", {}).items()
-    ]
-
-
-def _type_text(field: dict[str, object], definitions: dict[str, dict[str, object]]) -> str:
+def _type_text(field: Mapping[str, Any], definitions: Mapping[str, Mapping[str, Any]]) -> str:
     """Describe the type of a JSON Schema node in a few words, with its limits."""
-    reference = field.get("$ref")
-    if isinstance(reference, str):
+    if reference := field.get("$ref"):
         return _type_text(definitions.get(reference.rpartition("/")[2], {}), definitions)
-    if isinstance(choices := field.get("enum"), list):
-        return " | ".join(str(choice) for choice in choices)
+    if choices := field.get("enum"):
+        return " | ".join(map(str, choices))
     if "const" in field:
         return str(field["const"])
-    if isinstance(alternatives := field.get("anyOf"), list):
+    if alternatives := field.get("anyOf"):
         return " | ".join(_type_text(option, definitions) for option in alternatives)
     if field.get("type") == "array":
-        items = field.get("items")
-        inner = f" of {_type_text(items, definitions)}" if isinstance(items, dict) else ""
-        return f"array{inner}"
-    limits = "".join(
-        f" {sign} {field[key]}"
-        for key, sign in (
-            ("minimum", ">="),
-            ("exclusiveMinimum", ">"),
-            ("maximum", "<="),
-            ("exclusiveMaximum", "<"),
+        return (
+            f"array of {_type_text(items, definitions)}"
+            if (items := field.get("items"))
+            else "array"
         )
-        if key in field
-    )
-    return f"{field.get('type', 'any')}{limits}"
-
-
-def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
-    from orthoflow.sdk import port_specs
-
-    return [(spec.name, spec.type_name, spec.required) for spec in port_specs(ports).values()]
+    limits = {
+        "minimum": ">=",
+        "exclusiveMinimum": ">",
+        "maximum": "<=",
+        "exclusiveMaximum": "<",
+    }
+    shown = "".join(f" {sign} {field[key]}" for key, sign in limits.items() if key in field)
+    return f"{field.get('type', 'any')}{shown}"
 
 
 @click.command("new", cls=Command)
