@@ -323,8 +323,9 @@ def _type_text(field: Mapping[str, Any], definitions: Mapping[str, Mapping[str, 
 @click.option(
     "--gives",
     default="",
-    metavar="TYPE",
-    help="Product type that they give, of the plugin's own.  [default: KINDs]",
+    metavar="TYPES",
+    help="Product types that they give, with commas between them; one that no plugin has becomes "
+    "the plugin's own.  [default: KINDs]",
 )
 @click.option(
     "--folder",
@@ -342,8 +343,8 @@ def plugins_new(
     """Write a plugin NAME that installs, works and passes its tests at once, e.g. my-detector.
 
     `orthoflow plugins list` names the kinds and the product types. The method does something
-    simple; put your own in its place. With `--new-kind` the plugin brings a kind and a product
-    type, too.
+    simple; put your own in its place. With `--new-kind` the plugin brings a kind, too, and a
+    product type where `--gives` names a new one.
     """
     from orthoflow.scaffold import Project, write_project
 
@@ -356,17 +357,28 @@ def plugins_new(
         raise click.UsageError(
             "give --kind, the kind of the method (`orthoflow plugins list`), or --new-kind"
         )
-    types = (part.strip() for part in takes.split(",")) if new_kind else ()
+    catalog = discover_catalog()
+    taken, given = (
+        dict.fromkeys(part.strip() for part in types.split(",") if new_kind)
+        for types in (takes, gives or f"{new_kind}s")
+    )
+    own = [name for name in given if name not in catalog.products]
+    if len(own) > 1:
+        raise click.UsageError(
+            f"--gives {gives}: of {' and '.join(own)} no plugin has a product type, and a new "
+            "plugin brings one; `orthoflow plugins list` names those that are there"
+        )
     project = Project(
         name=name,
         kind=new_kind or about["kind"],
         author=about["author"],
         licence=about["licence"],
         citation=about["citation"],
-        product=(gives or f"{new_kind}s") if new_kind else "",
-        takes=tuple(dict.fromkeys(types)),
+        takes=tuple(taken),
+        gives=tuple(name for name in given if name not in own),
+        product=own[0] if own else "",
     )
-    written = write_project(project, folder, discover_catalog())
+    written = write_project(project, folder, catalog)
     if as_json:
         echo_json({"method": project.method_id, "files": [str(path) for path in written]})
         return EXIT_GOOD

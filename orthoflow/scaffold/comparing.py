@@ -27,6 +27,8 @@ _COARSE: Final = {
     }
 }
 _METRICS_MOST: Final = 4
+# Letters of a workflow's name.
+_NAME_MOST: Final = 32
 # What a detector says of its own planes (RMS) is good where it found but the easy ones.
 _JUDGED: Final = {
     "plane": ("true_planes_found", "label_iou_mean", "plane_angle_deg", "plane_offset_mm")
@@ -55,7 +57,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         if not of_kind:
             continue
         _vary(steps[of_kind[-1]], name, method_id)
-        document["name"] = f"compare-{name}"
+        document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
         document["compare"] = {"design": "product", **_judged(kind, steps, catalog)}
         return _dumped(document)
     sibling = loadable_method(catalog, kind)
@@ -70,7 +72,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
     document = _behind_a_recipe(kind, takes, variants, catalog)
     if not document:
         return ""
-    document["name"] = f"compare-{name}"
+    document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
     # A pattern may have none that fits; a name is reported.
     metrics = [one.name for one in sibling.load().metric_specs() if one.name.isidentifier()][
         :_METRICS_MOST
@@ -114,7 +116,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
     document = _behind_a_recipe(kind, dict(zip(takes, takes, strict=True)), variants, catalog)
     if not document:
         return ""
-    document["name"] = f"compare-{kind}"
+    document["name"] = f"compare-{kind}"[:_NAME_MOST].rstrip("_-")
     document["compare"] = {"design": "product", "metrics": [f"{kind}.n_items"]}
     return _dumped(document)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from orthoflow import products
 from orthoflow.catalog.catalog import Catalog, MethodEntry
 from orthoflow.catalog.distributions import DistributionInfo
-from orthoflow.errors import PluginError
+from orthoflow.errors import ArgumentError, PluginError
 from orthoflow.sdk import PortSpec, port_specs
 from orthoflow.sdk.hooks import FILES
 from orthoflow.version import DISTRIBUTION
@@ -43,6 +43,7 @@ class KindPorts:
         start_module: module of an installed method of the kind, empty without one.
         start_class: its class.
         start_id: its id.
+        start_inputs: those of the inputs that it takes.
     """
 
     inputs: tuple[Port, ...]
@@ -52,6 +53,7 @@ class KindPorts:
     start_module: str = ""
     start_class: str = ""
     start_id: str = ""
+    start_inputs: tuple[str, ...] = ()
 
     @property
     def hands_on(self) -> bool:
@@ -102,6 +104,7 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
         start_module=module,
         start_class=class_name,
         start_id=start.spec.id if start else "",
+        start_inputs=tuple(taken),
     )
 
 
@@ -117,18 +120,62 @@ def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
     return None
 
 
-def taken_ports(catalog: Catalog, takes: Sequence[str]) -> KindPorts:
-    """Return a port of its name for each product type, all of them required."""
+def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> KindPorts:
+    """Return a port of its name for each product type, all required, and what can fill the outputs.
+
+    Args:
+        catalog: what is installed.
+        takes: product types of the inputs.
+        gives: product types of the outputs that are there; what no input has, an installed method
+            may make of the inputs.
+
+    Raises:
+        ArgumentError: none does.
+    """
     imports: dict[str, set[str]] = {}
-    for name in takes:
+    for name in (*takes, *gives):
         module, class_name = _class_of(catalog, name)
         imports.setdefault(module, set()).add(class_name)
+    outputs = tuple(
+        Port(name=name, class_name=_class_of(catalog, name)[1], same_as=name * (name in takes))
+        for name in gives
+    )
+    made = [name for name in gives if name not in takes]
+    start = _maker(catalog, takes, made) if made else None
+    if made and not start:
+        raise ArgumentError(
+            f"no installed method makes {' and '.join(made)} of {' and '.join(takes)}, so there is "
+            f"nothing to start from: name {' and '.join(made)} behind --takes, too"
+        )
+    module, _, class_name = start.spec.target.partition(":") if start else ("", "", "")
     return KindPorts(
         inputs=tuple(Port(name=name, class_name=_class_of(catalog, name)[1]) for name in takes),
-        outputs=(),
+        outputs=outputs,
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
-        needs=_needs(catalog, takes, ()),
+        needs=_needs(catalog, (*takes, *gives), [start.distribution] if start else ()),
+        start_module=module,
+        start_class=class_name,
+        start_id=start.spec.id if start else "",
+        start_inputs=tuple(name for name in _declared(start)[0] if name in takes) if start else (),
     )
+
+
+def _maker(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> MethodEntry | None:
+    """Return an installed method that makes some products of others; None without one."""
+    for entry in catalog.methods.values():
+        try:
+            taken, given = _declared(entry)
+        except PluginError:
+            continue
+        required = {port.name: port.type_name for port in taken.values() if port.required}
+        has_all = all(name in given and given[name].type_name == name for name in gives)
+        if (
+            required
+            and has_all
+            and all(name == type_ and name in takes for name, type_ in required.items())
+        ):
+            return entry
+    return None
 
 
 def _needs(

@@ -19,7 +19,7 @@ from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
-from orthoflow.scaffold.kinds import KindPorts, kind_ports, taken_ports
+from orthoflow.scaffold.kinds import KindPorts, kind_ports, new_kind_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
@@ -43,9 +43,9 @@ class Project:
         author: for pyproject, licence and citation.
         licence: SPDX expression.
         citation: where the method comes from: DOI, title or URL; may be empty.
-        product: of a new kind, what its methods give: a product type of the plugin's own; empty for
-            a kind that is there.
         takes: of a new kind, the product types that its methods take.
+        gives: of a new kind, those that they give; empty for a kind that is there.
+        product: of a new kind, one more that they give, of the plugin's own; empty for none.
     """
 
     name: str
@@ -53,8 +53,14 @@ class Project:
     author: str = "The authors"
     licence: str = "MIT"
     citation: str = ""
-    product: str = ""
     takes: tuple[str, ...] = ()
+    gives: tuple[str, ...] = ()
+    product: str = ""
+
+    @property
+    def is_new_kind(self) -> bool:
+        """Whether the plugin brings the kind of its method."""
+        return bool(self.product or self.gives)
 
     @property
     def package(self) -> str:
@@ -70,7 +76,8 @@ class Project:
     def class_name(self) -> str:
         """Name of the method's class, no other class's of its module."""
         name = _class_name(self.name)
-        others = {self.product_class, *map(_class_name, self.takes), *_IMPORTED}
+        named = map(_class_name, (*self.takes, *self.gives))
+        others = {self.product_class, *named, *_IMPORTED}
         return f"{name}Method" if name in others else name
 
     @property
@@ -101,8 +108,8 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
     folder = parent / project.name
     _check(project, folder, catalog)
     ports = (
-        taken_ports(catalog, project.takes)
-        if project.product
+        new_kind_ports(catalog, project.takes, project.gives)
+        if project.is_new_kind
         else kind_ports(catalog, project.kind)
     )
     written: list[Path] = []
@@ -142,7 +149,7 @@ def _check(project: Project, folder: Path, catalog: Catalog) -> None:
             f"a plugin's name must be 2 to 32 small letters, digits and hyphens, a letter first, "
             f"and no word of Python's, as in my-detector, got {project.name!r}"
         )
-    if project.product:
+    if project.is_new_kind:
         _check_new_kind(project, catalog)
     elif project.kind not in catalog.kinds:
         raise ArgumentError(
@@ -168,7 +175,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
             f"kind {project.kind} is announced by an installed plugin already: write a method of "
             f"it with --kind {project.kind}, or take another name"
         )
-    for name in (project.kind, project.product):
+    for name in filter(None, (project.kind, project.product)):
         if not re.fullmatch(NAME_PATTERN, name) or keyword.iskeyword(name) or "-" in name:
             raise ArgumentError(
                 f"kinds and products are named with small letters, digits and underscores, got "
@@ -178,7 +185,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
         raise ArgumentError(
             f"product {project.product} is announced already: name another behind --gives"
         )
-    for name in project.takes:
+    for name in (*project.takes, *project.gives):
         if name not in catalog.products:
             raise ArgumentError(
                 f"there is no product type {name}{did_you_mean(name, catalog.products)}; there are "
@@ -195,11 +202,16 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
-    own = f"kinds/{project.kind}.py.jinja"
-    method = own if (_TEMPLATES / own).is_file() else "method.py.jinja"
+    method = f"kinds/{project.kind}.py.jinja"
+    if project.product:
+        method = "own_method.py.jinja"
+    elif project.is_new_kind or not (_TEMPLATES / method).is_file():
+        method = "method.py.jinja"
     comparison = (
         own_comparison_text(project.method_id, project.takes, catalog)
         if project.product
+        else ""
+        if project.is_new_kind
         else comparison_text(project.method_id, project.name, catalog)
     )
     known = {
@@ -208,6 +220,7 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         "version": __version__,
         "has_comparison": bool(comparison),
         "unwritten": _UNWRITTEN,
+        "outputs": [*filter(None, [project.product]), *project.gives],
     }
     sources = {
         "pyproject.toml": "pyproject.toml.jinja",
@@ -218,9 +231,9 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         ".github/workflows/tests.yml": "tests.yml.jinja",
         f"{project.package}/__init__.py": "init.py.jinja",
         f"{project.package}/hooks.py": "own_hooks.py.jinja"
-        if project.product
+        if project.is_new_kind
         else "hooks.py.jinja",
-        f"{project.package}/method.py": "own_method.py.jinja" if project.product else method,
+        f"{project.package}/method.py": method,
         "tests/test_conformance.py": "test_conformance.py.jinja",
     }
     if project.product:

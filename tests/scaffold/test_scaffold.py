@@ -116,21 +116,40 @@ def test_what_the_author_has_not_written_is_found(
     assert unwritten("plane.hough2d", discover_catalog()) == ()
 
 
-@pytest.mark.parametrize("takes", [("cloud",), ("planes", "cloud")], ids="-".join)
-def test_a_new_kind_brings_its_product_and_passes_the_suite(
-    takes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("takes", "gives"),
+    [
+        ("cloud", "parts"),
+        ("planes,cloud", "parts"),
+        # A filter; what an installed method makes; both, and a product of its own.
+        ("cloud", "cloud"),
+        ("cloud", "planes"),
+        ("cloud,labels", "planes,labels,scores"),
+    ],
+)
+def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
+    takes: str, gives: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = f"kind-of-{len(takes)}"
-    project = Project(name=name, kind=f"part{len(takes)}", product="my_parts", takes=takes)
-    write_project(project, tmp_path, discover_catalog())
+    name = f"kind-{takes}-{gives}".replace(",", "-")[:30]
+    kind = name.replace("-", "_")
+    known = set(discover_catalog().products)
+    asked = ["--new-kind", kind, "--takes", takes, "--gives", gives, "--folder", str(tmp_path)]
+    done = CliRunner().invoke(program, ["plugins", "new", name, *asked])
+    assert done.exit_code == 0, done.output
     folder = tmp_path / name
     install(folder, monkeypatch)
     catalog = discover_catalog()
-    assert list(catalog.kinds[project.kind].spec.inputs) == list(takes)
-    problems = [case.problem() for case in conformance_cases(project.method_id)]
+    assert list(catalog.kinds[kind].spec.inputs) == takes.split(",")
+    assert set(catalog.kinds[kind].spec.outputs) == set(gives.split(","))
+    assert set(catalog.products) - known == set(gives.split(",")) - known
+    problems = [case.problem() for case in conformance_cases(f"{kind}.{name}")]
     assert [problem for problem in problems if problem] == []
+    comparison = folder / "compare.yaml"
+    assert comparison.exists() == bool(set(gives.split(",")) - known)
+    if not comparison.exists():
+        return
     workflow = load_workflow(folder / "compare.yaml", catalog)
-    cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == project.kind]
+    cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == kind]
     assert [cell.params["factor"] for cell in cells] == [1.0, 2.0]
     assert [cell.skip_reason for cell in cells] == ["", ""]
     assert lint_workflow(workflow) == ()
@@ -218,6 +237,8 @@ def test_a_new_kind_that_cannot_be_is_refused(
     ("arguments", "said"),
     [
         ([], "give --kind, the kind of the method"),
+        (["--new-kind", "part", "--gives", "a,b"], "of a and b no plugin has a product type"),
+        (["--new-kind", "part", "--gives", "truth"], "no installed method makes truth of cloud"),
         (["--kind", "plane", "--new-kind", "part"], "exclude each other: leave one of them away"),
     ],
 )
