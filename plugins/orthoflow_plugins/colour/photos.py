@@ -24,11 +24,11 @@ from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 class ColourPhotos(Method):
     """Assign each point the colour of the photo that shows it best.
 
-    A point is seen where no nearer point of the whole cloud lies before it, outliers left out
-    (the depth buffer of `ortho.dsm-backward`). Of several photos that
-    see it, the one with the most pixels per metre wins, away from its border; its colour is
-    interpolated between four pixels. So a cloud without colours can take the direct way to
-    orthoimages (`ortho.pointcloud-direct`) with the same photos as the other methods.
+    A point is seen if no nearer point of the whole cloud hides it, outliers excluded (the depth
+    buffer of `ortho.dsm-backward`). Of several photos that see it, the one with the most pixels per
+    metre is used, away from its border; the colour is interpolated between four pixels. So a cloud
+    without colours can be used for direct orthoimages (`ortho.pointcloud-direct`) with the same
+    photos as the other methods.
     """
 
     id: ClassVar[str] = "colour.photos"
@@ -46,7 +46,7 @@ class ColourPhotos(Method):
     )
 
     class Params(MethodParams):
-        """What counts as seen, and what becomes of points that no photo sees."""
+        """When a point counts as seen, and the colour of points that no photo sees."""
 
         tolerance_m: float = Field(
             TOLERANCE_M,
@@ -64,7 +64,7 @@ class ColourPhotos(Method):
         )
 
     class In(Ports):
-        """The cloud, the photos, and where they were taken."""
+        """The cloud, the photos and their orientation."""
 
         cloud: PointCloud
         photos: Photos
@@ -76,7 +76,7 @@ class ColourPhotos(Method):
         cloud: PointCloud
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Colour photo by photo, keeping the best of each point."""
+        """Colour photo by photo, keeping the best colour of each point."""
         inputs.cloud.require_points(2)
         oriented = {camera.photo: camera for camera in inputs.cameras.cameras}
         chosen = [
@@ -116,7 +116,7 @@ class ColourPhotos(Method):
 
 
 def _only(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:
-    """The chosen points, with all that is known of each."""
+    """Return the chosen points with all their values."""
     per_point = {
         field.name: np.ascontiguousarray(value[chosen])
         for field in fields(PointCloud)

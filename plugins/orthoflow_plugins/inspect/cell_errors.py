@@ -1,9 +1,9 @@
-"""What an orthoimage and its wall show against what they should, cell by cell.
+"""Comparison of an orthoimage and its wall with the truth, cell by cell.
 
-All cells of small walls are compared, a fair part of large ones. What is compared is exact; a part
-of it says as much about the whole as the whole does, as long as it is spread evenly. Colours are
-rendered in whole blocks, since patches need neighbours; who sees a cell is asked on a lattice, so
-that nothing wider than its step is passed over.
+All cells of small walls are compared, a sample of large ones. The comparison itself is exact; an
+evenly spread sample gives the same statistics as the whole. Colours are rendered in whole blocks,
+since patches need neighbours; visibility is tested on a lattice, so that nothing wider than its
+step is missed.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from orthoflow_plugins.inspect.spreads import Spread
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
-# Neighbouring cells whose true depths differ by more make a step, reported apart.
+# Neighbouring cells whose true depths differ by more form a step, reported separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
-# A colour so far outside of all true colours within one cell has no business there.
+# A colour this far outside the range of true colours within one cell is wrong.
 _GROSS_GREY: Final = 40.0
-# Whole patches of 32 cells, and so many that little is lost at the rim.
+# Whole patches of 32 cells, and blocks large enough that little is lost at their border.
 BLOCK_CELLS: Final = 96
 # Multiples of these, modulo 1, fill a square most evenly (Roberts 2018, the R2 sequence).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
@@ -54,8 +54,8 @@ class Sampling:
     """Which cells of an orthoimage are compared.
 
     Attributes:
-        coloured: (rows, cols) bool, cells whose colour is.
-        lattice: (rows, cols) bool, cells of which is asked who sees them.
+        coloured: (rows, cols) bool, cells whose colour is compared.
+        lattice: (rows, cols) bool, cells whose visibility is tested.
     """
 
     coloured: NDArray[np.bool_]
@@ -68,7 +68,7 @@ class SamplingRule:
 
     Attributes:
         colour_share: share of blocks whose colours are compared.
-        lattice_step: every so manyth row and column is asked who sees it.
+        lattice_step: visibility is tested in every row and column of this step.
     """
 
     colour_share: float
@@ -78,7 +78,7 @@ class SamplingRule:
 def sampling_rule(
     images: Sequence[Orthoimage], *, colour_cells_most: int, seen_cells_most: int
 ) -> SamplingRule:
-    """Find the share and the step that keep to about so many cells of all images together."""
+    """Find the share and the step that limit the number of cells of all images together."""
     n_shown = sum(n_shown_of(image) for image in images)
     n_cells = sum(image.mask.size for image in images)
     return SamplingRule(
@@ -92,8 +92,8 @@ def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
 
     Args:
         image: of a wall, or some rows of one.
-        rule: how much is chosen.
-        first_row: of a part within its wall, a multiple of `BLOCK_CELLS`.
+        rule: how many are chosen.
+        first_row: for a part, its first row within its wall, a multiple of `BLOCK_CELLS`.
     """
     shows = shown(image)
     coloured = np.zeros(shows.shape, dtype=np.bool_)
@@ -116,25 +116,25 @@ def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class WallSamples:
-    """Errors of one wall, or of several put together.
+    """Errors of one wall, or of several together.
 
     Attributes:
-        depth_m: (n,) measured - true depth away from true depth steps.
-        sigma_m: (n,) standard deviation that the wall states for each; NaN where it states none.
+        depth_m: (n,) measured - true depth, away from true depth steps.
+        sigma_m: (n,) standard deviation that the wall states for each; NaN if it states none.
         step_depth_m: (m,) the same error within 2 cells of a true depth step.
         colour: (c,) mean square error of a painted cell over the three channels, away from steps.
         filled_colour: (f,) the same for filled cells.
         step_colour: (s,) the same for painted cells at steps.
         shift_m: (p, 2) displacement of patches along u and v, shown - true.
         shift_cells: (p, 2) the same in cells.
-        n_painted: painted cells of those of which is asked who sees them.
+        n_painted: painted cells among those whose visibility is tested.
         n_seen: of these cells, those whose true surface a viewer sees.
         n_seen_painted: those of them that are painted.
         n_seen_shown: those of them that are painted or filled.
         n_unseen_painted: painted cells whose true surface no viewer sees, away from steps.
-        n_coloured: painted cells whose colour is compared with those around.
-        n_gross: those of them of a colour that is nowhere near in the truth, away from steps.
-        n_ghost: those of them where an object stands in the way.
+        n_coloured: painted cells whose colour is compared with their surroundings.
+        n_gross: those of them with a colour far from any nearby in the truth, away from steps.
+        n_ghost: those of them where an object is in front of the wall.
     """
 
     depth_m: NDArray[np.float64]
@@ -157,13 +157,13 @@ class WallSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class WallErrors:
-    """Errors of one wall in their places.
+    """Errors of one wall at their positions.
 
     Attributes:
         samples: the errors as numbers.
         patches: where displacements were measured.
         depth_m: (rows, cols) measured - true depth, NaN where either is missing.
-        grey: (rows, cols) root mean square colour error, NaN where none is compared.
+        grey: (rows, cols) root mean square colour error, NaN where not compared.
     """
 
     samples: WallSamples
@@ -181,14 +181,14 @@ def wall_errors(
 ) -> WallErrors:
     """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
 
-    Depths are compared everywhere, the rest on the chosen cells.
+    Depths are compared everywhere, the rest in the chosen cells.
 
     Args:
         image: the orthoimage.
         wall: the wall.
         true: the truth.
-        chosen: cells whose colour is compared, and that are asked for who sees them.
-        inner: rows that are told of; the others are about them. A multiple of patches.
+        chosen: cells whose colour is compared, and those whose visibility is tested.
+        inner: rows to report; the others surround them. A multiple of patches.
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
@@ -230,11 +230,11 @@ def wall_errors(
 
 
 def pooled(samples: Sequence[WallSamples], allocate: Allocate = in_memory) -> WallSamples:
-    """Put the errors of several walls, or parts of one, together.
+    """Combine the errors of several walls, or of parts of one.
 
     Args:
-        samples: of each.
-        allocate: gives arrays for the errors of large walls, by name.
+        samples: the errors of each.
+        allocate: returns arrays for the errors of large walls, by name.
     """
 
     def joined(name: str) -> NDArray[np.float64]:
@@ -256,15 +256,16 @@ def pooled(samples: Sequence[WallSamples], allocate: Allocate = in_memory) -> Wa
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Cells within 2 cells of a true depth step or of the rim of the surface."""
+    """Return cells within 2 cells of a true depth step or of the border of the surface."""
     import cv2
 
-    # Far away instead of missing, so that the rim of the surface is a step too.
+    # A very distant depth instead of a missing one, so that the border of the surface is a step
+    # too.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
     down = np.abs(np.diff(depth, axis=0)) > _STEP_M
     right = np.abs(np.diff(depth, axis=1)) > _STEP_M
-    # The cells beside the edge are its first cells on each side.
+    # The cells next to the edge are its first cells on each side.
     edge[1:] |= down
     edge[:-1] |= down
     edge[:, 1:] |= right
@@ -274,10 +275,10 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
-    """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples.
+    """Return metrics of the cells of one wall, or of all with wall -1; none without samples.
 
-    Displacements and ghosts bear a longer name when they also follow from the photos' cameras,
-    which says more.
+    Displacements and ghosts have a longer name if they also follow from the photos' cameras, which
+    is more accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     return [
@@ -302,10 +303,10 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Displacements of patches, by known cells away from steps."""
+    """Return displacements of patches, from known cells away from steps."""
     painted = image.mask == OrthoMask.PAINTED
     filled = image.mask == OrthoMask.FILLED
-    # Two centimetres is far beyond any fair error; further off is reported as gross colour.
+    # Two centimetres is far beyond any plausible error; larger ones are reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     grey, true_grey = np.zeros(known.shape), np.zeros(known.shape)
     grey[known] = eight_bits(image.rgb[known]) @ REC_601
@@ -318,10 +319,10 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
 
 
 def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]:
-    """Cells whose colour lies outside of the range of the true colours within one cell."""
+    """Return cells whose colour is outside the range of the true colours within one cell."""
     import cv2
 
-    # NaN where no colour is known.
+    # NaN where the colour is unknown.
     missing = np.isnan(true.rgb)
     window = np.ones((3, 3), dtype=np.uint8)
     low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
@@ -332,7 +333,7 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
 
 
 def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells whose colour is compared and so are those of all surfaces within one cell."""
+    """Return cells that are compared and whose neighbours within one cell are, too."""
     import cv2
 
     whole = cv2.erode((coloured | ~known).view(np.uint8), np.ones((3, 3), dtype=np.uint8))
@@ -396,7 +397,7 @@ def _shift_numbers(samples: WallSamples) -> list[_Number]:
 
 
 def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
-    """Patches whose displacement belongs to the rest: 4 robust deviations, at least 1/4 cell."""
+    """Return patches that are no outliers: within 4 robust deviations, at least 1/4 cell."""
     cells = samples.shift_cells
     if len(cells) == 0:
         return np.zeros(0, dtype=np.bool_)

@@ -58,7 +58,7 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
-# Points whose residuals stand in the log.
+# Number of points whose residuals are logged.
 _TOLD: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
@@ -78,17 +78,17 @@ CAPPED_RULE: Final = DiagnosticSpec(
 
 
 class InspectCheckpoints(Method):
-    """Measure how far surveyed points lie off in the orthoimages (skarlatos2012, Table 1).
+    """Measure the displacement of surveyed points in the orthoimages (skarlatos2012, Table 1).
 
-    A point counts where it was measured (in cells or in metres, see `read.checkpoints`), where
-    a black and white quadrant target is recognised, or, in a simulated room, where its surroundings
-    are found by the scene's truth. Without orthoimages the intensity of the walls is the picture.
-    RMS and standard deviation are of the lengths of residuals; outliers are those beyond twice the
-    RMS, of all (`once`, the one to compare) or of what is left (`iterated`, a quarter of the points
-    at most; `iterated_capped` where that is too few). Classes of points (flat, vertical ...) are
-    told apart by a prefix. `x` is along u, to the right, `y` along v, down, shown - surveyed.
-    `length_error_..._share` are relative errors of lengths between points of a wall. Targets are
-    carried back into space, on the plane through the depths around them (`3d`).
+    A point is used if it was measured (in cells or in metres, see `read.checkpoints`), if a black
+    and white quadrant target is recognised, or, in a simulated room, if its surroundings are found
+    with the truth of the scene. Without orthoimages the intensity of the walls is the picture. RMS
+    and standard deviation are of the lengths of residuals; outliers are those beyond twice the RMS,
+    of all (`once`, the one to compare) or of the remaining points (`iterated`, a quarter of the
+    points at most; `iterated_capped` if that limit is reached). Classes of points (flat, vertical
+    ...) are distinguished by a prefix. `x` is along u, to the right, `y` along v, down, shown -
+    surveyed. `length_error_..._share` are relative errors of lengths between points of a wall.
+    Targets are back-projected into space, onto the plane through the depths around them (`3d`).
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
@@ -106,7 +106,7 @@ class InspectCheckpoints(Method):
         ),
         MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
-        # Those of a class of points have its name before them.
+        # Metrics of a class of points have its name as prefix.
         *prefixed((*CHECK_TABLE, *DISPLACEMENTS), "*_", "{0}"),
         *of_walls(IMAGE_QUALITY),
     )
@@ -118,7 +118,7 @@ class InspectCheckpoints(Method):
     )
 
     class Params(MethodParams):
-        """How points are found that nobody measured."""
+        """How points that were not measured are found."""
 
         search_m: float = Field(
             0.03, gt=0.0, le=1.0, description="How far from its place a point is looked for."
@@ -142,7 +142,7 @@ class InspectCheckpoints(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Find every point, then sum up."""
+        """Find every point, then compute the statistics."""
         if is_own(inputs.checkpoints).all():
             raise MethodError(
                 "x, y, z of all check points are those of the orthoimage in which they were "
@@ -291,7 +291,7 @@ def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float
 def _findings_in_space(
     points: Sequence[ShownPoint], surveyed: CheckPoints, found: Sequence[int]
 ) -> list[Finding]:
-    """How far the points that were carried back into space lie off."""
+    """Compute the distances of the points that were back-projected into space."""
     apart = np.array(
         [
             np.linalg.norm(point.point_world - surveyed.points_world[k])
@@ -320,7 +320,7 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
 
 
 def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
-    """State in words that a rule for outliers ran into its cap."""
+    """Report that a rule for outliers reached its limit."""
     capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)
@@ -328,7 +328,7 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
 
 
 def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
-    """Write the residual of each point into the log of the step, the largest first."""
+    """Log the residual of each point, the largest first."""
     for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_TOLD]:
         u_mm, v_mm = 1e3 * shift_m[k]
         ctx.log(f"check point {names[k]}: u {u_mm:+.2f} mm, v {v_mm:+.2f} mm")

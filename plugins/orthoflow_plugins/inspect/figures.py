@@ -1,4 +1,4 @@
-"""Pictures of an inspection: errors over a wall as colours, displacements as arrows."""
+"""Figures of an inspection: errors over a wall as colours, displacements as arrows."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _MAP_PX: Final = 900
 _LONGEST_PX: Final = 1100
 _SMALLEST_PX: Final = 500
-# Of larger images squares of cells are averaged before they are drawn.
+# In larger images squares of cells are averaged before drawing.
 _WHOLE_CELLS: Final = 1 << 24
-# The longest usual arrow is drawn so long.
+# Length of the longest usual arrow.
 _ARROW_PX: Final = 40.0
 _NAMES_MOST: Final = 60
 _HEAD_PX: Final = 8.0
@@ -32,7 +32,7 @@ _ENLARGED_MOST: Final = 500.0
 
 
 def depth_error_map(depth_m: NDArray[np.float64]) -> bytes:
-    """Picture of depth errors: blue behind the truth, red before it, black where nothing is."""
+    """Return a picture of depth errors: blue behind the truth, red in front, black without data."""
     import cv2
 
     scaled = np.nan_to_num(1e3 * depth_m / DEPTH_SPAN_MM, nan=0.0)
@@ -41,12 +41,12 @@ def depth_error_map(depth_m: NDArray[np.float64]) -> bytes:
 
 
 def colour_error_map(error_grey: NDArray[np.float64]) -> bytes:
-    """Picture of colour errors: bright where they are large, blue where nothing is shown."""
+    """Return a picture of colour errors: bright if large, blue without data."""
     return _bright_where_large(error_grey / COLOUR_SPAN_GREY)
 
 
 def displacement_map(displacement_cells: NDArray[np.float64]) -> bytes:
-    """Picture of displacements (rows, cols): bright where large, blue where none is known."""
+    """Return a picture of displacements (rows, cols): bright if large, blue if unknown."""
     return _bright_where_large(displacement_cells / DISPLACEMENT_SPAN_CELLS)
 
 
@@ -56,16 +56,16 @@ def vector_map(
     shift_cells: NDArray[np.float64],
     names: Sequence[str] = (),
 ) -> bytes:
-    """Draw an orthoimage in pale grey and arrows from where things should be to where they are.
+    """Draw an orthoimage in pale grey, and arrows from true to shown positions.
 
-    Arrows are green up to the median length, yellow up to twice that, red beyond. Of many pairs
-    an even part is drawn.
+    Arrows are green up to the median length, yellow up to twice that, red beyond. Of many pairs an
+    evenly spread part is drawn.
 
     Args:
-        image: what was inspected.
-        places: (n, 2) (column, row) where things are shown.
+        image: the inspected orthoimage.
+        places: (n, 2) shown positions (column, row).
         shift_cells: (n, 2) shown - true.
-        names: n of them, written beside the arrows unless there are many; none for no names.
+        names: n labels of the arrows, omitted if there are many; empty for none.
     """
     import cv2
 
@@ -94,9 +94,9 @@ def vector_map(
 
 
 def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
-    """Means of the three colours of cells; of a large image those of squares of cells.
+    """Return mean colours of cells; in a large image those of squares of cells.
 
-    Cells beyond a whole number of squares are left out.
+    Cells beyond a whole number of squares are omitted.
     """
     factor = 1
     if image.mask.size > _WHOLE_CELLS:
@@ -113,12 +113,12 @@ def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
 
 
 def enlargement(shift_cells: NDArray[np.float64], image: Orthoimage) -> float:
-    """How many times longer than true `vector_map` draws displacements (n, 2)."""
+    """Return the magnification with which `vector_map` draws displacements (n, 2)."""
     if not len(shift_cells):
         return 1.0
     usual = float(np.percentile(np.linalg.norm(shift_cells, axis=1), 95))
     wanted = _ARROW_PX / max(usual * _scale(image), 1e-9)
-    # One leading digit, so that the caption is easy to use.
+    # One leading digit, for an easily readable caption.
     digits = 10.0 ** np.floor(np.log10(wanted))
     return float(np.clip(np.floor(wanted / digits) * digits, 1.0, _ENLARGED_MOST))
 

@@ -1,7 +1,7 @@
-"""What displacements add up to, and which of an inspection's numbers bear plain names.
+"""Statistics of displacements, and which numbers of an inspection have plain names.
 
 The numbers are those of markiewicz2015, and the table of skarlatos2012: lengths of residuals,
-outliers by two rules, and what is left.
+outliers by two rules, and the remainder.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from orthoflow.products import Finding
 from orthoflow.sdk import MetricSpec, StepContext
 
 _AXES: Final = ("x", "y")
-# Never are more than so many of the points called outliers.
+# Maximum share of the points that may be outliers.
 _OUTLIERS_MOST: Final = 0.25
-# More than half are no outliers by any rule.
+# If more than half exceed the limit, there are no outliers.
 _MOST_WITHOUT_CAP: Final = 0.5
-# Shorter lengths between check points say more of the single points than of a scale.
+# Shorter lengths between check points depend on single points more than on a scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
-# Of more points of a wall every so manieth takes part: their pairs are millions.
+# Of more points of a wall every nth is used, because there are millions of pairs.
 _POINTS_MOST: Final = 1000
-# Behind the rule in the name of a number that the cap has made.
+# Suffix of the rule in the name of a number that was limited.
 CAPPED: Final = "_capped"
-# What displacements, check points and an orthoimage itself add up to, as metrics.
+# Statistics of displacements, check points and an orthoimage itself, as metrics.
 DISPLACEMENTS: Final = (
     MetricSpec("rmse_[xy]_mm", label="displacement along {0}, RMS", better="lower"),
     MetricSpec("rmse_[xy]_cells", label="displacement along {0}, RMS", better="lower"),
@@ -86,23 +86,23 @@ IMAGE_QUALITY: Final = (
     MetricSpec("stretch_share", label="cells smeared over steep relief", better="lower"),
     MetricSpec("smear_share", label="cells smeared along edges", better="lower"),
 )
-# What a comparison asks of every wall; the record has the rest.
+# Metrics compared for every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
 
 def displacement_findings(
     shift_m: NDArray[np.float64], gsd_m: float, wall: int, *, prefix: str = ""
 ) -> list[Finding]:
-    """Sum up displacements (n, 2) along u (`x`, to the right) and v (`y`, down), shown - true.
+    """Compute statistics of displacements (n, 2) along u (`x`) and v (`y`, down), shown - true.
 
-    Root mean squares, means, robust and plain spreads, the largest, and the shares beyond twice
-    the RMSE (markiewicz2015, Table 2; of normal errors it is 4.6 % per axis, and never over 25 %).
+    Root mean squares, means, robust and plain standard deviations, maxima, and the shares beyond
+    twice the RMSE (markiewicz2015, Table 2; 4.6 % per axis for normal errors, and never over 25 %).
 
     Args:
         shift_m: metres, at least one.
         gsd_m: side of a cell, for the numbers in cells.
-        wall: of the findings, -1 for all together.
-        prefix: of their names.
+        wall: index in the findings, -1 for all together.
+        prefix: prefix of their names.
     """
     findings = []
 
@@ -129,15 +129,14 @@ def displacement_findings(
 def check_findings(
     shift_m: NDArray[np.float64], gsd_m: float, *, prefix: str = ""
 ) -> list[Finding]:
-    """Sum up the displacements (n, 2) of check points, at least one: Table 1 and more.
+    """Compute statistics of displacements (n, 2) of check points: Table 1 and more.
 
-    `rms_mm`, `sd_mm` are of lengths; `mean_shift_share` says how much of the RMS is one common
-    shift.
+    `rms_mm`, `sd_mm` are of lengths; `mean_shift_share` is the share of a common shift in the RMS.
 
     Args:
         shift_m: metres along u and v, shown - surveyed.
         gsd_m: side of a cell.
-        prefix: of the names, for a class of points.
+        prefix: prefix of the names, for a class of points.
     """
     length = np.linalg.norm(shift_m, axis=1)
     mean_shift = float(np.linalg.norm(shift_m.mean(axis=0)))
@@ -166,15 +165,15 @@ def check_findings(
 def length_findings(
     surveyed_m: NDArray[np.float64], shift_m: NDArray[np.float64], wall: NDArray[np.int32]
 ) -> list[Finding]:
-    """Sum up the relative errors of lengths between check points (markiewicz2015, 5: 0.2 %).
+    """Compute relative errors of lengths between check points (markiewicz2015, 5: 0.2 %).
 
-    The lengths are those between points of one wall, from a quarter of its longest on; empty
-    without any.
+    The lengths are those between points of one wall, from a quarter of its longest on; empty if
+    there are none.
 
     Args:
-        surveyed_m: (n, 2) metres along u and v, where the points are.
-        shift_m: (n, 2) where the orthoimage shows them, less that.
-        wall: (n,) on which.
+        surveyed_m: (n, 2) metres along u and v, surveyed positions.
+        shift_m: (n, 2) shown minus surveyed position.
+        wall: (n,) wall of each point.
     """
     errors = [np.empty(0)]
     for mine in (np.flatnonzero(wall == number) for number in np.unique(wall)):
@@ -194,22 +193,22 @@ def length_findings(
 
 
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which lengths (n,) exceed twice the RMS of all."""
+    """Report which lengths (n,) exceed twice the RMS of all."""
     return length_m > 2.0 * rms(length_m)
 
 
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which lengths (n,) exceed twice the RMS of the others that do not.
+    """Report which lengths (n,) exceed twice the RMS of the others that do not.
 
-    The largest set of longest ones, a quarter at most, each beyond twice the RMS of what is left.
-    Lengths of two kinds, at edges and on flat parts, go on to lose the longer kind; `cap_binds`
-    says where they do. So the rule of all points is the one to compare.
+    The largest set of longest lengths, a quarter at most, each beyond twice the RMS of the rest.
+    With lengths of two kinds, at edges and on flat parts, the iteration goes on to remove the
+    longer kind; `cap_binds` reports this. The rule of all points is therefore the one to compare.
     """
     return _iterated(length_m, _OUTLIERS_MOST)
 
 
 def cap_binds(length_m: NDArray[np.float64]) -> bool:
-    """Whether the iterated rule calls as many of the lengths (n,) outliers as it may, too few."""
+    """Whether the iterated rule is limited to fewer outliers (n,) than it would find."""
     n_most = math.floor(_OUTLIERS_MOST * len(length_m))
     n_capped, n_all = (
         int(np.count_nonzero(_iterated(length_m, share)))
@@ -219,7 +218,7 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
 
 
 def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
-    """Return metrics as `report` gives them: of the main wall, of each, and of all together."""
+    """Return metrics as `report` reports them: of the main wall, of each wall, and of all."""
     of_each = [spec for spec in specs if fnmatch.filter(_OF_EACH_WALL, spec.name)]
     return (
         *specs,
@@ -229,12 +228,12 @@ def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
 
 
 def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
-    """Return the same metrics of something else; on the first screen stand those without prefix.
+    """Return the same metrics of something else; those without prefix are headlines.
 
     Args:
         specs: the metrics.
-        prefix: of their names, perhaps with wildcards.
-        what: behind their labels, with what the wildcards match.
+        prefix: prefix of their names, possibly with wildcards.
+        what: suffix of their labels, with the text that wildcards match.
     """
     n_wildcards = len(re.findall(r"\*|\[[^\]]+\]", prefix))
     return tuple(
@@ -250,23 +249,23 @@ def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[Metri
 
 
 def rms(values: ArrayLike) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def report(
     findings: Sequence[Finding], main: int, numbers: Mapping[int, int], ctx: StepContext
 ) -> None:
-    """Report the main wall by plain names, all walls with `all_`, the rest as it is called.
+    """Report the main wall by plain names, all walls with `all_`, the rest with its prefix.
 
-    Displacements and completeness of the other walls are reported too, with `wall_1_` and so on,
-    by the place of the plane in `planes.json`.
+    Displacements and completeness of the other walls are reported too, with `wall_1_` etc., by the
+    place of the plane in `planes.json`.
 
     Args:
         findings: of walls, and of all together (wall -1).
-        main: the wall whose numbers bear plain names.
+        main: the wall whose numbers have plain names.
         numbers: index of a wall -> place of its plane.
-        ctx: where they go.
+        ctx: context that receives them.
     """
     per_wall = {finding.name for finding in findings if finding.wall >= 0}
     for finding in findings:
@@ -281,7 +280,7 @@ def report(
 
 
 def _lengths(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths between all pairs of places (n, 2)."""
+    """Return distances between all pairs of positions (n, 2)."""
     first, second = np.triu_indices(len(places_m), k=1)
     lengths: NDArray[np.float64] = np.linalg.norm(places_m[first] - places_m[second], axis=1)
     return lengths

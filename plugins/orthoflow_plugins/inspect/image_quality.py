@@ -1,12 +1,12 @@
-"""What every inspection says of an orthoimage, whatever it is compared with.
+"""Properties of an orthoimage that every inspection reports.
 
-How complete it is, how much of it is filled, how sharp, and where it stretches its photos.
+Completeness, share of filled cells, sharpness, and where photos are stretched.
 
-Sharpness is told from the image's own edges: their width, and the MTF that they imply. A surface
-that a photo sees nearly edge on has few pixels there, however many cells it has: the stretches and
-smears that skarlatos2012 describes along vertical surfaces. Which pixel a cell takes follows from
-the wall's depths and the photo's camera, so how far apart the pixels of neighbouring cells lie is
-known exactly, whatever the picture shows.
+Sharpness is measured at the image's own edges: their width, and the MTF that follows from it. A
+surface that a photo sees at a grazing angle has few pixels there, however many cells it has: the
+stretches and smears that skarlatos2012 describes along vertical surfaces. Which pixel a cell takes
+follows from the wall's depths and the photo's camera, so the distance between the pixels of
+neighbouring cells is known exactly, whatever the picture shows.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 # A pixel drawn over more cells than this, in the direction where it is widest.
 _STRETCHED_CELLS: Final = 2.0
 _SMEARED_CELLS: Final = 5.0
-# Cells of a photo that are asked; more say nothing else.
+# Number of cells per photo that are tested; more do not change the result.
 _ASKED_MOST: Final = 200_000
 _REACH_CELLS: Final = 8
 _STEP_CELLS: Final = 0.25
 _ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
 _PEAKS_MOST: Final = 4000
 _EDGES_MOST: Final = 400
-# Between valid cells only, but for rounding.
+# Interpolated between valid cells only, apart from rounding.
 _WHOLE: Final = 0.999
 _TILE_CELLS: Final = 2048
 _EDGES_LEAST: Final = 20
 _CONTRAST_GREY: Final = 30.0
-# Either side of an edge must be this even, as a share of its contrast.
+# Each side of an edge must be this even, as a share of its contrast.
 _EVEN_SHARE: Final = 0.15
 _END_CELLS: Final = 3.0
 _LOW, _HIGH = 0.1, 0.9
@@ -47,7 +47,7 @@ _LOW, _HIGH = 0.1, 0.9
 
 @dataclass(frozen=True)
 class OrthoimageGrey(GreyCells):
-    """The grey of what an orthoimage shows, 0 elsewhere."""
+    """The grey levels of an orthoimage, 0 elsewhere."""
 
     image: Orthoimage
 
@@ -78,7 +78,7 @@ def n_shown(image: Orthoimage) -> int:
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
-    """How much of the scanned surface the image shows; both lie on the same cells."""
+    """Compute the share of the scanned surface that the image shows; both have the same cells."""
     n_surface = n_both = 0
     for rows in row_bands(image.mask.shape):
         surface = np.isfinite(wall.depth_m[rows])
@@ -89,12 +89,12 @@ def completeness(image: Orthoimage, wall: Wall) -> Finding:
 
 
 def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
-    """Sharpness, and the shares of what is shown that is filled, stretched or smeared.
+    """Compute sharpness, and the shares of shown cells that are filled, stretched or smeared.
 
     Args:
         image: the orthoimage.
-        wall: the wall it is of, on the same cells.
-        cameras: of its photos; without them nothing is said of stretches.
+        wall: its wall, on the same cells.
+        cameras: cameras of its photos; without them stretches are not computed.
     """
     share = count_cells(image.mask, OrthoMask.FILLED) / max(1, n_shown(image))
     return [
@@ -105,15 +105,15 @@ def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 
 
 def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
-    """Width of edges from 10 to 90 %, and the frequency at which contrast is halved.
+    """Compute the width of edges from 10 to 90 %, and the frequency at half contrast.
 
-    Profiles across the steepest places that have an even side each are brought to one contrast and
-    their middle; the median profile is the edge spread, its derivative's spectrum the MTF (ISO
-    12233). Nothing where there are fewer than 20 such edges.
+    Profiles across the steepest places with even sides are normalised in contrast and centred; the
+    median profile is the edge spread, the spectrum of its derivative the MTF (ISO 12233). Nothing
+    with fewer than 20 such edges.
 
     Args:
-        image: grey levels, and cells that count.
-        wall: of the findings.
+        image: grey levels, and valid cells.
+        wall: index in the findings.
     """
     profiles = _edge_profiles(image)
     if len(profiles) < _EDGES_LEAST:
@@ -130,15 +130,15 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
 
 
 def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
-    """Shares of painted cells whose photo is stretched or smeared there; none without cameras.
+    """Compute the shares of painted cells with stretched or smeared photos; none without cameras.
 
-    `stretch_share` are cells of which one pixel covers more than two in some direction,
-    `smear_share` those where it covers more than five, or that show the surface from behind.
+    `stretch_share` is the share of cells of which one pixel covers more than two in some direction,
+    `smear_share` where it covers more than five, or the surface is seen from behind.
 
     Args:
         image: the orthoimage.
-        wall: the wall it is of, on the same cells.
-        cameras: of its photos.
+        wall: its wall, on the same cells.
+        cameras: cameras of its photos.
     """
     if cameras is None:
         return []
@@ -161,22 +161,22 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 def cells_per_pixel(
     image: Orthoimage, wall: Wall, camera: tuple[str, ViewingCamera]
 ) -> NDArray[np.float64]:
-    """How many cells one pixel of a photo covers where it is widest, at cells that it painted.
+    """Return how many cells one pixel of a photo covers where it is widest, at painted cells.
 
     Args:
         image: the orthoimage.
-        wall: the wall it is of, on the same cells.
+        wall: its wall, on the same cells.
         camera: name of the photo, and its camera.
 
     Returns:
-        (n,) cells per pixel, of at most some hundred thousand cells spread evenly; infinite where
-        the surface shows its back.
+        (n,) cells per pixel, of at most some hundred thousand evenly spread cells; infinite where
+        the surface is seen from behind.
     """
     name, viewing = camera
     if name not in image.sources:
         return np.zeros(0)
     rows, columns = np.divmod(_asked_cells(image, wall, name), image.frame.width)
-    # Survey coordinates would cost digits.
+    # Survey coordinates would lose digits.
     near = replace(image.frame, origin_world=np.zeros(3))
     moved = viewing.shifted(image.frame.origin_world)
     depth = wall.depth_m[rows, columns].astype(np.float64)
@@ -189,13 +189,13 @@ def cells_per_pixel(
     jacobian = np.stack(along, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = 1.0 / np.linalg.svd(np.nan_to_num(jacobian), compute_uv=False)[:, 1]
-        # The image of a surface seen from the front runs as the wall does: u right, v down.
+        # The image of a surface seen from the front is oriented as the wall: u right, v down.
         spread[np.linalg.det(jacobian) <= 0.0] = np.inf
     return spread[np.isfinite(jacobian).all(axis=(1, 2))]
 
 
 def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
-    """Every so manyth of the cells (row * width + column) that a photo painted."""
+    """Return every nth of the cells (row * width + column) that a photo painted."""
     source, width = image.sources.index(name), image.frame.width
 
     def painted(rows: slice) -> NDArray[np.bool_]:
@@ -214,15 +214,15 @@ def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
 
 
 def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
-    """Profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
+    """Return profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
-    # A few million cells have edges enough.
+    # A few million cells have enough edges.
     image = cells.fullest_part(_TILE_CELLS)
-    # Of one row or column nobody can tell how steep it is.
+    # A single row or column has no gradient.
     if not image.valid.any() or min(image.valid.shape) < 2:
         return np.zeros((0, _ALONG.size))
-    # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.
+    # Voids are filled with the nearest value: they neither make edges nor ring into profiles.
     grey = _closed(image)
     smooth = gaussian_filter(grey, 1.0)
     down, right = (np.asarray(part) for part in np.gradient(smooth))
@@ -250,7 +250,7 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
 
 
 def _closed(image: GreyImage) -> NDArray[np.float64]:
-    """Grey levels where every void cell has that of the nearest valid one."""
+    """Return grey levels in which every void cell has that of the nearest valid one."""
     from scipy.ndimage import distance_transform_edt
 
     grey = np.asarray(image.grey, dtype=np.float64)
@@ -264,8 +264,8 @@ def _closed(image: GreyImage) -> NDArray[np.float64]:
 
 
 def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Profiles moved so that their middle lies in the middle."""
-    # The area above an edge tells its place with all samples, not with the two at the middle.
+    """Return profiles shifted so that their middle is centred."""
+    # The area above an edge gives its position from all samples, not from the two in the middle.
     reach = along[-1]
     offset = reach - np.sum(profiles[:, :-1] + profiles[:, 1:], axis=1) * 0.5 * _STEP_CELLS
     moved = [
@@ -276,7 +276,7 @@ def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArr
 
 
 def _width_cells(spread: NDArray[np.float64]) -> float:
-    """Distance between where the spread first passes 90 % and last was below 10 %."""
+    """Return the distance between the last sample below 10 % and the first above 90 %."""
     steps = np.arange(len(spread))
     above = int(np.argmax(spread >= _HIGH))
     below = int(np.flatnonzero(spread[: above + 1] <= _LOW)[-1])
@@ -286,13 +286,13 @@ def _width_cells(spread: NDArray[np.float64]) -> float:
 
 
 def _mtf50(spread: NDArray[np.float64]) -> float:
-    """Frequency in cycles per cell at which the spectrum of the slope is half of its start."""
+    """Return the frequency in cycles per cell at which the spectrum of the slope is halved."""
     slope = np.diff(spread)
     n_padded = 4096
     spectrum = np.abs(np.fft.rfft(slope, n_padded))
     contrast = spectrum / spectrum[0]
     frequency = np.fft.rfftfreq(n_padded, _STEP_CELLS)
-    # A step within one sample never halves below the last frequency.
+    # A step within one sample never falls to half below the last frequency.
     place = int(np.argmax(contrast < 0.5)) or len(contrast) - 1
     return float(
         np.interp(-0.5, -contrast[place - 1 : place + 1], frequency[place - 1 : place + 1])
@@ -310,9 +310,10 @@ def _neighbours(
     depth: NDArray[np.float64],
     step: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Points one cell further (column, row) on the surface, which goes on as it does at the cell.
+    """Return the points one cell further (column, row) on the surface.
 
-    Of the slopes on both sides the smaller one counts: at a depth step the other is the step's.
+    The surface is extended with the smaller of the slopes on both sides: at a depth step the other
+    is that of the step.
     """
     rows, columns = (places[:, 1] - 0.5).astype(np.int64), (places[:, 0] - 0.5).astype(np.int64)
     after = _depth_at(wall, rows + step[1], columns + step[0]) - depth
@@ -326,7 +327,7 @@ def _neighbours(
 def _depth_at(
     wall: Wall, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Depths (n,) of cells; NaN outside the wall."""
+    """Return depths (n,) of cells; NaN outside the wall."""
     height, width = wall.depth_m.shape
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     found = np.full(len(rows), np.nan)

@@ -22,27 +22,27 @@ from orthoflow_plugins.inspect.patches import (
     unrefined,
 )
 
-# Cells per key point at most: more are noise.
+# Minimum cells per key point: more key points are noise.
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
 _PAIRS_AT_ONCE: Final = 1 << 16
 _RATIO_MOST: Final = 0.9
-# Half of the box that levels contrast, which passes twice.
+# Half of the box that normalises contrast, which is applied twice.
 _LEVEL_REACH: Final = 12
 _LEAST_CONTRAST_GREY: Final = 2.0
 _LEAST_VALID_SHARE: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 0.5
-# A pair is believed when so many of its nearest ones agree with it.
+# A pair is accepted if this many of its nearest ones agree with it.
 _NEIGHBOURS: Final = 16
 _WITNESS_CELLS: Final = 8.0
 _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
-# Larger pictures are worked on in tiles, which take two gigabytes with what is about them: what
-# the widest key points and their descriptors look at, or a patch wherever it may be displaced to.
+# Larger pictures are processed in tiles, which take two gigabytes with their margin: the support of
+# the widest key points and their descriptors, or a patch wherever it may be displaced to.
 _WHOLE_CELLS: Final = 1 << 24
 _TILE_CELLS: Final = 3072
 _SURF_RIM_CELLS: Final = 512
@@ -51,14 +51,14 @@ _RIM_CELLS: Final = 96
 
 @dataclass(frozen=True, kw_only=True)
 class KeyPairs:
-    """Where the same is seen in two pictures.
+    """Corresponding positions in two pictures.
 
     Attributes:
         places: (n, 2) float64 (column, row) in the shown picture.
         shift: (n, 2) float64 cells along u and v, shown - reference, refined.
-        found: (n, 2) float64 the same as SURF alone gives it.
-        n_points: key points of the two pictures.
-        n_matched: pairs of like descriptors, right or wrong.
+        found: (n, 2) float64 the same as found by SURF alone.
+        n_points: number of key points of the two pictures.
+        n_matched: number of matched descriptors, right or wrong.
     """
 
     places: NDArray[np.float64]
@@ -72,14 +72,14 @@ class KeyPairs:
 
 
 def no_pairs() -> KeyPairs:
-    """Return the pairs of pictures in which nothing was looked for."""
+    """Return an empty result for pictures that were not searched."""
     nothing = np.zeros((0, 2))
     return KeyPairs(places=nothing, shift=nothing, found=nothing, n_points=(0, 0), n_matched=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _KeyPoints:
-    """SURF key points: places (n, 2), scale (n,), sign of the Laplacian (n,), descriptors."""
+    """SURF key points: positions (n, 2), scale (n,), sign of the Laplacian (n,), descriptors."""
 
     places: NDArray[np.float64]
     scale: NDArray[np.float64]
@@ -92,17 +92,17 @@ def find_key_pairs(
 ) -> KeyPairs:
     """Find pairs within a radius.
 
-    Both pictures are levelled to one contrast in their surroundings first, because laser and
-    camera see different brightness. Descriptors are matched mutually among key points of like
-    scale and sign; patches of 32 x 32 cells about a pair are then matched by least squares, and
-    pairs whose patches do not correlate, or that no neighbour agrees with, are left out. Large
-    pictures are worked on tile by tile.
+    Both pictures are first normalised to the local contrast, because laser and camera see different
+    brightness. Descriptors are matched mutually among key points of similar scale and sign; patches
+    of 32 x 32 cells around a pair are then matched by least squares, and pairs whose patches do not
+    correlate, or that disagree with their neighbours, are dropped. Large pictures are processed
+    tile by tile.
 
     Args:
         shown: the picture to judge.
-        reference: what it should show.
-        radius_cells: largest distance that is looked for.
-        threads: the pairs do not hang on their number.
+        reference: the picture to compare with.
+        radius_cells: maximum distance of a pair.
+        threads: number of threads, which does not change the pairs.
     """
     first: GreyCells = _Levelled(shown)
     second: GreyCells = _Levelled(reference)
@@ -130,7 +130,7 @@ def find_key_pairs(
 
 
 def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which pairs agree with some of their nearest ones: chance agrees with nobody."""
+    """Report which pairs agree with some of their nearest ones, as chance matches do not."""
     from scipy.spatial import cKDTree
 
     n_near = min(_NEIGHBOURS, len(places) - 1)
@@ -138,12 +138,13 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         return np.zeros(len(places), dtype=np.bool_)
     away, near = cKDTree(places).query(places, k=n_near + 1)
     apart = np.linalg.norm(shift[near] - shift[:, None], axis=2)
-    # The same place found at several scales is one witness, not several.
+    # The same place found at several scales counts once.
     agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
-    # A motif that repeats lets two or three pairs err alike, but not a quarter of a neighbourhood.
+    # A repeated motif can make two or three pairs wrong in the same way, but not a quarter of a
+    # neighbourhood.
     needed = max(_AGREEING, _AGREEING_SHARE * n_near)
     agreed = np.ones(len(places), dtype=np.bool_)
-    # Witnesses must be believed themselves.
+    # Only accepted pairs support others.
     while True:
         kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
         if np.array_equal(kept, agreed):
@@ -154,7 +155,7 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
 def _refined(
     first: GreyCells, second: GreyCells, start: PatchShifts, *, rim: int, threads: int
 ) -> PatchShifts:
-    """Refine shifts, those of each tile by what lies within a rim of it."""
+    """Refine shifts, those of each tile with a margin around it."""
     parts = [unrefined(*np.zeros((2, 0, 2)))]
     for tile in _tiles(first.shape):
         own = _lies_in(tile, start.centre)
@@ -175,7 +176,7 @@ def _refined(
 
 
 def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
-    """The tiles that a picture is worked on in: one unless it is large."""
+    """Return the tiles in which a picture is processed: one unless it is large."""
     return tiles(shape, max(shape) if math.prod(shape) <= _WHOLE_CELLS else _TILE_CELLS)
 
 
@@ -188,7 +189,7 @@ def _widened(tile: tuple[slice, slice], rim: int, shape: tuple[int, int]) -> tup
 
 
 def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which places (n, 2) = (column, row) lie in a tile."""
+    """Report which positions (n, 2) = (column, row) lie in a tile."""
     rows, columns = tile
     low, end = (columns.start, rows.start), (columns.stop, rows.stop)
     inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
@@ -197,7 +198,7 @@ def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[
 
 @dataclass(frozen=True)
 class _Levelled(GreyCells):
-    """A picture whose local mean and spread of what is valid are 128 and 40; elsewhere 128."""
+    """Return a picture with local mean 128 and standard deviation 40 where valid; elsewhere 128."""
 
     cells: GreyCells
 
@@ -232,7 +233,7 @@ def _levelled(image: GreyImage) -> GreyImage:
 def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     import cv2
 
-    # Two passes of a box come near a Gaussian and cost nothing at any width.
+    # Two passes of a box approximate a Gaussian at the same cost for any width.
     side = 2 * _LEVEL_REACH + 1
     once = cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
     twice = cv2.blur(once, (side, side), borderType=cv2.BORDER_CONSTANT)
@@ -240,11 +241,11 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _key_points(cells: GreyCells) -> _KeyPoints:
-    """Key points whose patch lies inside the picture and is mostly valid."""
+    """Return key points whose patch is inside the picture and mostly valid."""
     rows, columns = cells.shape
     half, parts = PATCH_CELLS // 2, []
     for image, corner, found in _strongest(cells):
-        # mahotas gives y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts
+        # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts
         # cells from their centres, as OpenCV does.
         places = from_opencv(found[:, 1::-1])
         inside = np.all(
@@ -265,11 +266,11 @@ def _key_points(cells: GreyCells) -> _KeyPoints:
 def _strongest(
     cells: GreyCells,
 ) -> Iterator[tuple[GreyImage, NDArray[np.int64], NDArray[np.float64]]]:
-    """The strongest key points of a picture, tile by tile.
+    """Yield the strongest key points of a picture, tile by tile.
 
     Yields:
-        What is about the tile, the (column, row) of its corner, and the key points (n, 70) of the
-        tile, their places counted from there.
+        The tile with its margin, the (column, row) of its corner, and the key points (n, 70) of the
+        tile, with positions relative to it.
     """
     from mahotas.features import surf
 
@@ -308,7 +309,7 @@ def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> ND
 
 
 def _matches(first: _KeyPoints, second: _KeyPoints, radius: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows, each other's best by descriptor and clearly better than the next."""
+    """Pairs (m, 2) of rows, mutually best by descriptor and clearly better than the second."""
     from scipy.spatial import cKDTree
 
     nothing = np.zeros((0, 2), dtype=np.int64)
@@ -337,7 +338,7 @@ def _descriptor_distances(
     one: NDArray[np.int64],
     other: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Distances of pairs, a part at a time, so that many pairs need little room."""
+    """Return distances of pairs, in parts, so that many pairs need little memory."""
     apart = np.empty(len(one))
     for start in range(0, len(one), _PAIRS_AT_ONCE):
         part = slice(start, start + _PAIRS_AT_ONCE)
@@ -348,7 +349,7 @@ def _descriptor_distances(
 def _clear_winners(
     owner: NDArray[np.int64], apart: NDArray[np.float64], n_owners: int
 ) -> NDArray[np.bool_]:
-    """Which pairs are the nearest of their owner, nearer than its second by the ratio."""
+    """Report which pairs are the nearest of their point, nearer than its second by the ratio."""
     order = np.lexsort((apart, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     nearest = np.full(n_owners, np.inf)

@@ -13,7 +13,7 @@ from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
 _NAMED: Final = 4
 _NEAR_M: Final = 1.0
-# Said of points that a larger wall would have.
+# The reason for points that a larger wall would include.
 _BESIDE: Final = re.compile(r" (?:left of|right of|above|below) ")
 
 
@@ -25,14 +25,14 @@ def missed_points(
     *,
     is_simulated: bool = False,
 ) -> dict[str, str]:
-    """Name the points that count nowhere, each with the reason, in the order of the survey.
+    """Name the points that are not used, each with the reason, in the order of the survey.
 
     Args:
-        points: where each is expected and shown.
+        points: expected and shown position of each.
         surveyed: the points.
-        pictures: what they were looked for in; at least one.
+        pictures: the pictures that were searched; at least one.
         walls: those of the pictures.
-        is_simulated: points were looked for by the scene's truth, not as targets.
+        is_simulated: points were searched with the scene's truth, not as targets.
     """
     sought = "nothing like it" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}
@@ -53,14 +53,14 @@ def missed_points(
 
 
 def with_reasons(missed: Mapping[str, str]) -> str:
-    """Name the first few of what `missed_points` gives, each with its reason."""
+    """Name the first few results of `missed_points`, each with its reason."""
     named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
     more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
     return f"{', '.join(named)}{more}"
 
 
 def ways_to_count(missed: Mapping[str, str]) -> str:
-    """Return what would let points count that count nowhere."""
+    """Return what would make unused points usable."""
     ways = ["measure them in an orthoimage"]
     if any(_BESIDE.search(reason) for reason in missed.values()):
         ways.append("let {step[raster.grid]}.margin_m make walls larger")
@@ -68,7 +68,7 @@ def ways_to_count(missed: Mapping[str, str]) -> str:
 
 
 def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -> tuple[float, str]:
-    """How far a point lies off a picture in metres, and on which side."""
+    """Return how far a point is outside a picture in metres, and on which side."""
     frame, slab = picture.frame, walls.slab(picture.wall)
     column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
     off_m = {

@@ -22,16 +22,17 @@ from orthoflow_plugins.inspect.findings import rms
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-# Larger walls are looked at in coarser cells; rays to the borders of openings are as fine as ever.
+# Larger walls are sampled in coarser cells; rays to the borders of openings keep their spacing.
 _CELLS_TOLD: Final = 1 << 24
-# Recesses of the scene may be so deep.
+# Maximum depth of a recess in a scene.
 _BEHIND_MOST_M: Final = 2.0
-# Of the cells about a recess, within two of it, so many are the face of the wall that it is in.
+# Of the cells within two cells of a recess, this share must be the face of its wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
-# An outline is of an opening when they share so much of both together.
+# An outline matches an opening if their intersection is this share of their union.
 _SAME_IOU: Final = 0.5
-# The true border is looked for so far to both sides of a found one, in steps, on so many lines.
+# Range of the search for the true border to both sides of a found one, in steps, and number of
+# lines.
 _REACH_CELLS: Final = 10.0
 _STEP_CELLS: Final = 1.0 / 16.0
 _LINES: Final = 33
@@ -42,11 +43,11 @@ _ENDS_SHARE: Final = 0.1
 class InspectOpenings(Method):
     """Compare outlines of openings with the recesses of a simulated scene.
 
-    True openings are the parts of a wall that show, seen squarely, a surface of a recess that lies
-    deep enough; what hangs together is one. An outline is of the opening with which it shares more
-    than half of both together, cell by cell; a wall of more than 17 million cells is looked at in
-    coarser ones. Each side that was seen is compared with the border of the recess on rays square
-    to the wall, a sixteenth of a cell apart; positive errors are outwards.
+    True openings are the connected parts of a wall that show, seen perpendicularly, a sufficiently
+    deep surface of a recess. An outline matches the opening with which it shares more than half of
+    their union, cell by cell; a wall of more than 17 million cells is sampled in coarser ones. Each
+    side that was seen is compared with the border of the recess on rays perpendicular to the wall,
+    a sixteenth of a cell apart; positive errors are outwards.
     """
 
     id: ClassVar[str] = "inspect.openings"
@@ -80,7 +81,7 @@ class InspectOpenings(Method):
     )
 
     class Params(MethodParams):
-        """Which recesses are asked for."""
+        """Which recesses are used."""
 
         behind_m: float = Field(
             default=0.05,
@@ -93,7 +94,7 @@ class InspectOpenings(Method):
         )
 
     class In(Ports):
-        """What to judge, on which walls, and the truth."""
+        """The openings to judge, their walls, and the truth."""
 
         truth: Truth
         openings: Openings
@@ -130,17 +131,17 @@ class InspectOpenings(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _TrueWall:
-    """A wall as it is.
+    """The truth of a wall.
 
     Attributes:
         slab: its raster.
-        place: in `Walls`.
-        step: cells of the raster, to both sides, in one of `labels`.
-        labels: (rows, cols) openings, from 1; 0 where none is.
+        place: its index in `Walls`.
+        step: cells of the raster along the side of a cell of `labels`.
+        labels: (rows, cols) openings, from 1; 0 elsewhere.
         face_m: depth of its face.
         deep_m: depth from which on recesses are openings.
-        scene: it is in.
-        views: of the scene.
+        scene: the scene that contains it.
+        views: prepared views of the scene.
     """
 
     slab: Slab
@@ -154,11 +155,11 @@ class _TrueWall:
 
     @property
     def frame(self) -> WallFrame:
-        """Where its cells lie."""
+        """Return the frame of its cells."""
         return self.slab.frame
 
     def depths_m(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (n,) of the opening seen at places (n, 2) = (column, row); NaN where none is."""
+        """Return the depth (n,) of the opening at positions (n, 2) = (column, row), or NaN."""
         frame, front_m = self.frame, self.slab.front_m
         starts = frame.world_from_wall(places, front_m) - self.scene.origin
         hits = self.views.cast(starts, np.broadcast_to(-frame.normal_world, starts.shape))
@@ -170,7 +171,7 @@ class _TrueWall:
 
 @dataclass(frozen=True, kw_only=True)
 class _SideError:
-    """Of one side: where, how far outwards of the truth, and what it said of itself."""
+    """One side: its middle, its error outwards, and its stated deviation."""
 
     point_world: NDArray[np.float64]
     outwards: NDArray[np.float64]
@@ -180,7 +181,7 @@ class _SideError:
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """What was found on one wall; shares have an entry per true opening, 0 where none was."""
+    """The findings on one wall; shares have an entry per true opening, 0 if it was not found."""
 
     place: int
     gsd_m: float
@@ -213,7 +214,7 @@ def _true_wall(
         cores=cores,
     )
     true = render(scene, told, rendering)
-    # Where there is no surface there is no depth either.
+    # Without a surface there is no depth either.
     role = scene.role[true.rectangle]
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
     face_m = float(np.median(of_face)) if of_face.size else 0.0
@@ -234,7 +235,7 @@ def _true_wall(
 
 
 def _step(n_cells: int) -> int:
-    """So many cells, to both sides, become one, that a wall has not too many."""
+    """Return how many cells are joined along each side, so that a wall does not have too many."""
     step = 1
     while n_cells // step**2 > _CELLS_TOLD:
         step += 1
@@ -244,16 +245,16 @@ def _step(n_cells: int) -> int:
 def _labelled(
     is_open: NDArray[np.bool_], is_face: NDArray[np.bool_], n_least: float
 ) -> NDArray[np.int32]:
-    """Number the open areas that are large enough and have the wall's face about them."""
+    """Number the open areas that are large enough and surrounded by the wall's face."""
     import cv2
 
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(
         is_open.astype(np.uint8), connectivity=4
     )
-    # A recess of another wall, seen beside the edge of this one, is no opening of it.
+    # A recess of another wall, seen beyond the edge of this one, is not an opening of it.
     about = np.ones((_RIM_CELLS, _RIM_CELLS), dtype=np.uint8)
     names = np.zeros(n_areas, dtype=np.int32)
-    # Before the first comes what is no area.
+    # Label 0 is no area.
     for label in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= n_least):
         left, top, width, height, _ = boxes[label]
         part = (
@@ -314,16 +315,16 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
 
 
 def _cells_of(opening: Opening, frame: WallFrame) -> NDArray[np.float64]:
-    """Corners (n, 2) as (column, row)."""
+    """Return corners (n, 2) as (column, row)."""
     return frame.wall_from_world(opening.outline_world)[:, :2]
 
 
 def _side_error(
     wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
-    """Middle (3,), direction outwards (2,) and error in metres of a side.
+    """Return middle (3,), outward direction (2,) and error in metres of a side.
 
-    None where no true border is near most of it.
+    None if no true border is near most of it.
     """
     way = end - begin
     length = float(np.linalg.norm(way))

@@ -1,6 +1,7 @@
-"""How far estimated cameras and their ties are from the truth, which no residual can tell.
+"""True errors of estimated cameras and their ties, which residuals cannot show.
 
-Cameras are compared in place, in angle, and on the wall; ties with where their pixels truly look.
+Cameras are compared in position, in angle and on the wall; ties with the true target of their
+pixels.
 """
 
 from __future__ import annotations
@@ -34,28 +35,28 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
 
 _GRID: Final = (24, 18)
-# Surfaces that face another way than the wall, such as the sides of mouldings, are left out.
+# Surfaces with another direction than the wall, such as the sides of mouldings, are ignored.
 _LEAST_COSINE: Final = 0.9
-# An orientation called `ok` that is off by more of its stated deviations is wrong.
+# An orientation called `ok` whose error exceeds this many stated deviations is wrong.
 _WRONG_SIGMAS: Final = 5.0
-# A tie that is off by more than so many cells of the wall is wrong.
+# A tie whose error exceeds this many cells of the wall is wrong.
 _WRONG_CELLS: Final = 1.5
-# Rays along the longer side of a photo that say which wall it shows most.
+# Number of rays along the longer side of a photo that decide which wall it shows most.
 _RAYS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseError:
-    """What is wrong with one photo's orientation.
+    """The errors of one photo's orientation.
 
     Attributes:
         photo: name.
         status: `ok`, or why it has no orientation; then the rest is None.
         centre_m: distance of the projection centres.
         rotation_deg: angle between the orientations.
-        wall_m: error of one coordinate on the walls, RMS over what the photo shows of them; None
-            when it shows none of them, infinite when the estimated camera does not look there.
-        sigma_wall_m: what the estimate states for that, or None.
+        wall_m: error of one coordinate on the walls, RMS over what the photo shows of them; None if
+            it shows none of them, infinite if the estimated camera does not look there.
+        sigma_wall_m: stated value of the same, or None.
     """
 
     photo: str
@@ -67,7 +68,7 @@ class PoseError:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether it is called `ok`, but off by more than 5 stated standard deviations."""
+        """Whether it is called `ok`, but has an error of more than 5 stated standard deviations."""
         if self.status != "ok" or self.wall_m is None:
             return False
         stated = math.inf if self.sigma_wall_m is None else self.sigma_wall_m
@@ -78,7 +79,7 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
     """Return the true camera of a photo.
 
     Raises:
-        MethodError: the truth knows no such photo.
+        MethodError: the truth has no such photo.
     """
     cameras = () if truth.cameras is None else truth.cameras.cameras
     for camera in cameras:
@@ -96,7 +97,7 @@ def pose_errors(
     """Compare each photo's orientation with the truth, on the walls and within their buffer.
 
     Raises:
-        MethodError: a photo is none of the simulated ones.
+        MethodError: a photo is not one of the simulated ones.
     """
     return tuple(
         PoseError(photo=camera.photo, status=camera.status)
@@ -107,7 +108,7 @@ def pose_errors(
 
 
 def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
-    """Sum up the errors of all photos; worst and median over those that are `ok`."""
+    """Compute statistics of all photos; worst and median over those that are `ok`."""
     good = [error for error in errors if error.status == "ok"]
     centres = [1e3 * error.centre_m for error in good if error.centre_m is not None]
     angles = [error.rotation_deg for error in good if error.rotation_deg is not None]
@@ -141,7 +142,7 @@ def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
 
 
 def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
-    """State of each photo how far off it is, as JSON."""
+    """Return the errors of each photo as JSON."""
     return [
         {
             "photo": error.photo,
@@ -156,7 +157,7 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
-    """State how many ties are wrong: of all that were matched, and of those that photos kept."""
+    """Report how many ties are wrong: of all that were matched, and of those that photos kept."""
     ties = cameras.ties
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []
@@ -181,13 +182,13 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """Distance (n,) in the wall's plane of each tie's point from where its pixel truly looks.
+    """Distances (n,) in the wall's plane of tie points from the true targets of their pixels.
 
-    To first order of the true camera, in cells of the wall; infinite where the true camera does not
+    To first order of the true camera, in cells of the wall; infinite if the true camera does not
     look towards the point at all.
 
     Raises:
-        MethodError: the truth knows no such photo.
+        MethodError: the truth has no such photo.
     """
     errors = np.full(len(ties.photo), np.inf)
     for photo in np.unique(ties.photo):
@@ -207,7 +208,7 @@ def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float
 
 
 def most_shown(camera: ViewingCamera, walls: Sequence[Wall]) -> int:
-    """Index of the wall whose rectangle covers most of a photo, -1 where none is in it."""
+    """Return the index of the wall whose rectangle covers most of a photo, -1 without one."""
     step = max(camera.width, camera.height) / _RAYS
     grid = np.meshgrid(
         np.arange(0.5 * step, camera.width, step), np.arange(0.5 * step, camera.height, step)
@@ -246,7 +247,7 @@ def _pose_error(
 
 
 def _angle_deg(rotation: NDArray[np.float64]) -> float:
-    """Angle of a rotation; the sine keeps small angles that the cosine would lose."""
+    """Angle of a rotation; the sine preserves small angles that the cosine would lose."""
     axis = np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -260,7 +261,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Where the two cameras place a grid of pixels on the surfaces that the true one sees."""
+    """Compare the projections of a pixel grid by both cameras onto the true surfaces."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)
@@ -283,7 +284,7 @@ def _error_on_walls(
 
 
 def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]:
-    """Which points lie on a wall: within its raster and buffer, on a surface that faces as it."""
+    """Which points lie on a wall: in its raster and buffer, on a surface that faces like it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
     for index in range(len(walls.walls)):
@@ -310,7 +311,7 @@ def _scaled(metres: float | None) -> float | None:
 
 
 def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
-    """Ties (n,) of photos with the wall that each truly shows most."""
+    """Return ties (n,) of photos with the wall that each truly shows most."""
     most = [
         most_shown(true_camera(truth, name), walls.walls) if (ties.photo == index).any() else -1
         for index, name in enumerate(ties.photo_names)
@@ -319,5 +320,5 @@ def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
 
 
 def _of_these(ties: Ties, walls: tuple[Wall, ...]) -> bool:
-    """Whether the ties may be ties with these walls."""
+    """Whether the ties may belong to these walls."""
     return int(ties.wall.min()) >= 0 and int(ties.wall.max()) < len(walls)

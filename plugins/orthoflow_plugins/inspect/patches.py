@@ -1,4 +1,4 @@
-"""How far one image lies off another: patches matched by least squares to hundredths of a cell."""
+"""Displacements between two images: least squares matching to hundredths of a cell."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _LEAST_REGION: Final = 0.8
 _LEAST_WEIGHT: Final = 0.25
 _ROUNDS: Final = 12
 _AT_ONCE: Final = 2048
-# What least squares move so far was found at the wrong place.
+# A patch that least squares move this far was found at the wrong place.
 _STRAYED_CELLS: Final = 2.0
 _CONVERGED_CELLS: Final = 0.002
-# Smoothing makes neighbouring cells alike; so many cells count as one when precision is judged.
+# Smoothing correlates neighbouring cells; this many count as one in the precision.
 _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
 _SIGMA_LIMIT_CELLS: Final = 0.15
 
 
 class GreyCells(ABC):
-    """A grey image of which some cells count, of which parts are given where they are asked for."""
+    """A grey image with valid cells, of which parts are computed on request."""
 
     @property
     @abstractmethod
@@ -39,14 +39,14 @@ class GreyCells(ABC):
 
     @abstractmethod
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Some rows and columns, all of them within the image."""
+        """Return some rows and columns, all of them within the image."""
 
     def whole(self) -> GreyImage:
-        """All rows and columns."""
+        """Return all rows and columns."""
         return self.cut((slice(0, self.shape[0]), slice(0, self.shape[1])))
 
     def fullest_part(self, side: int) -> GreyImage:
-        """The tile of at most so many rows and columns with most cells that count."""
+        """Return the tile of limited size with the most valid cells."""
 
         def n_valid(tile: tuple[slice, slice]) -> int:
             return int(np.count_nonzero(self.cut(tile).valid))
@@ -54,7 +54,7 @@ class GreyCells(ABC):
         return self.cut(max(tiles(self.shape, side), key=n_valid))
 
     def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
-        """A square from a corner (2,) = column, row on; beyond the border 0 and not valid."""
+        """Return a square from a corner (2,) = column, row; 0 and not valid beyond the border."""
         grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
         first = np.clip(corner[::-1], 0, self.shape)
         end = np.clip(corner[::-1] + side, first, self.shape)
@@ -69,12 +69,12 @@ class GreyCells(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class GreyImage(GreyCells):
-    """A grey image of which some cells count, in memory.
+    """A grey image with valid cells, in memory.
 
     Attributes:
         grey: (rows, cols) float64.
         valid: (rows, cols) bool, cells that count.
-        region: (rows, cols) bool, the whole of the surface, whatever is missing on it.
+        region: (rows, cols) bool, the whole surface, including missing cells.
     """
 
     grey: NDArray[np.float64]
@@ -88,17 +88,18 @@ class GreyImage(GreyCells):
         return rows, columns
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Some rows and columns, all of them within the image."""
+        """Return some rows and columns, all of them within the image."""
         return GreyImage(grey=self.grey[part], valid=self.valid[part], region=self.region[part])
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntensityGrey(GreyCells):
-    """An intensity as grey levels, 0 where it is not known.
+    """An intensity as grey levels, 0 where unknown.
 
     Attributes:
-        intensity: (rows, cols) float32 from 0 to 1, NaN where it is not known.
-        of_roots: that of a laser spans decades; its roots look more like what a camera sees.
+        intensity: (rows, cols) float32 from 0 to 1, NaN where unknown.
+        of_roots: use square roots: laser intensity spans decades, and its roots are closer to what
+            a camera sees.
     """
 
     intensity: NDArray[np.float32]
@@ -111,7 +112,7 @@ class IntensityGrey(GreyCells):
         return rows, columns
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Some rows and columns, all of them within the wall."""
+        """Return some rows and columns, all of them within the wall."""
         values = self.intensity[part]
         known = np.isfinite(values)
         level = np.where(known, values, np.float32(0.0))
@@ -123,7 +124,7 @@ class IntensityGrey(GreyCells):
 
 
 def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
-    """Cut a raster into tiles of at most so many rows and columns, row by row."""
+    """Cut a raster into tiles of limited size, row by row."""
     for row in range(0, shape[0], side):
         for column in range(0, shape[1], side):
             yield (
@@ -151,7 +152,7 @@ class PatchShifts(Rows):
     correlation: NDArray[np.float64]
 
     def within(self, rows: slice) -> PatchShifts:
-        """Those whose centre lies in some rows, counted from the first of these."""
+        """Return those whose centre lies in some rows, counted from the first of these."""
         first = rows.start or 0
         end = np.inf if rows.stop is None else rows.stop
         own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
@@ -160,7 +161,7 @@ class PatchShifts(Rows):
 
 
 def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
-    """Return patches at (p, 2) whose displacements (p, 2) are known roughly."""
+    """Return patches at (p, 2) whose displacements (p, 2) are known approximately."""
     return PatchShifts(
         centre=centre,
         shift=shift,
@@ -171,7 +172,7 @@ def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchS
 
 
 class _Patches(NamedTuple):
-    """Cells of the patches under work: arrays (p, 32 * 32)."""
+    """Cells of the current patches: arrays (p, 32 * 32)."""
 
     rows: NDArray[np.float64]
     columns: NDArray[np.float64]
@@ -183,13 +184,13 @@ def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> Pa
     """Measure where the content of `true` appears in `shown`, patch by patch.
 
     A patch is 32 x 32 cells. It is found to a whole cell by the smallest mean square difference
-    within the reach, then by Gauss-Newton steps for shift and brightness. Patches that have too
-    few valid cells, too little texture for 0.15 cells, or do not converge are left out.
+    within the reach, then by Gauss-Newton steps for shift and brightness. Patches with too few
+    valid cells, too little texture for 0.15 cells, or without convergence are omitted.
 
     Args:
         shown: the image to judge.
-        true: the image it should be.
-        reach_cells: largest displacement that is looked for.
+        true: the reference image.
+        reach_cells: maximum displacement that is searched.
     """
     first, second = _smoothed(shown), _smoothed(true)
     start = _whole_cell_shifts(first, second, reach_cells)
@@ -210,13 +211,13 @@ def refine_shifts(
     """Refine displacements that are known to a cell or two, patch by patch.
 
     Args:
-        shown: the image to judge, of about the contrast of the other.
-        true: the image it should be.
-        start: where patches of 32 x 32 cells lie, wholly inside the image, and how far they are
-            displaced at first.
-        sigma_most_cells: patches measured less exactly are left out.
-        focus_cells: cells count by a Gaussian of this width about the patch's middle.
-        threads: so many parts of the patches are refined at once, each as if it were alone.
+        shown: the image to judge, with about the contrast of the other.
+        true: the reference image.
+        start: positions of patches of 32 x 32 cells, wholly inside the image, and their approximate
+            displacements.
+        sigma_most_cells: patches with a larger standard deviation are omitted.
+        focus_cells: width of the Gaussian weight around the patch's middle.
+        threads: number of parts of the patches that are refined at once, independently.
 
     Returns:
         The patches that converge within two cells of the start.
@@ -237,10 +238,10 @@ def refine_shifts(
 
 
 def _smoothed(image: GreyImage) -> GreyImage:
-    """Smooth by a Gaussian of one cell, as if only valid cells were there.
+    """Smooth by a Gaussian of one cell over valid cells only.
 
-    At the rim of the region the mean leans to one side, by what the region cuts off and not by
-    what is shown; such cells do not count. Scattered holes do no harm.
+    At the border of the region the mean is shifted to one side by the region and not by the
+    content; such cells are not valid. Scattered holes do no harm.
     """
     inside = _gauss(image.region) > _LEAST_REGION
     weight = _gauss(image.valid)
@@ -260,7 +261,7 @@ def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchSh
     row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * PATCH_CELLS**2)
     grey = _windows(shown.grey, row, column, 0)
     valid = _windows(shown.valid, row, column, 0)
-    # What comes in from beyond the border is not valid.
+    # Cells from beyond the border are not valid.
     true_grey = _windows(np.pad(true.grey, reach), row, column, reach)
     true_valid = _windows(np.pad(true.valid, reach), row, column, reach)
     best, shift = np.full(len(row), np.inf), np.zeros((len(row), 2))
@@ -300,7 +301,7 @@ _Value = TypeVar("_Value", bound=np.generic)
 def _windows(
     values: NDArray[_Value], row: NDArray[np.int64], column: NDArray[np.int64], rim: int
 ) -> NDArray[_Value]:
-    """Patches (p, n, n) with a rim round each; `values` has the rim round it."""
+    """Return patches (p, n, n) with a margin around each; `values` has the margin around it."""
     side = PATCH_CELLS + 2 * rim
     cells = np.arange(side)
     rows = row[:, None, None] * PATCH_CELLS + cells[:, None]
@@ -346,7 +347,7 @@ def _refined(
         weight = part.weight * inside
         step[active], sigma[active] = _normal_step(design, part.grey - expected, weight)
         correlation[active] = _correlations(part.grey, expected, weight)
-        # Half a cell at most: the linear model holds no further.
+        # Half a cell at most: the linear model is not valid further.
         shift[active] += np.clip(step[active], -0.5, 0.5)
     good = (
         (np.abs(step).max(axis=1) < 5.0 * _CONVERGED_CELLS)
@@ -365,7 +366,7 @@ def _refined(
 def _correlations(
     first: NDArray[np.float64], second: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Correlation coefficients (p,) of patches (p, n) by their weights."""
+    """Return weighted correlation coefficients (p,) of patches (p, n)."""
     total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     one = first - (weight * first).sum(axis=1, keepdims=True) / total
     other = second - (weight * second).sum(axis=1, keepdims=True) / total
@@ -375,9 +376,9 @@ def _correlations(
 
 
 class _Sampler:
-    """The true image between its cells, by cubic B-splines (Unser 1999); validity by all cells.
+    """The true image interpolated by cubic B-splines (Unser 1999), with validity.
 
-    All cells of a patch lie at one fraction of a cell, so that four weights per axis do.
+    All cells of a patch have the same fractional position, so four weights per axis suffice.
     """
 
     def __init__(self, true: GreyImage) -> None:
@@ -406,9 +407,9 @@ class _Sampler:
         return expected.reshape(flat), design, valid.reshape(flat)
 
     def _windows(self, corner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Coefficients (p, 35, 35) about patches from their corners, and valid cells (p, 32, 32).
+        """Coefficients (p, 35, 35) around patches from their corners, and valid cells (p, 32, 32).
 
-        A cell between others is valid when all four are.
+        An interpolated cell is valid if all four neighbours are.
         """
         steps = np.arange(-1, PATCH_CELLS + 2)
         rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps
@@ -423,7 +424,7 @@ class _Sampler:
 
 
 def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights (2, p, 4) of the coefficients about a place for its value and its derivative."""
+    """Return weights (2, p, 4) of the coefficients for the value and its derivative."""
     t = part
     s = 1.0 - t
     value = [s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3]

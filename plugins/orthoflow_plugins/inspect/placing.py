@@ -1,4 +1,4 @@
-"""The wall that an orthoimage is of, on the orthoimage's own cells."""
+"""The wall of an orthoimage, on the orthoimage's own cells."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
-    """Return orthoimages whose `wall` counts in these walls.
+    """Return orthoimages whose `wall` is an index of these walls.
 
-    Those of other programs, and of walls rastered in another step, know the plane only.
+    Orthoimages of other programs, and of walls rastered in another step, state the plane only.
 
     Raises:
         MethodError: there is no such wall.
@@ -47,7 +47,7 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
 
 
 def rows_of(raster: _Framed, rows: slice) -> _Framed:
-    """Return some rows of an orthoimage, a wall or a truth, on a frame of their own."""
+    """Return some rows of an orthoimage, a wall or a truth, with a frame of their own."""
     frame = raster.frame
     corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
     part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
@@ -61,7 +61,7 @@ def rows_of(raster: _Framed, rows: slice) -> _Framed:
 
 
 def in_files(ctx: StepContext, name: str) -> Allocate:
-    """Return arrays in files, for what many cells are wrong by, or take from elsewhere."""
+    """Return arrays in files, for errors or values of many cells."""
 
     def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
         return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
@@ -70,19 +70,19 @@ def in_files(ctx: StepContext, name: str) -> Allocate:
 
 
 def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> Wall:
-    """Return the wall of one of `on_walls`; one that lies on other cells is laid onto the image's.
+    """Return the wall of one of `on_walls`, resampled if its cells differ from the image's.
 
-    Orthoimages of other programs have grids of their own. Each of their cells takes what the
-    nearest cell of the wall holds, its depth counted from the image's own plane, and an intensity
-    between those of the four nearest.
+    Orthoimages of other programs have grids of their own. Each of their cells takes the values of
+    the nearest cell of the wall, its depth relative to the image's own plane, and an intensity
+    interpolated between the four nearest.
 
     Args:
         image: the orthoimage.
         walls: all of them.
-        allocate: gives arrays for what is laid onto the cells of a large image, by name.
+        allocate: returns arrays for resampled values of a large image, by name.
 
     Raises:
-        MethodError: it lies elsewhere.
+        MethodError: it is elsewhere.
     """
     wall = walls.walls[image.wall]
     if wall.frame.has_cells_of(image.frame):
@@ -104,12 +104,12 @@ def _require_nearness(image: Orthoimage, wall: Wall, walls: Walls) -> None:
 
 
 def _laid_onto(image: Orthoimage, wall: Wall, allocate: Allocate) -> Wall:
-    """The wall on the image's cells, row by row, so that large images need little room."""
+    """Return the wall on the image's cells, row by row, so that large images need little memory."""
     import cv2
 
     frame = image.frame
     columns = np.arange(frame.width) + 0.5
-    # What each cell holds, and what those beyond the wall get.
+    # Fields of a cell, and their values beyond the wall.
     given: dict[str, tuple[NDArray[Any], float]] = {
         "depth_m": (wall.depth_m, np.nan),
         "sigma_m": (wall.sigma_m, np.nan),

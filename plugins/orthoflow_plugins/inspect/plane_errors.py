@@ -1,4 +1,4 @@
-"""Planes and labels against the truth: of walls that were made, and how well detectors do."""
+"""Planes and labels against the truth: errors of walls, and scores of detectors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
-# A wall further off than this shows no true plane.
+# A wall farther away than this does not match a true plane.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
 _LABEL_SCORES: Final = ("precision", "recall", "f1", "iou")
@@ -99,14 +99,14 @@ def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Fi
 
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
-    """Numbers on the plane of one wall; none when it shows no true plane."""
+    """Return metrics of the plane of one wall; none if it matches no true plane."""
     distances = (_plane_distance(plane, true, index) for index in range(len(true)))
     nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
     return [] if nearest is None else _plane_findings(nearest, wall)
 
 
 def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
-    """The largest error of any wall's plane, as numbers on all walls."""
+    """Return the largest error of any wall's plane, as metrics of all walls."""
     worst = []
     for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
         values = [finding for finding in findings if finding.name == name]
@@ -129,7 +129,7 @@ def found_planes(planes: Planes, true: Planes) -> list[Finding]:
 
 
 def label_findings(labels: PointLabels, truth: Truth) -> list[Finding]:
-    """Precision, recall, F1 and IoU of the labels per true plane, matched one to one.
+    """Compute precision, recall, F1 and IoU of the labels per true plane, matched one to one.
 
     Raises:
         MethodError: the labels are not of the simulated cloud.
@@ -171,7 +171,7 @@ def label_findings(labels: PointLabels, truth: Truth) -> list[Finding]:
 
 @dataclass(frozen=True, kw_only=True)
 class _PlaneDistance:
-    """How far a plane lies off a true one.
+    """Differences between a plane and a true one.
 
     Attributes:
         angle_deg: between the normals.
@@ -189,7 +189,7 @@ class _PlaneDistance:
 
     @property
     def score(self) -> float:
-        """What tells the nearest plane: angle and offset in units of those that count as found."""
+        """Return what selects the nearest plane: angle and offset in units of the limits."""
         return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
 
 
@@ -205,20 +205,20 @@ def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
 
 
 def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
-    """How far each of the found planes lies off a true one."""
+    """Return the differences of each of the found planes from a true one."""
     return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
 
 
 def _nearest(
     distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
 ) -> _PlaneDistance | None:
-    """The smallest of those distances that are within the limits."""
+    """Return the smallest of those differences that are within the limits."""
     near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
     return min(near, key=lambda distance: distance.score, default=None)
 
 
 def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:
-    """Numbers on the plane of one wall."""
+    """Return metrics of the plane of one wall."""
     return [
         Finding(name="plane_angle_deg", value=distance.angle_deg, unit="deg", wall=wall),
         Finding(name="plane_offset_mm", value=1e3 * distance.offset_m, unit="mm", wall=wall),
@@ -229,7 +229,7 @@ def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:
 def _joint_counts(
     found: NDArray[np.int16], true: NDArray[np.int16], n_true: int
 ) -> NDArray[np.int64]:
-    """Points by (true + 1, found + 1)."""
+    """Return counts of points by (true + 1, found + 1)."""
     n_found = int(found.max(initial=-1)) + 2
     joint = (true.astype(np.int64) + 1) * n_found + (found.astype(np.int64) + 1)
     return np.bincount(joint, minlength=(n_true + 1) * n_found).reshape(n_true + 1, n_found)

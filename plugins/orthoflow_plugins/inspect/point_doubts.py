@@ -1,4 +1,4 @@
-"""Signs that check points mean another raster, unit or coordinate system than the orthoimage's."""
+"""Signs that check points refer to another raster, unit or coordinate system."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
-# A spec, what it is about, and its values.
+# A spec, its subject, and its values.
 Doubt: TypeAlias = tuple[DiagnosticSpec, str, dict[str, Any]]
-# An orthoimage is off by cells, not by tens of them.
+# Errors of an orthoimage are cells, not tens of cells.
 _OFF_CELLS: Final = 20.0
-# Another cell size, and not what a photo's pose or a scan's scale can be wrong by.
+# A different cell size, beyond what a photo's pose or a scan's scale can explain.
 _SCALE_OFF: Final = 0.02
-# So much of all that is off is the same for all points.
+# Share of the total error that all points have in common.
 _ALIKE_SHARE: Final = 0.9
 _ALIKE_LEAST: Final = 3
 _ANY_CELLS: Final = (
@@ -59,7 +59,7 @@ SHIFTED_POINTS: Final = DiagnosticSpec(
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
-    """Points (n,) whose survey is nothing but what was shown where they were clicked."""
+    """Report points (n,) whose surveyed coordinates are those shown where they were clicked."""
     if surveyed.shown_world is None:
         return np.zeros(len(surveyed.names), dtype=np.bool_)
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
@@ -68,12 +68,12 @@ def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
 def doubts(
     points: Sequence[ShownPoint], surveyed: CheckPoints, pictures: Sequence[Picture]
 ) -> Iterator[Doubt]:
-    """Return diagnostics of what about the check points can hardly be meant.
+    """Return diagnostics of implausible check points.
 
     Args:
-        points: where each is expected and shown.
+        points: expected and shown position of each.
         surveyed: the points.
-        pictures: what they are shown in.
+        pictures: the pictures that show them.
     """
     if n_own := int(np.count_nonzero(is_own(surveyed))):
         yield OWN_POINTS, "", {"n": n_own, "n_points": len(points)}
@@ -93,7 +93,7 @@ def doubts(
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
-    """How far a point lies off its wall, where that is more than the wall is long; else 0."""
+    """Return how far a point is from its wall if that exceeds the wall's length; else 0."""
     if picture is None:
         return 0.0
     frame = picture.frame
@@ -103,7 +103,7 @@ def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
 
 
 def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[Doubt]:
-    """Measured places that are off by another cell size, or all alike."""
+    """Return measured positions that differ by another cell size, or all by the same shift."""
     if len(points) < 2:
         return
     expected = np.array([point.expected for point in points])

@@ -1,4 +1,4 @@
-"""Where check points are shown: measured, recognised as targets, or found by a scene's truth."""
+"""Where check points are shown: measured, recognised as targets, or found with the truth."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from orthoflow_plugins.inspect.targets import find_crossing
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
-# A point is what lies within a few cells about it, not the texture further off.
+# The surroundings of a point are a few cells, not the texture farther away.
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
-# Targets are not quite flat: only so much of their radius says how deep the centre lies.
+# Targets are not quite flat: only this share of their radius is used for the depth of the centre.
 _DEPTH_SHARE: Final = 0.5
 _NOWHERE: Final = np.full(3, np.nan)
 
@@ -41,9 +41,9 @@ class ShownPoint:
     Attributes:
         how: how it was found, or why not.
         wall: index of the wall in `Walls`, -1 outside of all.
-        expected: (2,) column, row where the survey has it.
-        place: (2,) column, row where it is shown, NaN when not found.
-        point_world: (3,) metres, the shown place on the surface; NaN when not known.
+        expected: (2,) column, row of the surveyed position.
+        place: (2,) column, row where it is shown, NaN if not found.
+        point_world: (3,) metres, the shown position on the surface; NaN if unknown.
     """
 
     how: How
@@ -55,14 +55,14 @@ class ShownPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """What points are looked for in.
+    """A picture in which points are searched.
 
     Attributes:
         wall: index of the wall in `Walls`.
         frame: the cells.
-        grey: what is shown on them.
+        grey: their grey levels.
         surface: the wall on the same cells.
-        image: what is drawn beneath residuals.
+        image: background of drawn residuals.
     """
 
     wall: int
@@ -77,12 +77,12 @@ class PointFinder:
     """Finds one check point after the other.
 
     Attributes:
-        pictures: where points may be shown.
+        pictures: pictures that may show points.
         checkpoints: the points.
         walls: those of the pictures.
-        truth: of a simulated room, or None; targets are looked for then.
-        search_m: how far from its place a point is looked for.
-        target_radius_m: of the targets that counts.
+        truth: of a simulated room, or None; then targets are searched.
+        search_m: radius of the search for a point.
+        target_radius_m: radius of a target that is used.
     """
 
     pictures: Sequence[Picture]
@@ -93,7 +93,7 @@ class PointFinder:
     target_radius_m: float
 
     def find(self, index: int) -> ShownPoint:
-        """Where a point is shown, and how that is known."""
+        """Return where a point is shown, and how that is known."""
         points = self.checkpoints
         world = points.points_world[index]
         wall = int(points.wall[index])
@@ -123,7 +123,7 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """The picture of the wall of a number, or of the nearest one that the point lies before."""
+        """Return the picture of a wall by number, or of the nearest wall behind the point."""
         best, nearest = None, np.inf
         for picture in self.pictures:
             if wall is not None and picture.image.number == wall:
@@ -195,15 +195,15 @@ def find_by_truth(
     """Find where the surroundings of a point are shown, known from a simulated scene.
 
     Args:
-        picture: what is judged.
+        picture: the picture to judge.
         frame: its cells.
         expected: (2,) column, row of the point.
         truth: the scene.
-        buffers_m: in front of the wall and behind it, what belongs to the wall.
-        search_cells: how far is looked.
+        buffers_m: depths in front of the wall and behind it that belong to the wall.
+        search_cells: radius of the search.
 
     Returns:
-        (2,) column, row, or None where nothing correlates.
+        (2,) column, row, or None without correlation.
     """
     from orthoflow.geometry.scene_views import render_frame
 
@@ -227,7 +227,7 @@ def find_by_truth(
     whole = _whole_shift(shown, reference, rim, search_cells)
     if whole is None:
         return None
-    # The patch is cut where the point is shown, so that it is the point that counts.
+    # The patch is centred where the point is shown, so that the point is what is measured.
     centre = np.full(2, side // 2) + whole
     found = refine_shifts(
         shown,
@@ -244,9 +244,9 @@ def find_by_truth(
 def point_on_surface(
     wall: Wall, place: NDArray[np.float64], radius_m: float
 ) -> NDArray[np.float64] | None:
-    """World point (3,) of a place, on the plane through the depths around it; None without any.
+    """Return the world point (3,) of a position, on the plane through nearby depths, or None.
 
-    The plane is fitted robustly: a target on its holder is flat where the wall about it is not.
+    The plane is fitted robustly: a target on its holder is flat even if the wall around it is not.
     """
     radius = radius_m / wall.frame.gsd_m
     low = np.maximum(np.floor(place - radius).astype(np.int64), 0)
@@ -274,7 +274,7 @@ def point_on_surface(
 def _whole_shift(
     shown: GreyImage, true: GreyImage, rim: int, search: int
 ) -> NDArray[np.int64] | None:
-    """Whole cells (right, down) by which the middle of `true` lies off in `shown`."""
+    """Return whole cells (right, down) by which the middle of `true` is displaced in `shown`."""
     middle = slice(rim, rim + PATCH_CELLS)
     down, right = np.mgrid[:PATCH_CELLS, :PATCH_CELLS] - 0.5 * (PATCH_CELLS - 1)
     focus = np.exp(-0.5 * (down**2 + right**2) / _FOCUS_CELLS**2)

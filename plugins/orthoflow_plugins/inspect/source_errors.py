@@ -1,4 +1,4 @@
-"""The true error of painted cells: where the photo's pixel that coloured them really looks."""
+"""True errors of painted cells, from the true target of the pixel that coloured them."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _FAR_CELLS: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SourceErrors:
-    """Where the colours of a wall's painted cells come from.
+    """The true sources of the colours of a wall's painted cells.
 
     Attributes:
         frame: where the cells lie.
-        displacement_m: (rows, cols, 2) along u and v, cell - place that its colour is of; NaN
-            where no oriented photo painted or its pixel looks at nothing.
+        displacement_m: (rows, cols, 2) along u and v, cell - true target of its pixel; NaN where no
+            oriented photo painted or the pixel has no target.
         traced: (rows, cols) bool, cells that an oriented photo painted.
-        expected_m: (rows, cols) the error that the orthoimage states; None where it states none.
+        expected_m: (rows, cols) stated error of the orthoimage; None if it states none.
         steps: (rows, cols) bool, within 2 cells of a true depth step.
-        ghosts: (rows, cols) bool, the pixel looks at a free-standing object.
-        n_seen_by_both: cells of those of which is asked who sees them, whose true surface a
-            station and a photo see.
+        ghosts: (rows, cols) bool, the pixel shows a free-standing object.
+        n_seen_by_both: of the cells whose visibility is tested, those whose true surface a station
+            and a photo see.
         n_seen_painted: those of them that are painted.
     """
 
@@ -51,7 +51,7 @@ class SourceErrors:
     expected_m: NDArray[np.float32] | None = None
 
     def kept(self, name: str, allocate: Allocate) -> SourceErrors:
-        """The same with its arrays in files."""
+        """Return the same with its arrays in files."""
         return replace(
             self,
             displacement_m=in_file(self.displacement_m, f"{name}.displacement_m", allocate),
@@ -70,23 +70,23 @@ def trace_sources(
     truth: Truth,
     views: SceneCameras,
 ) -> SourceErrors:
-    """Trace every cell that a photo painted back to what its pixel really shows.
+    """Trace every cell that a photo painted back to the true target of its pixel.
 
-    The cell's point on the found surface is projected through the estimated camera, as painting
-    did; the pixel's ray through the true camera meets the true scene somewhere, and that place in
-    the wall is compared with the cell's own.
+    The cell's point on the found surface is projected with the estimated camera, as in painting;
+    the pixel's ray through the true camera meets the true scene, and that place on the wall is
+    compared with the cell's own.
 
     Args:
         image: the orthoimage.
-        wall: the wall it is of.
+        wall: its wall.
         true: its truth.
-        lattice: (rows, cols) cells of which is asked who sees them.
+        lattice: (rows, cols) cells whose visibility is tested.
         cameras: the estimated ones.
         truth: the simulated room.
-        views: its scene, for many rays.
+        views: its scene, prepared for many rays.
 
     Raises:
-        MethodError: a photo is none of the simulated ones.
+        MethodError: a photo is not one of the simulated ones.
     """
     known = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
     displacement = np.full((*image.frame.shape, 2), np.nan)
@@ -124,15 +124,15 @@ def trace_sources(
 def source_findings(
     errors: Sequence[SourceErrors], wall: int, allocate: Allocate = in_memory
 ) -> list[Finding]:
-    """Sum up one wall, or several together (wall -1); nothing when no photo painted anything.
+    """Compute statistics of one wall, or of several (wall -1); none without photos.
 
     Displacements are of all painted cells that show no free-standing object; those within 2 cells
-    of true depth steps are apart.
+    of true depth steps are separate.
 
     Args:
         errors: of walls, or of parts of them.
-        wall: of the findings.
-        allocate: gives arrays for the displacements of many cells, by name.
+        wall: index in the findings.
+        allocate: returns arrays for the displacements of many cells, by name.
     """
     errors = [item for item in errors if item.traced.any()]
     if not errors:
@@ -168,7 +168,7 @@ def source_findings(
 
 
 def _shares_within(errors: Sequence[SourceErrors]) -> list[tuple[str, float, str]]:
-    """Shares of coordinates whose error is within once and twice what the orthoimage states."""
+    """Return shares of coordinates with errors within once and twice the stated one."""
     counts = np.zeros(3)
     for item in errors:
         if item.expected_m is None:
@@ -186,7 +186,7 @@ def _shares_within(errors: Sequence[SourceErrors]) -> list[tuple[str, float, str
 
 
 def counted_once(bands: Sequence[SourceErrors]) -> tuple[SourceErrors, ...]:
-    """Let a band that photos painted count for all bands of its wall; none where none is."""
+    """Return the bands that photos painted as representative of their wall; none without any."""
     traced = [bool(item.traced.any()) for item in bands]
     if not any(traced):
         return ()
@@ -206,7 +206,7 @@ def counted_once(bands: Sequence[SourceErrors]) -> tuple[SourceErrors, ...]:
 def _gathered(
     errors: Sequence[SourceErrors], allocate: Allocate, *, at_steps: bool
 ) -> NDArray[np.float64]:
-    """Displacements (n, 2) of cells at true depth steps, or away from them."""
+    """Return displacements (n, 2) of cells at true depth steps, or away from them."""
 
     def of(item: SourceErrors) -> NDArray[np.float64]:
         return _of(item, item.traced & (item.steps if at_steps else ~item.steps))
@@ -223,14 +223,14 @@ def _gathered(
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
-    """The frame seen from the scene's origin: survey coordinates would cost digits."""
+    """Return the frame relative to the scene's origin: survey coordinates would lose digits."""
     return replace(frame, origin_world=frame.origin_world - truth.scene.origin)
 
 
 def _seen_by_photos(
     true: TrueOrthoimage, asked: NDArray[np.bool_], truth: Truth, views: SceneCameras
 ) -> NDArray[np.bool_]:
-    """Those of the asked cells whose true surface some photo sees, oriented or not."""
+    """Return those of the tested cells whose true surface some photo sees, oriented or not."""
     rows, columns = np.nonzero(asked)
     places = np.column_stack([columns + 0.5, rows + 0.5])
     depths = true.depth_m[rows, columns].astype(np.float64)
@@ -245,13 +245,13 @@ def _seen_by_photos(
 
 
 def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Displacements (n, 2) of the chosen cells, without ghosts and pixels that show nothing."""
+    """Return displacements (n, 2) of the chosen cells, without ghosts and pixels without target."""
     values = errors.displacement_m[chosen & ~errors.ghosts]
     return values[np.isfinite(values).all(axis=1)]
 
 
 def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:
-    """Cells whose colour is of a place more than 3 cells away, or of nothing."""
+    """Report cells whose colour comes from more than 3 cells away, or from nothing."""
     length = np.linalg.norm(errors.displacement_m, axis=2)
     far: NDArray[np.bool_] = errors.traced & ~(length <= _FAR_CELLS * errors.frame.gsd_m)
     return far

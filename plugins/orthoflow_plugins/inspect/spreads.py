@@ -1,4 +1,4 @@
-"""What many values add up to: exact medians and percentiles of more than fit into memory."""
+"""Statistics of many values: exact medians and percentiles of more than fit into memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
 
-# More values lie in files and are looked at so many at once.
+# Larger arrays are kept in files and processed this many values at once.
 _AT_ONCE: Final = 1 << 22
 _DIGIT_BITS: Final = 16
 _SIGN: Final = np.uint64(1 << 63)
@@ -23,11 +23,11 @@ _Value = TypeVar("_Value", bound=np.generic)
 
 @dataclass(frozen=True)
 class Spread:
-    """Values, times a factor, of which numbers are told.
+    """Values, times a factor, whose statistics are computed.
 
     Attributes:
-        values: (n,) float64, at least one, none NaN; of many the array may lie in a file.
-        factor: what each is multiplied by.
+        values: (n,) float64, at least one, none NaN; a large array may be in a file.
+        factor: multiplier of each value.
     """
 
     values: NDArray[np.float64]
@@ -35,7 +35,7 @@ class Spread:
 
     @property
     def is_large(self) -> bool:
-        """Whether the values are looked at part by part."""
+        """Whether the values are processed in parts."""
         return len(self.values) > _AT_ONCE
 
     def rms(self) -> float:
@@ -53,13 +53,13 @@ class Spread:
         return self._percentile(50.0, None)
 
     def median_deviation(self, middle: float | None = None) -> float:
-        """Standard deviation told from the median distance to a middle, the median unless given."""
+        """Standard deviation from the median distance to a middle, the median unless given."""
         if not self.is_large:
             return median_deviation(self._whole(), middle)
         return NMAD_FACTOR * self._percentile(50.0, self.median() if middle is None else middle)
 
     def percentile_of_size(self, percent: float) -> float:
-        """Percentile of the absolute values, linear between two of them."""
+        """Return the percentile of the absolute values, interpolated linearly."""
         if not self.is_large:
             return float(np.percentile(np.abs(self._whole()), percent))
         return self._percentile(percent, 0.0)
@@ -76,7 +76,7 @@ class Spread:
             yield self.factor * self.values[first : first + _AT_ONCE]
 
     def _percentile(self, percent: float, middle: float | None) -> float:
-        """Percentile of the values, or of their distances to a middle."""
+        """Return the percentile of the values, or of their distances to a middle."""
         place = (self._count - 1) * (percent / 100.0)
         lower = math.floor(place)
         low = self._at_rank(lower, middle)
@@ -85,13 +85,13 @@ class Spread:
         return low + (place - lower) * (self._at_rank(lower + 1, middle) - low)
 
     def _at_rank(self, rank: int, middle: float | None) -> float:
-        """The value before which so many come in order: its bits are found from the highest on."""
+        """Return the value at a rank: its bits are found from the highest on."""
         found, n_before = 0, 0
         for shift in range(64 - _DIGIT_BITS, -1, -_DIGIT_BITS):
             counts = np.zeros(1 << _DIGIT_BITS, dtype=np.int64)
             for part in self._parts():
                 keys = _keys(part if middle is None else np.abs(part - middle))
-                # Those that begin with the bits found so far, all at first.
+                # Those that begin with the bits found so far, initially all.
                 known = shift + _DIGIT_BITS
                 alike = (
                     keys if known == 64 else keys[(keys >> np.uint64(known)) == np.uint64(found)]
@@ -108,13 +108,13 @@ class Spread:
 
 
 def in_file(values: NDArray[_Value], name: str, allocate: Allocate) -> NDArray[_Value]:
-    """Return a copy of an array that lies where `allocate` says."""
+    """Return a copy of an array in the memory that `allocate` returns."""
     kept: NDArray[_Value] = np.asarray(allocate(name, values.shape, values.dtype), values.dtype)
     kept[...] = values
     return kept
 
 
 def _keys(values: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Whole numbers that are ordered as the values are."""
+    """Return integers that sort like the values."""
     bits = np.ascontiguousarray(values).view(np.uint64)
     return np.where(bits & _SIGN, ~bits, bits | _SIGN)

@@ -47,8 +47,8 @@ from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pai
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage, IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
-# The intensity is laid so far aside to see how exactly the comparison measures that; some hundred
-# pairs say so.
+# Shift of the intensity against itself, which shows the accuracy of the comparison; some hundred
+# pairs suffice.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
@@ -60,18 +60,18 @@ UNFIT: Final = DiagnosticSpec(
 
 
 class InspectSurf(Method):
-    """Measure how far an orthoimage lies off the laser's intensity of the same wall.
+    """Measure displacements of an orthoimage from the laser's intensity of the same wall.
 
     The inspection of markiewicz2015: SURF key points of both images are paired, and the distances
-    of pairs are the error (Table 2), drawn as a map (Figure 25). Both images lie on one grid, so a
-    pair is looked for within a radius only; each pair is then refined by least squares, because
-    SURF alone is good to a cell, no better than what it should measure. The intensity compared
-    with itself, laid half a cell aside, says how exact the comparison is at best: its floor. `x`
-    is along u, to the right, `y` along v, down; displacements are shown - true. Metrics of the
+    of pairs are the error (Table 2), drawn as a map (Figure 25). Both images have one grid, so a
+    pair is searched within a radius only; each pair is then refined by least squares, because SURF
+    alone is accurate to a cell, no better than what it should measure. The intensity compared with
+    itself, shifted by half a cell, gives the best possible accuracy of the comparison: its floor.
+    `x` is along u, to the right, `y` along v, down; displacements are shown - true. Metrics of the
     first wall have no prefix, `all_` is of all walls; `surf_` are of the pairs before refinement.
 
-    What stands in for a missing intensity is the grey of colours, and when these come from the
-    same photos the comparison says nothing: then it is refused, or told with a warning.
+    If the intensity is missing, the grey of colours is used; if these come from the same photos,
+    the comparison is meaningless: then it is refused, or reported with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"
@@ -108,7 +108,7 @@ class InspectSurf(Method):
     )
 
     class Params(MethodParams):
-        """How far is looked, and what happens where the comparison says nothing."""
+        """The radius of the search, and what happens if the comparison is meaningless."""
 
         radius_cells: float = Field(
             40.0,
@@ -123,7 +123,7 @@ class InspectSurf(Method):
         )
 
     class In(Ports):
-        """The orthoimages, the walls they are of, and the cameras that tell of stretches."""
+        """The orthoimages, their walls, and the cameras for stretches."""
 
         orthoimages: Orthoimages
         walls: Walls
@@ -135,7 +135,7 @@ class InspectSurf(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare wall by wall, and put all walls together."""
+        """Compare wall by wall, then combine all walls."""
         images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
@@ -179,7 +179,7 @@ class _Verdict:
     quality: tuple[Finding, ...] = ()
 
     def findings(self) -> list[Finding]:
-        """The wall's numbers."""
+        """Return the wall's metrics."""
         wall = self.image.wall
         gsd_m = self.image.frame.gsd_m
         counts = [
@@ -208,7 +208,7 @@ class _Verdict:
 
 
 def _unfit(inputs: InspectSurf.In) -> str | None:
-    """Why the walls hold nothing to compare with, or None."""
+    """Return why the walls cannot be compared with, or None."""
     if inputs.walls.intensity_source == "laser":
         return None
     if inputs.walls.intensity_source == "luminance":
@@ -221,14 +221,14 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """How walls are compared: their cameras, the radius in cells, and so many threads."""
+    """How walls are compared: their cameras, the radius in cells, and the number of threads."""
 
     cameras: Cameras | None
     radius: float
     threads: int
 
     def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
-        """Return the pairs of a wall; nothing more where they are too few to say anything."""
+        """Return the pairs of a wall; nothing more if they are too few."""
         if wall.intensity is None:
             raise MethodError(f"{wall.name} has no intensity to compare with")
         if not n_shown(image):
@@ -248,13 +248,14 @@ class _Comparison:
         return find_key_pairs(shown, reference, radius_cells=self.radius, threads=self.threads)
 
     def _floor(self, intensity: GreyImage) -> KeyPairs:
-        """Pairs of the intensity with itself laid aside, their errors as displacements."""
+        """Return pairs of the intensity with itself shifted, their errors as displacements."""
         import cv2
 
         right, down = _FLOOR_SHIFT_CELLS
         rows, columns = intensity.grey.shape
         move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-        # Averaging two of four cells would smooth one image only; cubic keeps most of the detail.
+        # The mean of two of four cells would smooth one image only; cubic interpolation keeps most
+        # of the detail.
         grey = cv2.warpAffine(
             intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
         )

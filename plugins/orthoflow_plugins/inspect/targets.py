@@ -22,20 +22,21 @@ _LEAST_WEIGHT: Final = 0.2
 def find_crossing(
     picture: GreyCells, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
 ) -> NDArray[np.float64] | None:
-    """Find the centre of a target near a place.
+    """Find the centre of a target near a position.
 
-    The crossing is a saddle of the smoothed picture, found to a cell where the Hessian's
-    determinant is lowest. Least squares then move it until the picture, turned by half about it, is
-    itself: every part of the four edges counts, and their direction does not matter.
+    The crossing is a saddle of the smoothed picture, found to a cell where the determinant of the
+    Hessian is lowest. Least squares then move it until the picture, rotated by half a turn about
+    it, equals itself: every part of the four edges contributes, and their direction does not
+    matter.
 
     Args:
-        picture: grey, with cells that count.
+        picture: grey, with valid cells.
         near: (2,) column, row.
-        search_cells: how far from there is looked.
-        radius_cells: of the target, or of as much of it as shall count.
+        search_cells: radius of the search.
+        radius_cells: radius of the target, or of the part of it to use.
 
     Returns:
-        (2,) float64 column, row where the quadrants meet, or None where nothing looks like that.
+        (2,) float64 column, row where the quadrants meet, or None without a target.
     """
     margin = int(np.ceil(search_cells + radius_cells)) + 3
     corner = np.floor(near).astype(np.int64) - margin
@@ -52,16 +53,16 @@ def find_crossing(
 
 
 def _window(picture: GreyCells, corner: NDArray[np.int64], side: int) -> GreyImage:
-    """A square part, not valid beyond the border, its voids closed from around them."""
+    """Square part, not valid beyond the border, with voids filled from their surroundings."""
     part = picture.square(corner, side)
     return _closed(np.where(part.valid, part.grey, 0.0), part.valid)
 
 
 def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
-    """Smooth a picture by planes fitted about each cell to the valid ones.
+    """Smooth a picture by planes fitted around each cell to the valid ones.
 
-    Means alone would lean towards the side of an edge that has fewer holes (Knutsson and Westin
-    1993, normalised convolution of first order).
+    Means alone would be biased towards the side of an edge that has fewer holes (Knutsson and
+    Westin 1993, normalised convolution of first order).
     """
     from scipy.ndimage import correlate1d
 
@@ -82,7 +83,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
     right_side = np.stack([moment(weight * grey, *order) for order in orders], axis=-1)
     total = normal[..., 0, 0]
     enough = total > _LEAST_WEIGHT * gauss.sum() ** 2
-    # A little of the identity keeps cells apart from all others solvable.
+    # A little of the identity keeps cells far from all others solvable.
     normal += 1e-6 * np.eye(3)
     level = np.linalg.solve(normal, right_side[..., None])[..., 0, 0]
     return GreyImage(grey=np.where(enough, level, 0.0), valid=enough, region=valid)
@@ -91,7 +92,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
 def _saddle(
     window: GreyImage, near: NDArray[np.float64], search: float, radius: float
 ) -> NDArray[np.float64] | None:
-    """The strongest saddle (2,) = column, row within the search, to a cell."""
+    """Return the strongest saddle (2,) = column, row within the search, to a cell."""
     from scipy.ndimage import gaussian_filter
 
     width = max(1.5, 0.3 * radius)
@@ -112,7 +113,7 @@ def _saddle(
 def _symmetric(
     window: GreyImage, start: NDArray[np.float64], radius: float
 ) -> NDArray[np.float64] | None:
-    """Move the centre until half a turn about it changes least; None if it runs away."""
+    """Move the centre until half a turn about it changes least; None if it diverges."""
     from scipy.ndimage import map_coordinates
 
     aside = _disc(radius)
@@ -161,7 +162,7 @@ def _turned_correlation(
 
 
 def _disc(radius: float) -> NDArray[np.float64]:
-    """Offsets (n, 2) of half of a disc would do; the whole weighs both halves alike."""
+    """Return offsets (n, 2) of a disc; half of it would do, but the whole has symmetric weights."""
     side = np.arange(-np.floor(radius), np.floor(radius) + 1.0)
     columns, rows = np.meshgrid(side, side)
     inside = np.hypot(columns, rows) <= radius

@@ -85,9 +85,9 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
-# Larger walls are compared in bands of so many cells, which take a gigabyte.
+# Larger walls are compared in bands of this many cells, which take a gigabyte.
 _BAND_CELLS: Final = 1 << 23
-# Of large walls every so manyth cell is drawn, so that there are so many along the longest side.
+# Number of drawn cells along the longest side of large walls, of which every nth cell is drawn.
 _DRAWN_CELLS: Final = 1800
 # Of each wall, from its cells and from what photos painted on it.
 _OF_WALLS: Final = (
@@ -164,7 +164,7 @@ _OF_WALLS: Final = (
         label="cells whose error is within twice what the orthoimage states",
     ),
 )
-# Of planes, also where there are no orthoimages.
+# Of planes, also without orthoimages.
 _OF_PLANES: Final = (
     MetricSpec(
         "plane_angle_deg", label="direction of the main plane, error", better="lower", headline=True
@@ -191,7 +191,7 @@ NOT_TRACED: Final = DiagnosticSpec(
 
 
 def _needing(ports: tuple[str, ...], *specs: MetricSpec) -> tuple[MetricSpec, ...]:
-    """Return metrics as ones that are reported only where these ports are wired."""
+    """Return metrics that are reported only if these ports are wired."""
     return tuple(replace(spec, needs=ports) for spec in specs)
 
 
@@ -199,22 +199,23 @@ class InspectTruth(Method):
     """Compare with the truth of a simulated scene, cell by cell and patch by patch.
 
     The true orthoimage is rendered on each wall's own frame: the first surface within the buffer,
-    seen square to the wall. Depths and colours are compared away from true depth steps; a band of
-    2 cells at the steps is reported apart. Displacements come from patches of 32 x 32 painted
-    cells, matched to the truth by least squares. Metrics without prefix are of the first wall;
-    those with `all_` are of all walls together. Of large walls, colours and patches are compared
-    in whole blocks of 96 x 96 cells, and who sees a cell is asked on a lattice, both spread evenly;
-    depths, and displacements told from cameras, are compared in every cell.
+    seen perpendicularly to the wall. Depths and colours are compared away from true depth steps; a
+    band of 2 cells at the steps is reported separately. Displacements come from patches of 32 x 32
+    painted cells, matched to the truth by least squares. Metrics without prefix are of the first
+    wall; those with `all_` are of all walls together. On large walls, colours and patches are
+    compared in whole blocks of 96 x 96 cells, and visibility is tested on a lattice, both spread
+    evenly; depths, and displacements derived from cameras, are compared in every cell.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
-    every cell that a photo painted is told exactly: its point on the found surface is projected
-    through the estimated camera, and the ray of that pixel through the true camera meets the true
-    scene at the place that the colour is of. The displacements of patches are then named `patch_`.
-    Ties that come with the cameras are compared, too: `tie_wrong_share` of those that photos kept,
-    `match_wrong_share` of all, are more than 1.5 cells of the wall from where their pixel looks;
-    `match_wrong_share_own_wall` is that of the matches with the wall that each photo shows most.
+    every cell that a photo painted is exact: its point on the found surface is projected with the
+    estimated camera, and the ray of that pixel through the true camera meets the true scene at the
+    place from which the colour comes. The displacements of patches are then named `patch_`. Ties
+    that come with the cameras are compared, too: `tie_wrong_share` of those that photos kept,
+    `match_wrong_share` of all, are more than 1.5 cells of the wall from the true target of their
+    pixel; `match_wrong_share_own_wall` is that of the matches with the wall that each photo shows
+    most.
 
-    Without orthoimages only planes and labels are compared, as for a comparison of detectors.
+    Without orthoimages only planes and labels are compared, as in a comparison of detectors.
     """
 
     id: ClassVar[str] = "inspect.truth"
@@ -341,7 +342,7 @@ class InspectTruth(Method):
     )
 
     class Params(MethodParams):
-        """How finely the truth is rendered, and how much of it."""
+        """How finely, and how much of, the truth is rendered."""
 
         supersample: int = Field(
             3, ge=1, le=8, description="True colours are means of so many rays squared per cell."
@@ -359,7 +360,7 @@ class InspectTruth(Method):
         )
 
     class In(Ports):
-        """What to judge, and the truth."""
+        """The products to judge, and the truth."""
 
         truth: Truth
         orthoimages: Orthoimages | None = None
@@ -440,8 +441,8 @@ class _Verdict:
         depth_m: measured - true depth of every `step`th row and column, for the picture.
         grey: root mean square colour error, likewise.
         step: see `depth_m`; 1 unless the wall is large.
-        sources: of bands of the wall, from the top; none where no photo painted.
-        quality: what is told of every orthoimage.
+        sources: of bands of the wall, from the top; empty if no photo painted.
+        quality: metrics that every orthoimage has.
     """
 
     samples: WallSamples
@@ -453,7 +454,7 @@ class _Verdict:
     quality: tuple[Finding, ...]
 
     def findings(self, wall: int, ctx: StepContext) -> list[Finding]:
-        """The wall's numbers."""
+        """Return the wall's metrics."""
         is_traced = bool(self.sources)
         numbers = sample_findings(self.samples, wall, sources_are_traced=is_traced)
         numbers += self.quality
@@ -474,7 +475,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 
 
 def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:
-    """State which cells are not traced to their pixels, though cameras are wired."""
+    """Report which cells are not traced to their pixels although cameras are wired."""
     if cameras is None:
         return
     known = {camera.photo for camera in cameras.cameras if camera.status == "ok"}
@@ -500,7 +501,7 @@ def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[P
 
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
-    """What walls are judged by; `views` is None without cameras."""
+    """What walls are judged with; `views` is None without cameras."""
 
     inputs: InspectTruth.In
     walls: Walls
@@ -510,7 +511,7 @@ class _Judge:
     ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall, a large one in bands of whole blocks with a block about them."""
+        """Compare one wall, a large one in bands of whole blocks with a margin of one block."""
         inputs = self.inputs
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
         step = max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
@@ -532,7 +533,7 @@ class _Judge:
                     inputs.truth,
                     self.views,
                 )
-                # Steps at the rim of a band are told from what is beyond it.
+                # Steps at the edge of a band depend on what is beyond it.
                 traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
                 name = f"{image.wall}.{band.rows.start}"
                 sources.append(traced.kept(name, self._files) if _is_large(image) else traced)
@@ -548,7 +549,7 @@ class _Judge:
         )
 
     def _kept(self, errors: WallErrors, image: Orthoimage, band: Band, step: int) -> WallErrors:
-        """What is kept of a band: places in the wall, every so manyth cell to draw, and files."""
+        """What is kept of a band: positions in the wall, every nth cell to draw, and files."""
         first = -band.rows.start % step
         patches, samples = errors.patches, errors.samples
         above = np.array([0.0, band.rows.start])
@@ -633,7 +634,7 @@ def _inspection(
     findings: list[Finding],
     details: dict[str, JsonValue],
 ) -> Inspection:
-    """Put together the displacements of all patches and of a few thousand painted cells."""
+    """Combine the displacements of all patches and of a few thousand painted cells."""
     walls, points, shifts, kinds = [], [], [], []
     for image, item in zip(orthoimages.images, verdicts, strict=True):
         places, shift = item.patches.centre, item.samples.shift_m
@@ -661,7 +662,7 @@ def _inspection(
 
 
 def _by_first_row(sources: Sequence[SourceErrors]) -> Iterator[tuple[int, SourceErrors]]:
-    """Bands of a wall, each with the number of the wall's rows above it."""
+    """Yield bands of a wall, each with the number of the wall's rows above it."""
     first = 0
     for item in sources:
         yield first, item
@@ -671,7 +672,7 @@ def _by_first_row(sources: Sequence[SourceErrors]) -> Iterator[tuple[int, Source
 def _traced_cells(
     sources: Sequence[SourceErrors],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Every so manyth traced cell (n, 2) = (row, column) of a wall, and its displacement."""
+    """Return every nth traced cell (n, 2) = (row, column) of a wall, and its displacement."""
     known = [np.isfinite(item.displacement_m).all(axis=2) for item in sources]
     counts = [int(np.count_nonzero(mask)) for mask in known]
     step, n_before = max(1, sum(counts) // _TRACED_POINTS), 0
@@ -689,7 +690,7 @@ def _is_large(image: Orthoimage) -> bool:
 
 
 def _bands(image: Orthoimage) -> Iterator[Band]:
-    """Bands of whole blocks with a block about them; of an image that is not large, one."""
+    """Bands of whole blocks with a margin of one block; a single one unless the image is large."""
     height, width = image.frame.shape
     rows = height
     if _is_large(image):

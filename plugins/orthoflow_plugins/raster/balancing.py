@@ -1,10 +1,10 @@
-"""Intensities of several scans brought to one scale, told from where the scans overlap.
+"""Intensities of several scans brought to one scale, from where the scans overlap.
 
-What a scanner calls intensity falls with range and incidence, and each scan may have a scale of its
-own. At a place that two scans show, the surface is the same: the ratio of their intensities tells
-the three apart, whatever the texture is. On a single wall range and incidence go together (cosine
-times range is how far the station is from the plane), so that only their joint effect is known,
-which is all that this wall needs.
+The intensity of a scanner falls with range and incidence, and each scan may have a scale of its
+own. At a place shown by two scans the surface is the same: the ratio of their intensities separates
+the three effects, whatever the texture is. On a single wall range and incidence are coupled (cosine
+times range is the distance of the station from the plane), so that only their joint effect is
+known, which is all that this wall needs.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
-# Places are squares of this side: many points of each scan, and still one colour mostly.
+# Places are squares of this side: many points of each scan, and mostly a single colour.
 _PLACE_M: Final = 0.05
 _POINTS_MOST: Final = 2_000_000
 _PLACES_LEAST: Final = 20
 _COSINE_LEAST: Final = 0.05
-# At this range and square on, the first scan keeps its intensities.
+# At this range and perpendicular incidence, the first scan keeps its intensities.
 _RANGE_M: Final = 3.0
 _DARKEST: Final = 1.0e-4
-# Rounds of weights by the L1 norm, and where a residual of log intensity stops to gain weight.
+# Iterations of weights for the L1 norm, and the residual of log intensity with the largest weight.
 _ROUNDS: Final = 20
 _FLOOR: Final = 0.01
 _CHUNK: Final = 1 << 21
@@ -54,10 +54,10 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with intensities as if all scans had been taken alike.
+    """Return the cloud with intensities as if all scans had been taken under equal conditions.
 
-    Points on a wall are corrected by the incidence on it, all others are left as they are. Where
-    no two scans overlap the cloud stays as it is, and that is said.
+    Points on a wall are corrected by the incidence on it, all others are unchanged. Without overlap
+    between scans the cloud is unchanged, which is reported.
     """
     if cloud.intensity is None or cloud.scan is None or cloud.stations is None:
         ctx.report(NOT_BALANCED, reason="balancing takes scans with known stations")
@@ -88,7 +88,7 @@ def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointClo
 
 @dataclass(frozen=True)
 class _Looks:
-    """How scans saw the points in a slab; all (n,)."""
+    """The scan geometry of the points in a slab; all (n,)."""
 
     points: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -120,11 +120,11 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
 
 
 def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
-    """Rows of differences between two scans at one place.
+    """Return differences between two scans at one place, as rows.
 
     Returns:
-        (n, 5): scan, other scan, and by how much the means of log intensity, log range and log
-        cosine of the first are larger.
+        (n, 5): scan, other scan, and the differences (first minus second) of the means of log
+        intensity, log range and log cosine.
     """
     if cloud.intensity is None:
         raise AssertionError("balancing was asked of a cloud without intensity")
@@ -139,14 +139,14 @@ def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
         np.log(looks.cosine),
     )
     means = np.column_stack([np.bincount(members, values) / counts for values in logs])
-    # Scans of one place stand beside each other in the order of the keys.
+    # Scans of one place are adjacent in the order of the keys.
     pairs = np.flatnonzero(keys[1:] // n_scans == keys[:-1] // n_scans)
     scans = np.column_stack([keys[pairs] % n_scans, keys[pairs + 1] % n_scans])
     return np.column_stack([scans, means[pairs] - means[pairs + 1]])
 
 
 def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
-    """Fit the differences by the L1 norm, which edges of the texture do not pull far."""
+    """Fit the differences by the L1 norm, which is robust to edges of the texture."""
     if len(table) < _PLACES_LEAST:
         return None
     first, second = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -155,7 +155,7 @@ def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
     design[rows, first] += 1.0
     design[rows, second] -= 1.0
     design[:, n_scans:] = table[:, 3:]
-    # The first scan is the scale of all, and a scan that overlaps none keeps its own.
+    # The first scan defines the scale, and a scan without overlap keeps its own.
     held = 1e-3 * np.eye(n_scans + 2)
     held[0, 0] = 1e3
     wanted, weights = table[:, 2], np.ones(len(table))

@@ -1,4 +1,4 @@
-"""The part of a wall that is wanted: a rectangle or a polygon, in metres on its raster."""
+"""The requested part of a wall: a rectangle or a polygon, in metres on its raster."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class CroppedFrame:
 
     Attributes:
         frame: the grid; its cells are some of the whole wall's.
-        outline_px: (n, 2) corners of a polygon as (column, row) of the grid, beyond which nothing
-            is wanted; None where the whole grid is.
+        outline_px: (n, 2) corners of a polygon as (column, row) of the grid, outside of which cells
+            are void; None for the whole grid.
     """
 
     frame: WallFrame
@@ -40,7 +40,7 @@ def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
 
 
 def area_m2(crop: Rectangle | Polygon) -> float:
-    """Area of a crop; 0 where its corners span none."""
+    """Return the area of a crop; 0 if its corners span none."""
     corners = outline_m(crop)
     if len(corners) < 3:
         return 0.0
@@ -48,12 +48,12 @@ def area_m2(crop: Rectangle | Polygon) -> float:
 
 
 def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> CroppedFrame | None:
-    """Cut whole columns and rows off a grid that a crop does not touch; None when it touches none.
+    """Remove whole columns and rows outside a crop from a grid; None if the crop misses it.
 
-    The cells that stay are where they were, so that rasters of two crops fit onto each other.
+    The remaining cells are unchanged, so that rasters of two crops fit onto each other.
     """
     outline_px = outline_m(crop) / frame.gsd_m
-    # A millionth of a cell of slack, as `frame_over` has it.
+    # A tolerance of a millionth of a cell, as in `frame_over`.
     first = np.floor(outline_px.min(axis=0) + 1e-6).clip(0, None).astype(np.int64)
     last = np.ceil(outline_px.max(axis=0) - 1e-6).astype(np.int64)
     width, height = np.minimum(last, [frame.width, frame.height]) - first
@@ -71,7 +71,7 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> CroppedFrame | None:
 
 
 def blank_outside(wall: Wall, outline_px: NDArray[np.float64]) -> None:
-    """Make the cells of a wall void whose centres lie outside a polygon of its grid."""
+    """Make the cells of a wall void whose centres are outside a polygon of its grid."""
     for rows in row_bands(wall.mask.shape):
         outside = ~_inside(outline_px, rows, wall.frame.width)
         wall.mask[rows][outside] = SurfaceMask.VOID
@@ -85,7 +85,7 @@ def blank_outside(wall: Wall, outline_px: NDArray[np.float64]) -> None:
 
 
 def _inside(outline_px: NDArray[np.float64], rows: slice, width: int) -> NDArray[np.bool_]:
-    """Which cells (rows, width) have their centre in a polygon (even-odd rule)."""
+    """Report which cells (rows, width) have their centre in a polygon (even-odd rule)."""
     columns = np.arange(width) + 0.5
     centres = np.arange(rows.start, rows.stop)[:, None] + 0.5
     inside = np.zeros((rows.stop - rows.start, width), dtype=np.bool_)

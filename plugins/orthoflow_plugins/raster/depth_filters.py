@@ -1,4 +1,4 @@
-"""What is taken out of a raster of depths: cells that only outliers measured, and noise."""
+"""Filters of a raster of depths: cells that only outliers measured, and noise."""
 
 from __future__ import annotations
 
@@ -13,45 +13,45 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.threads import in_parts
 
-# Cells within so many rows and columns are around.
+# Neighbours are within this many rows and columns.
 _NEAR_CELLS: Final = 2
-# Fewer of them known say nothing, fewer of the known ones in agreement make a speck.
+# With fewer known neighbours nothing is decided; with fewer that agree a cell is a speck.
 _KNOWN_LEAST: Final = 6
 _AGREEING_LEAST: Final = 2
-# Where cells are sparse more of them are asked, and more must agree: at least half of the known.
+# Where cells are sparse more neighbours are used, and more must agree: at least half of the known.
 _SPARSE_CELLS: Final = 4
 _SPARSE_LEAST: Final = 3
 # Steepest surface whose sparse cells agree: 27 degrees.
 _SLOPE: Final = 0.5
-# A cell is sparse where less than this share of the cells is known as somewhere around is.
+# A cell is sparse if the share of known cells is below this fraction of the maximum nearby.
 _SPARSE_SHARE: Final = 0.35
 # The shadow of an edge is narrower than twice this reach, in cells.
 _AROUND_CELLS: Final = 16
 # Cells on one surface differ by noise, in standard deviations, and by its slope.
 _CLOSE_SIGMAS: Final = 4.0
-# The first look takes most of the noise; the second, at what is left of it, may look closer at
-# steps. In standard deviations of the noise of a cell.
+# The first pass removes most of the noise; the second, on what remains, can be stricter at steps.
+# In standard deviations of the noise of a cell.
 _REACHES: Final = (3.0, 1.5)
-# Void weighs nothing: it lies so many reaches below everything.
+# Void cells have no weight: they are this many reaches below everything.
 _VOID_REACHES: Final = 8.0
-# Depths nearer to each other than this are not worth a filter: a tenth of a cell at 1 mm.
+# Smaller differences of depth need no filter: a tenth of a cell at 1 mm.
 _NOISE_LEAST_M: Final = 2.0e-5
 
 
 def without_specks(
     depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
 ) -> NDArray[np.float32]:
-    """Leave void what only an outlier measured: a cell that hardly any of those around agrees with.
+    """Make void what only an outlier measured: cells with which hardly any neighbour agrees.
 
-    A photo would paint it with a place far off. Where an edge casts its shadow on the scan, and
-    cells are sparse that are dense beside it, what is there are outliers and distances mixed of
-    both sides of the edge: most of the few cells around must agree, but for a slope.
+    A photo would paint such a cell with a distant place. In the shadow of an edge in the scan,
+    where cells are sparse that are dense beside it, there are outliers and mixed distances of both
+    sides of the edge: there most of the few neighbours must agree, allowing for a slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
         gsd_m: side of a cell.
         layer_m: depths that differ by more are of different layers.
-        threads: how many threads work.
+        threads: number of threads.
     """
     noise_m = min(layer_m, _CLOSE_SIGMAS * depth_noise_m(depth_m))
     rule = _SpeckRule(layer_m=layer_m, noise_m=noise_m, gsd_m=gsd_m)
@@ -62,7 +62,7 @@ def without_specks(
 
 
 def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Known cells with far fewer known ones near them than there are near cells around."""
+    """Report known cells with far fewer known neighbours than there are nearby."""
     import cv2
 
     near = 2 * _NEAR_CELLS + 1
@@ -82,12 +82,13 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.float32]:
     """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
 
-    How near in depth a neighbour must be follows from the noise that the raster shows, so that
-    steps of more than about six standard deviations stay as they are, to the cell.
+    The permitted difference of depth follows from the noise of the raster, so that steps of more
+    than about six standard deviations are preserved, to the cell.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
-        radius_cells: neighbours at most so far away count, half of it by the weight of a Gauss.
+        radius_cells: maximum distance of neighbours; half of it is the sigma of the Gaussian
+            weight.
 
     Returns:
         (rows, cols) metres, NaN where it was.
@@ -120,8 +121,8 @@ class _SpeckRule(NamedTuple):
     """Which depths agree.
 
     Attributes:
-        layer_m: those that differ by no more.
-        noise_m: of sparse cells, those that differ by no more, but for the slope of a surface.
+        layer_m: maximum difference.
+        noise_m: maximum difference for sparse cells, apart from the slope of a surface.
         gsd_m: side of a cell.
     """
 
@@ -145,9 +146,9 @@ def _find_specks(
         depth_m: (rows, cols) metres, NaN where void.
         is_sparse: (rows, cols) cells in gaps of an otherwise well known surface.
         rule: which depths agree.
-        is_speck: (rows, cols), made true for known cells of which fewer than two of at least six
-            known ones in the 5 x 5 around agree, and for sparse ones of which fewer than three, or
-            fewer than half of the known ones, in the 9 x 9 around agree.
+        is_speck: (rows, cols), set for known cells with which fewer than two of at least six known
+            ones in the 5 x 5 neighbourhood agree, and for sparse ones with which fewer than three,
+            or fewer than half of the known ones, in the 9 x 9 neighbourhood agree.
         first_row: first row to visit.
         end_row: the row after the last one.
     """
@@ -179,7 +180,7 @@ def _count_around(
 ) -> tuple[int, int]:
     """Count the known cells around a cell, and those that agree with it.
 
-    Depths agree that differ by `agree_m`, and by `slope_m` more for each row or column between.
+    Depths agree that differ by at most `agree_m`, plus `slope_m` for each row or column between.
     """
     rows, columns = depth_m.shape
     here = depth_m[row, column]

@@ -15,18 +15,18 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.raster.sampled_points import SampledPoints, points_in
 
-# Causes are told of tiles of about this side, which hold some points of the sample each.
+# Causes are determined on tiles of about this side, each with some points of the sample.
 _TILE_M: Final = 0.05
-# As many points of the sample as make a surface.
+# Number of points of the sample that make a surface.
 _POINTS_LEAST: Final = 2
-# What lies farther behind a wall is another room or the street; what stands farther before it, as
-# a portico or a balcony, hides it only where a station is known to look past.
+# Points farther behind a wall are another room or the street; objects farther in front, such as a
+# portico or a balcony, hide it only if a station is known to look past them.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 5.0
-# A buffer is to take in so much of what stands before a wall.
+# Share of what is in front of a wall that a suggested buffer includes.
 _BEFORE_PERCENT: Final = 95.0
-# Rays from the wall to the stations: side of a voxel, how many there are and along one axis, how
-# far both ends are left out, and how many tiles are asked.
+# Rays from the wall to the stations: side of a voxel, their number and that along one axis, margin
+# at both ends, and number of tiles tested.
 _VOXEL_M: Final = 0.1
 _VOXELS_MOST: Final = 1 << 24
 _VOXELS_MOST_ALONG: Final = 1 << 11
@@ -36,15 +36,15 @@ _RAYS_MOST: Final = 4000
 
 @dataclass(frozen=True, kw_only=True)
 class Emptiness:
-    """What share of a wall's cells is empty, by cause.
+    """The share of a wall's cells that is empty, by cause.
 
     Attributes:
-        behind_share: what was scanned there lies behind the buffer.
-        behind_m: how far behind the plane, median; NaN where nothing does.
-        before_share: something stands right before the wall, beyond the buffer.
-        before_m: how far before the plane 95 % of that is; NaN where nothing does.
-        hidden_share: something stands between the wall and every scanner.
-        sparse_share: points of the wall lie about the cell: in gaps, shadows of relief, rims.
+        behind_share: scanned points there are behind the buffer.
+        behind_m: their depth behind the plane, median; NaN without any.
+        before_share: objects are directly in front of the wall, beyond the buffer.
+        before_m: depth in front of the plane of 95 % of them; NaN without any.
+        hidden_share: objects are between the wall and every scanner.
+        sparse_share: points of the wall surround the cell: gaps, shadows of relief, borders.
         unseen_share: nothing was scanned there.
     """
 
@@ -65,11 +65,11 @@ class Emptiness:
 
 @dataclass(frozen=True, kw_only=True)
 class Sight:
-    """What was scanned, and from where.
+    """The scanned points and their stations.
 
     Attributes:
         points: of the cloud.
-        stations: (k, 3) world; None where they are not known.
+        stations: (k, 3) world; None if unknown.
     """
 
     points: SampledPoints
@@ -77,21 +77,21 @@ class Sight:
 
     @cached_property
     def room(self) -> _Room:
-        """Where points are; what they hide is asked of few walls."""
+        """Return the voxels that contain points; computed once, because few walls need them."""
         return _Room.of(self.points)
 
 
 def emptiness_of(
     wall: Wall, slab: Slab, sight: Sight, *, free_m: float = math.inf, threads: int
 ) -> Emptiness:
-    """Report why cells of a wall are empty.
+    """Determine why cells of a wall are empty.
 
     Args:
         wall: the wall.
         slab: its raster and buffer.
-        sight: what was scanned.
-        free_m: what stands farther before the wall belongs to what faces it.
-        threads: how many threads work.
+        sight: the scanned points.
+        free_m: objects farther in front of the wall belong to what faces it.
+        threads: number of threads.
     """
     points = sight.points
     tiles = _tiles(wall, points)
@@ -138,8 +138,8 @@ class _Tiles:
 
     Attributes:
         frame: a cell for each tile; those at the right and below may be cut off by the wall's end.
-        n_void: (rows, cols) void cells in it.
-        n_measured: (rows, cols) cells with a point.
+        n_void: (rows, cols) number of void cells.
+        n_measured: (rows, cols) number of cells with a point.
     """
 
     frame: WallFrame
@@ -151,7 +151,7 @@ def _tiles(wall: Wall, points: SampledPoints) -> _Tiles:
     frame = wall.frame
     rows, columns = frame.shape
     n_points = max(1.0, float(wall.count.sum(dtype=np.int64)) / points.n_represented)
-    # Three steps of the sample, were its points spread over the whole wall.
+    # Three times the spacing of the sample if its points were spread over the whole wall.
     side_m = max(_TILE_M, 3.0 * frame.gsd_m * math.sqrt(rows * columns / n_points))
     side = max(1, min(round(side_m / frame.gsd_m), rows, columns))
     starts = np.arange(0, columns, side)
@@ -177,7 +177,7 @@ def _blocked(
     sight: Sight,
     stations: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether something stands between tiles (n,) of a wall's plane and every station."""
+    """Whether objects are between tiles (n,) of a wall's plane and every station."""
     every = -(-len(tiles) // _RAYS_MOST)
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
@@ -189,8 +189,8 @@ def _blocked(
         lengths_m = np.linalg.norm(rays, axis=1)
         is_met = rays @ frame.normal_world <= 0.0
         rays /= np.maximum(lengths_m, 1e-9)[:, None]
-        # A station may stand far from all points, or be a point at the origin of a survey grid:
-        # nothing hides a wall beyond the voxels.
+        # A station may be far from all points, or at the origin of a survey grid: nothing hides a
+        # wall beyond the voxels.
         enter_m, leave_m = room.crossed_m(starts, rays)
         enter_m = np.maximum(enter_m, _ENDS_M)
         leave_m = np.minimum(leave_m, lengths_m - _ENDS_M)
@@ -206,7 +206,7 @@ def _blocked(
 
 @dataclass(frozen=True, kw_only=True)
 class _Room:
-    """Which voxels of the room hold points; places are offsets of the cloud."""
+    """The voxels of the room that contain points; positions are offsets of the cloud."""
 
     low_m: NDArray[np.float64]
     side_m: float
@@ -215,7 +215,7 @@ class _Room:
     @classmethod
     def of(cls, points: SampledPoints) -> _Room:
         axes = (points.x, points.y, points.z)
-        # Single points far out must not make voxels coarse.
+        # Isolated distant points must not make voxels coarse.
         low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
         low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
         side_m = max(
@@ -229,16 +229,16 @@ class _Room:
         )
         inside = ((places >= 0.0) & (places < shape)).all(axis=1)
         voxels = np.ravel_multi_index(tuple(places[inside].astype(np.int64).T), tuple(shape))
-        # One stray point hides nothing.
+        # A single stray point hides nothing.
         counts = np.bincount(voxels, minlength=int(shape.prod())).reshape(tuple(shape))
         return cls(low_m=low, side_m=side_m, occupied=counts >= _POINTS_LEAST)
 
     def crossed_m(
         self, starts: NDArray[np.float64], ways: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where rays (n, 3) from places (n, 3), unit vectors, enter and leave the voxels, metres.
+        """Return where rays (n, 3) from positions (n, 3) enter and leave the voxels, metres.
 
-        A ray that misses them leaves before it enters.
+        For a ray that misses them the exit precedes the entry.
         """
         high_m = self.low_m + self.side_m * np.array(self.occupied.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -249,7 +249,7 @@ class _Room:
         return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points lie in the voxels of places (n, 3)."""
+        """Whether the voxels of positions (n, 3) contain points."""
         voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
         inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
         held = np.zeros(len(places), dtype=np.bool_)

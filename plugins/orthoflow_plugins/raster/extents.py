@@ -1,10 +1,10 @@
-"""How far a wall reaches: to the surfaces that adjoin it, and over the relief that it has.
+"""The extent of a wall: up to the surfaces that adjoin it, and including its relief.
 
-markiewicz2015 (section 6) lets each plane define the range before and behind it that is rastered.
-Here both it and the rectangle follow from the points that hang together with the wall: voxels of a
-sample of the cloud, step by step along the wall and in depth, from those on the plane. A detected
-plane that adjoins the wall ends it, where it comes nearest: farther on, a rectangle would show that
-plane, too. Where none was detected, it ends with the points.
+In markiewicz2015 (section 6) each plane defines the range in front of and behind it that is
+rastered. Here both this range and the rectangle follow from the points connected to the wall:
+voxels of a sample of the cloud, step by step along the wall and in depth, from those on the plane.
+A detected plane that adjoins the wall ends it where it comes nearest: beyond, a rectangle would
+show that plane, too. Without a detected one, it ends with the points.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from orthoflow_plugins.raster.selection import area_m2, frame_of
 Side = Literal["left", "right", "top", "bottom"]
 _SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 
-# How far a rectangle may grow on each side, and how far from the plane relief is looked for.
+# Maximum growth of a rectangle on each side, and maximum depth of relief.
 _GROWTH_MOST_M: Final = 1.0
 _FRONT_MOST_M: Final = 0.5
 _BEHIND_MOST_M: Final = 1.0
@@ -35,54 +35,56 @@ _VOXELS_MOST: Final = 1 << 22
 _SIDE_LEAST_M: Final = 0.03
 _SIDE_STEPS: Final = 3.0
 _DEPTH_STEP_M: Final = 0.025
-# Sides of relief are seldom scanned: surfaces hang together across depths that as many steps span.
+# Sides of relief are seldom scanned: surfaces are connected across this many steps of depth.
 _BRIDGED_STEPS: Final = 5
-# A part of the surface has so many voxels on the plane.
+# A part of the surface has at least this many voxels on the plane.
 _SEEDS_LEAST: Final = 4
 # A line of cells beside the rectangle belongs to the wall if this share of it is covered.
 _COVERED_LEAST: Final = 0.2
 # Share of the outermost points that may be stray ones.
 _STRAY_SHARE: Final = 0.02
-# So far beyond is looked too: what goes on there, as the cornices of adjoining walls and the sides
-# of furniture do, has no front within reach that a buffer could take in.
+# Additional depth that is searched: objects that continue there, as the cornices of adjoining walls
+# and the sides of furniture do, have no front within reach that a buffer could include.
 _BEYOND_MOST_M: Final = 0.1
-# What stands farther before a wall and hangs together with it, as a fountain before its facade,
-# belongs to it where it covers so much of the wall that nothing else does, up to here, and no
-# farther than halfway to a surface that faces the wall or to a scanner.
+# An object farther in front of a wall and connected to it, such as a fountain in front of its
+# facade, belongs to it if it covers this share of the wall that nothing else covers, up to this
+# distance, and no farther than halfway to a surface that faces the wall or to a scanner.
 _FAR_FRONT_MOST_M: Final = 3.0
 _FAR_SHARE_LEAST: Final = 0.03
 _HALFWAY: Final = 0.5
 _FACING_COSINE: Final = -0.7
 _UPRIGHT_SINE: Final = math.sin(math.radians(10.0))
-# So near to the lowest and the highest points before a wall, ground and ceiling join everything.
+# This close to the lowest and the highest points in front of a wall, ground and ceiling connect
+# everything.
 _GROUND_M: Final = 0.15
-# Relief that covers less than this share of the wall decides no buffer.
+# Relief that covers less than this share of the wall does not influence the buffer.
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
 _RELIEF_USUAL_M: Final = 0.15
-# Which planes adjoin: angle, and on which part of the side points of theirs lie between so far
-# and so far before the wall, or behind it. The undersides of cornices are not as deep.
+# Which planes adjoin: minimum angle, and the share of the side along which their points are within
+# this range of depths in front of the wall, or behind it. The undersides of cornices are not as
+# deep.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
 _BESIDE_SHARE: Final = 0.3
 _STANDING_M: Final = (0.35, 1.0)
 _BESIDE_STEP_M: Final = 0.1
-# How far within the rectangle of the points their line may lie.
+# How far inside the rectangle of the points their line may be.
 _WITHIN_M: Final = 0.1
-# Points of an adjoining surface lie within so many of its sigmas, and no farther than this.
+# Points of an adjoining surface are within this many of its sigmas, and no farther than this.
 _NOISE_SIGMAS: Final = 3.0
 _NOISE_MOST_M: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """How far a wall reaches.
+    """The extent of a wall.
 
     Attributes:
-        growth_m: how far beyond the rectangle of its points, to the left, right, top and bottom.
+        growth_m: growth beyond the rectangle of its points, to the left, right, top and bottom.
         front_m: from the plane towards the viewer.
         behind_m: behind the plane.
-        cut_m: how much farther a plane that runs askew leaves the wall than it ends it, by side.
+        cut_m: how much of the wall a plane that is askew cuts off beyond its end, by side.
     """
 
     growth_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -92,12 +94,12 @@ class Extent:
 
     @property
     def buffer_m(self) -> tuple[float, float]:
-        """Reach in front of the plane and behind it."""
+        """Return the depths in front of the plane and behind it."""
         return self.front_m, self.behind_m
 
     def widened(self, frame: WallFrame) -> WallFrame:
-        """Add whole cells on each side, so that the others stay where they are."""
-        # A millionth of a cell of slack, as `frame_over` has it.
+        """Add whole cells on each side, so that the others keep their position."""
+        # A tolerance of a millionth of a cell, as in `frame_over`.
         left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
         corner = np.array([[-left, -top]], dtype=np.float64)
         return replace(
@@ -110,12 +112,12 @@ class Extent:
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """How far in depth to look, and what the buffer is at least.
+    """The depth to search, and the minimum buffer.
 
     Attributes:
         front_m: buffer towards the viewer that is set; None to find it.
         behind_m: buffer behind the plane that is set; None to find it.
-        least_m: one that is found is no narrower.
+        least_m: minimum of a buffer that is found.
     """
 
     front_m: float | None
@@ -124,12 +126,12 @@ class Reach:
 
     @property
     def is_set(self) -> bool:
-        """Whether nothing is left to find."""
+        """Whether both buffers are set."""
         return self.front_m is not None and self.behind_m is not None
 
     @property
     def as_set(self) -> Extent:
-        """Extent of a wall of which nothing is looked for."""
+        """Return the extent of a wall without a search."""
         return Extent(
             front_m=self.least_m if self.front_m is None else self.front_m,
             behind_m=self.least_m if self.behind_m is None else self.behind_m,
@@ -145,15 +147,15 @@ def extent_of(
     stations: NDArray[np.float64] | None = None,
     threads: int,
 ) -> Extent:
-    """Find how far the wall of a plane reaches.
+    """Find the extent of the wall of a plane.
 
     Args:
         points: of the cloud.
-        planes: all that were found.
+        planes: all detected planes.
         index: of the wall's plane.
-        reach: of the wall in depth.
-        stations: (k, 3) world, where scanners stood; None where that is not known.
-        threads: how many threads work.
+        reach: depths of the wall.
+        stations: (k, 3) world, positions of scanners; None if unknown.
+        threads: number of threads.
     """
     search = _Search.of(points, planes, index, reach)
     inside = points_in(points, search.slab, threads=threads)
@@ -190,12 +192,12 @@ class _Bound:
     """An adjoining plane: distance of (right, down, depth) in metres from it, positive inside.
 
     Attributes:
-        side: of the rectangle that it bounds.
+        side: side of the rectangle that it bounds.
         slopes: (3,) change of the distance along right, down and depth.
         offset_m: distance at the top-left corner of the rectangle of the points.
-        noise_m: how far from it its points lie.
-        beyond_m: how far beyond the rectangle's side it lies, where it lies nearest.
-        askew_m: how much farther, where it lies farthest.
+        noise_m: distance of its points from it.
+        beyond_m: its distance beyond the rectangle's side, where it is nearest.
+        askew_m: additional distance where it is farthest.
     """
 
     side: Side
@@ -207,20 +209,20 @@ class _Bound:
 
     @property
     def line_m(self) -> float:
-        """How far a wall that it ends reaches beyond the rectangle's side."""
-        # What lies nearer to the adjoining surface belongs to either.
+        """Return how far a wall that it ends extends beyond the rectangle's side."""
+        # Points closer to the adjoining surface may belong to either.
         return self.beyond_m - self.noise_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Search:
-    """Where the points of a wall are looked for.
+    """The region that is searched for the points of a wall.
 
     Attributes:
-        slab: voxels' cells along the wall, and the depths that are looked at.
+        slab: voxels' cells along the wall, and the range of depths.
         width_m: of the rectangle of the points.
         height_m: of the rectangle of the points.
-        seed_m: points so near to the plane are on it.
+        seed_m: points this close to the plane are on it.
         bounds: adjoining planes.
     """
 
@@ -260,17 +262,17 @@ class _Search:
         )
 
     def places_m(self, points: PointsInside) -> NDArray[np.float64]:
-        """Metres (2, n) to the right of and below the rectangle's top-left corner."""
+        """Return metres (2, n) to the right of and below the rectangle's top-left corner."""
         return self.slab.frame.gsd_m * (points.places - self.n_beside).T
 
     @property
     def n_beside(self) -> int:
-        """Cells between the frame's and the rectangle's side."""
+        """Return the cells between the frame's and the rectangle's side."""
         return math.ceil(_GROWTH_MOST_M / self.slab.frame.gsd_m)
 
     @property
     def inside(self) -> tuple[slice, slice]:
-        """Rows and columns of the cells that lie in the rectangle of the points."""
+        """Return rows and columns of the cells in the rectangle of the points."""
         side_m, first = self.slab.frame.gsd_m, self.n_beside
         rows, columns = (
             max(1, int(length_m / side_m)) for length_m in (self.height_m, self.width_m)
@@ -280,12 +282,12 @@ class _Search:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """What hangs together with the wall.
+    """The points connected to the wall.
 
     Attributes:
-        is_covered: (rows, cols) cells of the surface, strays left out.
-        front_m: (rows, cols) its largest depth there; -inf without.
-        behind_m: (rows, cols) its smallest; inf without.
+        is_covered: (rows, cols) cells of the surface, without strays.
+        front_m: (rows, cols) its largest depth there; -inf without any.
+        behind_m: (rows, cols) its smallest; inf without any.
         is_own: (n,) which points are on it.
     """
 
@@ -305,20 +307,20 @@ def _far_front_m(
     near_m: float,
     threads: int,
 ) -> float:
-    """How far before a wall stands what hangs together with it and hides much of it; 0 for none.
+    """Return the depth of objects connected to a wall that hide much of it; 0 for none.
 
     Args:
         points: of the cloud.
-        planes: all that were found.
+        planes: all detected planes.
         index: of the wall's plane.
-        search: of the wall.
+        search: the region of the wall.
         stations: (k, 3) world, or None.
-        near_m: nearer relief is the wall's in any case.
-        threads: how many threads work.
+        near_m: nearer relief belongs to the wall in any case.
+        threads: number of threads.
     """
     from scipy import ndimage
 
-    # On floors stands what is no part of them.
+    # Objects on floors are not part of them.
     is_upright = abs(float(planes.normal[index] @ planes.up)) < _UPRIGHT_SINE
     most_m = min(_FAR_FRONT_MOST_M, free_before_m(planes, index, stations))
     if not is_upright or most_m <= near_m + _BEYOND_RELIEF_M:
@@ -330,7 +332,7 @@ def _far_front_m(
         return 0.0
     is_far = surface.front_m > near_m
     is_far &= ~(surface.behind_m <= near_m)
-    # Sides of what goes on, as of adjoining walls, are thin from here.
+    # Sides of objects that continue, such as adjoining walls, are thin beyond this depth.
     is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
     rows, columns = far.inside
     gained_m = surface.front_m[rows, columns][is_far[rows, columns]]
@@ -342,9 +344,9 @@ def _far_front_m(
 
 
 def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | None) -> float:
-    """Halfway from a wall to the nearest surface that faces it, or to a scanner before it, metres.
+    """Return half the distance from a wall to the nearest surface that faces it, or to a scanner.
 
-    What stands farther before it may as well belong to what faces it; infinite without any.
+    Objects farther in front may belong to what faces it; infinite without any.
     """
     normal, offset_m = planes.normal[index], float(planes.offset[index])
     distances_m = [math.inf]
@@ -358,7 +360,7 @@ def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | No
 
 
 def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> PointsInside:
-    """Leave out ground and ceiling before a wall, which join what stands there with it."""
+    """Drop ground and ceiling in front of a wall, which connect objects there with it."""
     _, down_m = search.places_m(inside)
     is_before = inside.depth_m > near_m
     if not is_before.any():
@@ -372,7 +374,7 @@ def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> Poi
 
 
 def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
-    """Find the voxels that hang together with those on the plane; None without any of these."""
+    """Find the voxels connected to those on the plane; None without any of these."""
     from scipy import ndimage
 
     slab = search.slab
@@ -418,16 +420,16 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
 
 
 def _searched_m(set_m: float | None, most_m: float) -> float:
-    """How far a wall is looked for in depth; found or set, farther off it does not grow."""
+    """Return the depth in which a wall is searched; found or set, it does not grow beyond it."""
     return most_m + _BEYOND_MOST_M if set_m is None else min(set_m, most_m)
 
 
 def _relief_m(depth_m: NDArray[np.float64], most_m: float, search: _Search) -> float:
-    """How far the relief of the wall stands out where it is more than thin or tiny."""
+    """Return the depth of the wall's relief, except where it is thin or tiny."""
     from scipy import ndimage
 
     inner = np.where(np.isfinite(depth_m) & (depth_m <= most_m), depth_m, -np.inf)
-    # A floor or ceiling that nobody detected, and the sides of relief, are thin from here.
+    # A floor or ceiling that was not detected, and the sides of relief, are thin from here.
     opened = np.asarray(ndimage.minimum_filter(inner, 3, mode="constant", cval=-np.inf))
     opened = np.sort(opened[np.isfinite(opened)])
     rows, columns = search.inside
@@ -439,7 +441,7 @@ def _relief_m(depth_m: NDArray[np.float64], most_m: float, search: _Search) -> f
 
 
 def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Search) -> float:
-    """How far the wall reaches beyond a side of the rectangle of its points."""
+    """Return how far the wall extends beyond a side of the rectangle of its points."""
     side_m, first = search.slab.frame.gsd_m, search.n_beside
     rows, columns = search.inside
     is_covered = surface.is_covered
@@ -448,7 +450,7 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
         is_within = (down_m >= 0.0) & (down_m <= search.height_m)
     else:
         is_within = (right_m >= 0.0) & (right_m <= search.width_m)
-    # Lines of cells from the rectangle outwards; the first may lie partly within it.
+    # Lines of cells from the rectangle outwards; the first may be partly inside it.
     lines, beyond_m, within_m = {
         "left": (is_covered[rows, :first].T[::-1], -right_m, 0.0),
         "right": (
@@ -477,7 +479,7 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
 
 
 def _covered_m2(planes: Planes, index: int) -> float:
-    """Area of the connected parts of a plane, of its rectangle where none are known."""
+    """Return the area of the connected parts of a plane, or of its rectangle without parts."""
     whole = area_m2(planes.corners[index])
     parts = sum(area_m2(corners) for corners in _parts(planes, index))
     return min(whole, parts) if parts > 0.0 else whole
@@ -493,10 +495,10 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
 def _bounds(
     planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
 ) -> Iterator[_Bound]:
-    """The planes that adjoin a wall along one of its sides, of several on a side the innermost.
+    """Return the planes that adjoin a wall along one of its sides, the innermost of several.
 
-    But a part of an adjoining wall that stands out of it farther on, as a chimney breast does, ends
-    nothing: the wall's own surface goes on to the next.
+    A part of an adjoining wall that projects from it farther on, such as a chimney breast, does not
+    end the wall: the wall's own surface continues to the next plane.
     """
     found: dict[Side, list[_Bound]] = {}
     for other in range(len(planes)):
@@ -529,7 +531,7 @@ def _bound(
     middle = np.array([0.5 * size_m[0], 0.5 * size_m[1], 0.0])
     if offset_m + float(slopes @ middle) < 0.0:
         slopes, offset_m = -slopes, -offset_m
-    # Inside is to the right of a left wall and below a ceiling: there distances rise.
+    # Inside is to the right of a left wall and below a ceiling: there distances increase.
     sides: tuple[Side, Side] = ("left", "right") if axis == 0 else ("top", "bottom")
     is_first = bool(slopes[axis] > 0.0)
     along = 1 - axis
@@ -555,9 +557,9 @@ class _Around:
     """Points in and beside a wall, in metres of its rectangle.
 
     Attributes:
-        places_m: (3, n) right of and below the top-left corner, and before the plane, of those that
-            lie clearly before or behind it.
-        own_m: (3, n) of those on the plane, or on the relief that most walls have.
+        places_m: (3, n) right of and below the top-left corner, and in front of the plane, of those
+            that are clearly in front of or behind it.
+        own_m: (3, n) of those on the plane, or on relief of the usual depth.
     """
 
     places_m: NDArray[np.float64]
@@ -570,7 +572,7 @@ class _Around:
         growth_m = _GROWTH_MOST_M
         corner = rectangle.world_from_wall(np.array([[-growth_m, -growth_m]]) / rectangle.gsd_m)[0]
         width_m, height_m = (length_m + 2.0 * growth_m for length_m in size_m)
-        # In 32 x 32 pieces, as any cells do: only places count.
+        # In 32 x 32 pieces; any cells would do, because only positions are used.
         gsd_m = max(width_m, height_m) / 32.0
         frame = replace(
             rectangle,
@@ -591,7 +593,7 @@ class _Around:
 
 
 def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
-    """Whether points of a plane run along a side of a wall, out of it or back."""
+    """Whether points of a plane run along a side of a wall, towards the front or back."""
     places_m = around.places_m
     is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
     return any(
@@ -609,7 +611,7 @@ def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: 
 
 
 def _runs_along(bound: _Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
-    """Whether places (3, n) lie along enough of a bound's side."""
+    """Whether positions (3, n) cover enough of a bound's side."""
     along = 1 if bound.side in {"left", "right"} else 0
     length_m = size_m[along]
     n_steps = max(1, round(length_m / _BESIDE_STEP_M))

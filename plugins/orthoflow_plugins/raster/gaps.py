@@ -1,7 +1,7 @@
-"""Where the cells of a surface come from: measured, recovered in narrow gaps, or void.
+"""The state of the cells of a surface: measured, recovered in narrow gaps, or void.
 
-A gap is recovered between points that lie side by side in a scan, where its rows and columns are
-known; else between the measured cells about it.
+A gap is recovered between points that are neighbours in a scan if its rows and columns are known;
+otherwise between the measured cells around it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from orthoflow_plugins.raster.scan_grid_kernels import (
 )
 from orthoflow_plugins.raster.surfaces import CellSurface
 
-# A scan with more rows times columns than this has numbers that are no grid (2 GB of indices).
+# In a scan with more rows times columns than this the numbers are not a grid (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
 
 _Number = TypeVar("_Number", np.float32, np.uint8)
@@ -70,18 +70,18 @@ def _values(surface: CellSurface) -> CellValues:
 def _recover_between_neighbours(
     cloud: PointCloud, slab: Slab, surface: CellSurface, rule: GapRule
 ) -> NDArray[np.bool_]:
-    """Fill void cells of a surface between neighbours in the scans' grids, linear between them.
+    """Fill void cells of a surface between neighbours in the scans' grids by linear interpolation.
 
-    A point that the scanner missed lies between its neighbours in the scan, whatever the raster
-    makes of their distance. So a gap between points that are neighbours, or nearly, and on one
-    surface is recovered between them; one that the scanner looked through is not, since no
-    neighbours span it.
+    A point that the scanner missed lies between its neighbours in the scan, whatever their distance
+    on the raster. So a gap between points that are neighbours, or nearly, and on one surface is
+    recovered between them; one through which the scanner looked is not, since no neighbours span
+    it.
 
     Args:
         cloud: with rows and columns; without them nothing is filled.
         slab: of the wall.
         surface: filled in place; its spreads stay unknown and its counts 0.
-        rule: what neighbours are.
+        rule: which points count as neighbours.
 
     Returns:
         (cells,) which were filled.
@@ -113,14 +113,14 @@ def _recover_between_neighbours(
 
 
 def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
-    """An array in the one form that kernels are compiled for."""
+    """Return an array in the form for which kernels are compiled."""
     view = np.asarray(values).view(np.ndarray)
     view.flags.writeable = False
     return view
 
 
 def _near(is_void: NDArray[np.bool_], reach_cells: int) -> NDArray[np.bool_]:
-    """Cells (flat) whose points may span a void cell."""
+    """Return cells (flat) whose points may span a void cell."""
     import cv2
 
     window = np.ones((2 * reach_cells + 1,) * 2, dtype=np.uint8)
@@ -128,7 +128,7 @@ def _near(is_void: NDArray[np.bool_], reach_cells: int) -> NDArray[np.bool_]:
 
 
 def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
-    """For each scan the indices of its chosen points by row and column."""
+    """Return for each scan the indices of its chosen points by row and column."""
     if cloud.row is None or cloud.column is None:
         raise AssertionError("a grid was asked of a cloud without rows and columns")
     scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
@@ -150,7 +150,7 @@ def _points_beside_voids(
     near: NDArray[np.bool_],
     rule: GapRule,
 ) -> NDArray[np.uint32]:
-    """Indices of the points that lie on the surface of a cell near a void one."""
+    """Return indices of the points on the surface of a cell near a void one."""
     found = [np.empty(0, dtype=np.uint32)]
     for entries in entries_inside(cloud, slab, threads=rule.threads):
         for block, n_inside in enumerate(entries.n_inside):

@@ -55,9 +55,9 @@ from orthoflow_plugins.raster.walls import WallRaster, rastered_wall, require_me
 RectangleRule = Literal["points", "room"]
 ExtentOf = Callable[[int], Extent]
 
-# A point that somebody took for one on a wall is farther from it than any relief.
+# A point wrongly assumed to be on a wall is farther from it than any relief.
 _FAR_M: Final = 1.0
-# So much of a wall is missed on a drawing.
+# A larger missing share would be noticed in a drawing.
 _LARGE_CUT_M: Final = 0.05
 NEAR_RELIEF: Final = DiagnosticSpec(
     code="near-takes-relief",
@@ -82,12 +82,13 @@ CROP_OF_SEVERAL: Final = DiagnosticSpec(
 
 
 class RasterGrid(Method):
-    """Lay the cloud into a raster on each wall: depth, spread, count, intensity, colour.
+    """Bin the cloud into a raster on each wall: depth, spread, count, intensity, colour.
 
-    Narrow gaps are closed: between neighbours of the scan's own rows and columns where these are
-    known, else between the measured cells about them, by where their points lie. Wider ones, such
-    as windows, stay void. Where a cell has few points, up to 16, the means of their intensities and
-    colours are carried along their slope from there to its centre.
+    Narrow gaps are closed: between neighbours of the scan's own rows and columns if these are
+    known, otherwise between the measured cells around them, from the positions of their points.
+    Wider ones, such as windows, stay void. In cells with few points, up to 16, the means of
+    intensities and colours are extrapolated along their slope from the position of the points to
+    the centre.
     """
 
     id: ClassVar[str] = "raster.grid"
@@ -95,7 +96,7 @@ class RasterGrid(Method):
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
-        # Which wall the first one is.
+        # Which wall is the first.
         MetricSpec("omega_deg", label="direction of the first normal (omega)"),
         MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
@@ -107,7 +108,7 @@ class RasterGrid(Method):
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
-        # By what causes it, too.
+        # Including the causes.
         MetricSpec("void_share", label="cells without a depth"),
         MetricSpec("void_*_share", label="cells without a depth, by cause"),
         MetricSpec("empty*_share", label="cells without a depth, by cause"),
@@ -122,7 +123,7 @@ class RasterGrid(Method):
     )
 
     class Params(MethodParams):
-        """Cell size, reach of the surface, which planes, and how gaps close."""
+        """Cell size, depth of the surface, choice of planes, and how gaps are closed."""
 
         gsd_m: float = Field(
             default=0.005, gt=0, description="Side of a cell; not finer than the scan's step."
@@ -251,7 +252,7 @@ class RasterGrid(Method):
             return crop
 
     class In(Ports):
-        """The cloud and the planes found in it."""
+        """The cloud and its planes."""
 
         cloud: PointCloud
         planes: Planes
@@ -262,7 +263,7 @@ class RasterGrid(Method):
         walls: Walls
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Raster the chosen planes, one pass over the cloud or a few for each."""
+        """Raster the chosen planes, with one or a few passes over the cloud for each."""
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         points = sampled(cloud)
@@ -331,7 +332,7 @@ def _extents(
     params: RasterGrid.Params,
     ctx: StepContext,
 ) -> ExtentOf:
-    """How far the wall of each plane reaches, found when it is asked for."""
+    """Return a function that finds the extent of each plane's wall on first use."""
     reach = Reach(
         front_m=params.buffer_m if params.buffer_front_m is None else params.buffer_front_m,
         behind_m=params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m,
@@ -358,7 +359,7 @@ def _log_cuts(
     *,
     margin_m: float,
 ) -> None:
-    """State what of a wall lies beyond its rectangle because what adjoins it runs askew."""
+    """Report what part of a wall is beyond its rectangle because an adjoining plane is askew."""
     for index, frame in frames.items():
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - margin_m
@@ -374,10 +375,10 @@ def _log_cuts(
 def _crops(
     planes: Planes, params: RasterGrid.Params, extent_of: ExtentOf, ctx: StepContext
 ) -> tuple[dict[int, CroppedFrame], dict[int, int]]:
-    """Grid of each chosen plane by its index, the whole or a part; and what is left out for which.
+    """Return the grid of each chosen plane by index, whole or cropped, and the planes left out.
 
     Raises:
-        MethodError: there is no such plane, or no wall has the part that is wanted.
+        MethodError: there is no such plane, or no wall contains the requested part.
     """
     choice = WallChoice(
         constraint=params.constraint,
@@ -429,7 +430,7 @@ def _crops(
 def _slabs(
     params: RasterGrid.Params, crops: Mapping[int, CroppedFrame], extent_of: ExtentOf
 ) -> dict[int, Slab]:
-    """Slab of each chosen plane by its index.
+    """Return the slab of each chosen plane by index.
 
     Raises:
         MethodError: the rasters would not fit into memory.

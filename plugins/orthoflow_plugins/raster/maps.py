@@ -16,7 +16,7 @@ from orthoflow.products import Planes
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
-# A tilted raster may show a point so far from its place in the map.
+# Maximum displacement of a point in the map of a tilted raster.
 _OFF_CELLS_MOST: Final = 0.5
 TILTED: Final = DiagnosticSpec(
     code="map-of-a-tilted-plane",
@@ -37,14 +37,14 @@ NO_MAP: Final = DiagnosticSpec(
 def mapped(
     frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
 ) -> dict[int, WallFrame]:
-    """Return the grids of level planes a place in a map; the others stay in their planes.
+    """Return the grids with level planes placed in the map; the others stay in their planes.
 
     Args:
-        frames: grid of each plane by its index.
+        frames: grid of each plane by index.
         planes: the planes.
         crs: coordinate system of the cloud, whose x is east and y north.
-        reach_m: how far from a plane its points lie at most, which a tilt shifts.
-        ctx: takes warnings.
+        reach_m: maximum distance of points from a plane, which a tilt displaces.
+        ctx: receives warnings.
 
     Raises:
         MethodError: there is no such system, or z is not up.
@@ -83,13 +83,13 @@ def _tilt_rad(frame: WallFrame) -> float:
 
 
 def _off_m(frame: WallFrame, tilt_rad: float, reach_m: float) -> float:
-    """How far a point may be shown from its place, by its depth and as slopes are foreshortened."""
+    """Return the maximum displacement of a point, by its depth and by foreshortening of slopes."""
     extent_m = frame.gsd_m * math.hypot(frame.width, frame.height)
     return reach_m * math.sin(tilt_rad) + extent_m * (1.0 - math.cos(tilt_rad))
 
 
 def _centred(frame: WallFrame, planes: Planes, index: int) -> WallFrame:
-    """Lay what whole cells reach beyond the rectangle to all sides, less than half a cell each."""
+    """Distribute the part of whole cells beyond the rectangle evenly to all sides."""
     middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
     off = middle - 0.5 * np.array([frame.width, frame.height])
     return replace(frame, origin_world=frame.world_from_wall(off[None])[0])

@@ -1,10 +1,10 @@
-"""The surface `tin`: a net of triangles through one point of each cell, of large walls in tiles.
+"""The surface `tin`: a triangulation of one point per cell, in tiles on large walls.
 
-A triangle belongs to the net (Delaunay's) where the circle through its corners holds no other
-point, and no points but those inside the circle need be known to tell. So the triangle over a cell
-is that of the whole wall when its circle lies within the window that was looked at, and tiles give
-the triangles of the whole. On large walls the net is made of the triangles whose circle spans at
-most `SPAN_MOST_CELLS` of the raster; which these are does not hang on the tiles.
+A triangle belongs to the (Delaunay) triangulation if its circumcircle contains no other point, and
+only the points inside the circle need be known to decide it. So the triangle over a cell is that of
+the whole wall if its circle is inside the window that was searched, and tiles give the triangles of
+the whole. On large walls the triangulation consists of the triangles whose circle spans at most
+`SPAN_MOST_CELLS` of the raster; this set does not depend on the tiles.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from scipy.spatial import Delaunay, cKDTree
 
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
-# A net of more corners is made in tiles; one takes some 700 bytes for each.
+# A triangulation with more vertices is made in tiles; a vertex takes about 700 bytes.
 VERTICES_MOST: Final = 2_000_000
-# Circles of triangles that are looked for, as wide and high as this within the raster.
+# Maximum diameter of circumcircles within the raster.
 SPAN_MOST_CELLS: Final = 512
-# Most triangles are small, so that a smaller window tells.
+# Most triangles are small, so that a smaller window suffices.
 _SPAN_CELLS: Final = 64
 _TILE_CELLS: Final = 768
 _ROWS_AT_ONCE: Final = 256
-# Corners of wide triangles lie so near to cells that are so far from all points.
+# Vertices of wide triangles are this close to cells that are this far from all points.
 _RIM_CELLS: Final = 20
 _EMPTY_CELLS: Final = 16
 _ROUNDING_CELLS: Final = 1e-6
@@ -42,10 +42,10 @@ _ROUNDING_CELLS: Final = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Vertices:
-    """The points that a net goes through, one per cell at most.
+    """The points of the triangulation, at most one per cell.
 
     Attributes:
-        point: (rows, cols) uint32, which of the cloud; `NO_POINT` where there is none.
+        point: (rows, cols) uint32, index in the cloud; `NO_POINT` without one.
         depth_m: (rows, cols) float32.
     """
 
@@ -55,12 +55,12 @@ class Vertices:
 
 @dataclass(frozen=True, kw_only=True)
 class Net:
-    """What a net tells at the centres of the cells, all arrays flat over these.
+    """Interpolated values at the centres of the cells, all arrays flat over these.
 
     Attributes:
-        depth_m: float32, NaN where no triangle is.
+        depth_m: float32, NaN without a triangle.
         intensity: float32, likewise, or None.
-        rgb: (cells, 3) uint8, 0 where no triangle is, or None.
+        rgb: (cells, 3) uint8, 0 without a triangle, or None.
     """
 
     depth_m: NDArray[np.float32]
@@ -68,7 +68,7 @@ class Net:
     rgb: NDArray[np.uint8] | None
 
     def part(self, cells: slice) -> Net:
-        """Copies of what is told of some cells."""
+        """Return copies of the values of some cells."""
         return Net(
             depth_m=np.array(self.depth_m[cells]),
             intensity=None if self.intensity is None else np.array(self.intensity[cells]),
@@ -79,18 +79,18 @@ class Net:
 def lay_net(
     cloud: PointCloud, slab: Slab, vertices: Vertices, allocate: Allocate = in_memory
 ) -> Net:
-    """Values at all cell centres, linear in the triangles of a net.
+    """Interpolate values at all cell centres linearly in the triangles.
 
-    It spans gaps, windows included, and lays slopes where depths step.
+    The triangulation spans gaps, including windows, and makes slopes where depths step.
 
     Args:
         cloud: the points.
         slab: of the wall.
         vertices: of the net.
-        allocate: gives the arrays of a large wall, by name.
+        allocate: returns the arrays of a large wall, by name.
 
     Raises:
-        MethodError: the points make no triangle.
+        MethodError: the points form no triangle.
     """
     shape, n_cells = slab.frame.shape, slab.n_cells
     n_vertices, n_told = n_vertices_of(vertices), 0
@@ -119,7 +119,7 @@ def lay_net(
 
 
 def n_vertices_of(vertices: Vertices) -> int:
-    """How many points a net goes through."""
+    """Return the number of vertices."""
     return sum(
         int(np.count_nonzero(vertices.point[rows] != NO_POINT))
         for rows in row_bands(vertices.point.shape)
@@ -155,7 +155,7 @@ def _tiles(shape: tuple[int, int]) -> Iterator[_Window]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """A wall whose net is being laid."""
+    """A wall under triangulation."""
 
     cloud: PointCloud
     slab: Slab
@@ -163,14 +163,14 @@ class _Surface:
     net: Net
 
     def lay(self, window: _Window) -> int:
-        """Lay the net of a whole wall; give how many cells it tells of."""
+        """Triangulate a whole wall; return the number of cells with a triangle."""
         triangles = self._triangles(window)
         return sum(
             self._set(rows, columns, triangles, np.inf).size for rows, columns in _cells_of(window)
         )
 
     def lay_tile(self, tile: _Window) -> int:
-        """Lay the net over one tile of a large wall; give how many cells it tells of."""
+        """Triangulate one tile of a large wall; return the number of cells with a triangle."""
         shape, n_told = self.slab.frame.shape, 0
         near = self._triangles(tile.widened(_SPAN_CELLS, shape))
         wide = []
@@ -188,12 +188,12 @@ class _Surface:
         return n_told
 
     def _triangles(self, window: _Window, *, rim_only: bool = False) -> _Triangles | None:
-        """The net of the points of a window; None where there are too few.
+        """Return the triangulation of the points of a window; None if there are too few.
 
         Args:
-            window: where they are looked for.
-            rim_only: only of points beside large gaps. Where a triangle's circle holds others, it
-                is not given.
+            window: the window of the points.
+            rim_only: only of points beside large gaps. Triangles whose circle contains other points
+                are dropped.
         """
         from scipy.spatial import Delaunay, QhullError, cKDTree
 
@@ -224,7 +224,7 @@ class _Surface:
         )
 
     def _places(self, points: NDArray[np.uint32], window: _Window) -> NDArray[np.float64]:
-        """Places (n, 2) of points as column and row in a window, cell centres at .5."""
+        """Return positions (n, 2) of points as column and row in a window, cell centres at .5."""
         cloud, matrix = self.cloud, wall_from_offset(self.slab.frame, self.cloud.origin)
         offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
         corner = matrix[:2, 3] - (window.left, window.top)
@@ -237,7 +237,7 @@ class _Surface:
         triangles: _Triangles | None,
         span_cells: float,
     ) -> NDArray[np.int64]:
-        """Set what cells show, NaN where no triangle is; give which of them have one."""
+        """Set the values of cells, NaN without a triangle; report which have one."""
         n_channels = 1 + (self.net.intensity is not None) + 3 * (self.net.rgb is not None)
         found = np.full((rows.size, n_channels), np.nan, dtype=np.float32)
         if triangles is not None:
@@ -252,7 +252,7 @@ class _Surface:
 
 
 def _cells_of(window: _Window) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Rows and columns of the cells of a window, so many rows at once."""
+    """Yield rows and columns of the cells of a window, some rows at a time."""
     for top in range(window.top, window.bottom, _ROWS_AT_ONCE):
         rows, columns = np.mgrid[
             top : min(top + _ROWS_AT_ONCE, window.bottom), window.left : window.right
@@ -262,14 +262,14 @@ def _cells_of(window: _Window) -> Iterator[tuple[NDArray[np.int64], NDArray[np.i
 
 @dataclass(frozen=True, kw_only=True)
 class _Triangles:
-    """A net over a window of a raster.
+    """A triangulation over a window of a raster.
 
     Attributes:
-        window: where it lies.
+        window: its window.
         shape: of the raster.
-        delaunay: the net, in cells of the window.
-        values: (n, channels) of its corners.
-        others: all points in the window, where the net is one of some; else None.
+        delaunay: the triangulation, in cells of the window.
+        values: (n, channels) of its vertices.
+        others: all points in the window, if the triangulation is of some of them; else None.
     """
 
     window: _Window
@@ -285,9 +285,9 @@ class _Triangles:
         span_cells: float,
         found: NDArray[np.float32],
     ) -> None:
-        """Set the values (n, channels) at cells whose triangle has a circle of at most that span.
+        """Set the values (n, channels) at cells whose triangle has a circle within the span.
 
-        As scipy's LinearNDInterpolator computes them, which does not say of which triangle.
+        Computed as by scipy's LinearNDInterpolator, which does not return the triangle.
         """
         aside = [columns - self.window.left, rows - self.window.top]
         centres = np.column_stack(aside).astype(np.float64) + 0.5
@@ -312,7 +312,7 @@ class _Triangles:
         found[inside] = total
 
     def _within_reach(self, centres: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Which places (n, 2) lie within the net's outline; scipy asks all triangles of others."""
+        """Which positions (n, 2) are inside the outline; scipy tests all triangles for others."""
         lines, line = np.unique(centres[:, 1], return_inverse=True)
         ends = self.delaunay.points[self.delaunay.convex_hull]
         ends = np.take_along_axis(ends, ends[:, :, 1:].argsort(axis=1), axis=1)
@@ -326,7 +326,7 @@ class _Triangles:
         return np.flatnonzero((centres[:, 0] >= first[line]) & (centres[:, 0] <= last[line]))
 
     def _belongs(self, simplices: NDArray[np.int32], span_cells: float) -> NDArray[np.bool_]:
-        """Which triangles are the whole net's, and have a circle of at most that span."""
+        """Which triangles belong to the whole triangulation and have a circle within the span."""
         corners = self.delaunay.points[self.delaunay.simplices[simplices]]
         b, c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         b_square, c_square = (b**2).sum(axis=1), (c**2).sum(axis=1)
@@ -339,7 +339,7 @@ class _Triangles:
                 ]
             )
             centre, radius = corners[:, 0] + aside, np.hypot(*aside.T)
-            # What of the circle lies beside the raster holds no point of the wall.
+            # The part of the circle outside the raster contains no point of the wall.
             low = -np.array([self.window.left, self.window.top], dtype=np.float64)
             high = low + self.shape[::-1]
             beside = np.clip(centre, low, high) - centre
@@ -354,10 +354,10 @@ class _Triangles:
 
 
 def _beside_gaps(has_point: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells (rows, cols) with a point that lie beside a place far from all points.
+    """Return cells (rows, cols) with a point next to a position far from all points.
 
-    The corners of every triangle do whose circle is wide: on the way from a corner to the centre
-    there is a place that far from all.
+    The vertices of every triangle with a wide circle qualify: between a vertex and the centre there
+    is a position that far from all points.
     """
     import cv2
 

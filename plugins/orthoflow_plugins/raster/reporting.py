@@ -1,4 +1,4 @@
-"""What is told of rastered walls: numbers, and what limits them."""
+"""Metrics of rastered walls, and what limits them."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
-# Medians of larger walls are told from some of their rows.
+# Medians of larger walls are estimated from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
-# Points of a scan are to lie so many cells apart at most.
+# Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
-# Empty and interpolated cells are warned of where so many of a wall are, by causes of so many.
+# Share of a wall that is empty or interpolated before a warning, and share of a cause in it.
 _SHARE_WORTH_WORDS: Final = 0.1
 _CAUSE_WORTH_WORDS: Final = 0.01
-# What stands before a wall and is left out of it is missed sooner.
+# Objects in front of a wall that are left out are reported from a smaller share on.
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
-# The least share that is not printed as 0.0 %.
+# The smallest share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
-# Where a cell that has points has so many, no cell is empty for want of larger ones.
+# If cells with points have this many, no cell is empty because cells are too small.
 _DENSE_POINTS: Final = 4.0
-# A net leaves a few cells void along the rim of every wall.
+# A triangulation leaves a few void cells along the border of every wall.
 _VOID_WORTH_WORDS: Final = 0.01
 
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
@@ -137,7 +137,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 
 
 def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
-    """Report what limits the walls: what the cloud lacks, and cells finer than its points."""
+    """Report what limits the walls: missing data of the cloud, and cells finer than its points."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -171,10 +171,10 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
 
 
 def _least_gsd_m(step_m: float) -> float:
-    """Smallest cells, of two digits, that are not too fine for points so far apart."""
+    """Return the smallest cell size, of two digits, that is not too fine for a point spacing."""
     least_m = step_m / _STEP_MOST_CELLS
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
-    # Rounded up: the nearest number of two digits may be what is too fine.
+    # Rounded up: the nearest number of two digits may be too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
 
 
@@ -220,7 +220,7 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
-    """Report which planes are not rastered though smaller ones are: a larger wall shows them.
+    """Report which planes are not rastered although smaller ones are: a larger wall shows them.
 
     Args:
         ctx: of the step.
@@ -251,7 +251,7 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
 
 
 def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float64]) -> None:
-    """Report in numbers what the walls hold.
+    """Report metrics of the walls.
 
     Args:
         ctx: of the step.
@@ -285,7 +285,7 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
-    """Report why cells are empty: in numbers, and by cause where it is many of a wall."""
+    """Report why cells are empty: as metrics, and by cause if it affects much of a wall."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
@@ -298,7 +298,8 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
         )
-        # Tiles on the rim of a hole belong to it and to what is about it: no words for those few.
+        # Tiles at the border of a hole belong to it and to its surroundings: no warning for those
+        # few.
         least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
         is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
         if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
@@ -324,10 +325,10 @@ def _digits(depth_m: float) -> float | None:
 
 
 def _rounded_up(depth_m: float) -> float | None:
-    """A buffer that takes in a depth, in whole decimetres."""
+    """Return a buffer that includes a depth, in whole decimetres."""
     return math.ceil(10.0 * depth_m) / 10.0 if math.isfinite(depth_m) else None
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
-    """Rows of a raster, all of them unless it is large."""
+    """Return rows of a raster, all of them unless it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]

@@ -1,4 +1,4 @@
-"""By which rules the depth of a cell follows from its points, and gaps close."""
+"""The rules by which the depth of a cell follows from its points, and gaps close."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Final, Literal
 
 Surface = Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"]
 
-# Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
+# Maximum distance of neighbours in the scan, in radii of a narrow gap.
 _SPAN_GAPS: Final = 4
-# Outliers are told from 20 cells around.
+# Outliers are detected within 20 cells.
 _REACH_OF_OUTLIERS: Final = 32
 
 
@@ -21,8 +21,8 @@ class SurfaceRule:
         surface: name of the rule.
         layer_m: depth step that separates two layers within a cell; for `median`.
         denoise_cells: reach of the filter of `denoised`.
-        percentiles: depths below which these shares (%) of a cell's points lie, wanted besides.
-        threads: how many threads work.
+        percentiles: shares (%) of a cell's points below additional depths to compute.
+        threads: number of threads.
     """
 
     surface: Surface
@@ -43,9 +43,9 @@ class GapRule:
 
     Attributes:
         gap_cells: no disc of this radius fits into a narrow gap; 0 closes none.
-        scan_steps: rows or columns of a scan between neighbours that span a gap, at most.
-        layer_m: how far apart their depths are, at most.
-        threads: how many threads work.
+        scan_steps: maximum rows or columns of a scan between neighbours that span a gap.
+        layer_m: maximum difference of their depths.
+        threads: number of threads.
     """
 
     gap_cells: int
@@ -55,7 +55,7 @@ class GapRule:
 
     @property
     def span_cells(self) -> int:
-        """How far apart on the wall neighbours in the scan lie that span a gap, at most."""
+        """Return the maximum distance on the wall of neighbours in the scan that span a gap."""
         return _SPAN_GAPS * self.gap_cells
 
 
@@ -73,8 +73,8 @@ class RasterRule:
 
     @property
     def reach_rows(self) -> int:
-        """How many rows away a cell may lie that decides what becomes of another, at most."""
-        # Noise is taken out twice, and a gap is as wide as what spans it and a disc on either side,
-        # and a little more, between which it is interpolated.
+        """Return how many rows away a cell may influence another."""
+        # Noise is filtered twice, and a gap is as wide as what spans it plus a disc on either side
+        # and a margin, between which it is interpolated.
         gaps = self.gaps.span_cells + 2 * self.gaps.gap_cells + 2
         return _REACH_OF_OUTLIERS + 2 * self.surface.denoise_cells + gaps

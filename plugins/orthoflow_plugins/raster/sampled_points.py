@@ -1,4 +1,4 @@
-"""Some points of a cloud, for a short look: how far walls reach, and why cells are empty."""
+"""A sample of a cloud for quick checks: extents of walls, and causes of empty cells."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
-# More points are not read: one of every so many, spread by chance.
+# Maximum number of points that are read, one of every n, chosen by hashing.
 _POINTS_MOST: Final = 1 << 21
-# Neither rows nor columns of a scan repeat as multiples of this do (Fibonacci hashing).
+# Multiples of this do not coincide with rows or columns of a scan (Fibonacci hashing).
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SampledPoints:
-    """Some points of a cloud.
+    """A sample of the points of a cloud.
 
     Attributes:
         origin: (3,) metres, of the cloud.
         x: (n,) float32 metres from the origin along x.
         y: (n,) likewise along y.
         z: (n,) likewise along z.
-        n_represented: how many points of the cloud each stands for.
+        n_represented: number of points of the cloud that each represents.
     """
 
     origin: NDArray[np.float64]
@@ -37,7 +37,7 @@ class SampledPoints:
 
     @property
     def boxes_m(self) -> None:
-        """No boxes: what is drawn from the whole cloud lies everywhere."""
+        """Return no boxes: points drawn from the whole cloud are everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class PointsInside:
 
     Attributes:
         places: (n, 2) column and row.
-        depth_m: (n,) metres before the plane.
+        depth_m: (n,) metres in front of the plane.
         cells: (n,) row * width + column of their cell.
     """
 
@@ -56,7 +56,7 @@ class PointsInside:
 
 
 def sampled(cloud: PointCloud) -> SampledPoints:
-    """Take one point of every so many, so that a look at all walls is short."""
+    """Take one point of every n, so that all walls are checked quickly."""
     every = -(-len(cloud) // _POINTS_MOST)
     index = np.arange(0, len(cloud), every)
     if every > 1:

@@ -1,4 +1,4 @@
-"""Compiled passes that carry the surface across void cells between neighbours in a scan's grid."""
+"""Compiled passes that interpolate void cells between neighbours in a scan's grid."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.interpolation import CellValues
 from orthoflow.geometry.point_kernels import Offsets
 
-# A hair outside of a triangle still counts: a centre on an edge belongs to one of two at least.
+# Slightly outside of a triangle still counts: a centre on an edge belongs to at least one of two.
 _ON_EDGE = 1e-9
 
 
 class ScanGrid(NamedTuple):
-    """Points of one scan by their row and column.
+    """Points of one scan by row and column.
 
     Attributes:
-        points: (rows, cols) int64 index in the cloud, -1 where none is.
+        points: (rows, cols) int64 index in the cloud, -1 without one.
         offsets: of the cloud.
         wall_from_offset: (3, 4) float64; rows give column, row and depth in metres of an offset.
     """
@@ -30,12 +30,12 @@ class ScanGrid(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """What neighbours may stand for one surface.
+    """Limits for neighbours on one surface.
 
     Attributes:
         step: rows and columns of the scan between them.
-        side_cells: their distance on the wall along u and along v, at most.
-        step_m: difference of their depths, at most.
+        side_cells: maximum distance on the wall along u and along v.
+        step_m: maximum difference of their depths.
     """
 
     step: int
@@ -44,10 +44,10 @@ class Reach(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What triangles lay into the cells that they cover, summed, flat over cells.
+    """Sums over the triangles that cover cells, flat over cells.
 
     Attributes:
-        n: uint16 triangles.
+        n: uint16 number of triangles.
         depth_m: float32.
         intensity: float32.
         rgb: (cells, 3) float32.
@@ -68,15 +68,15 @@ def recover_between(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Lay the triangles of neighbours into void cells, linear between them.
+    """Add the triangles of neighbours to void cells, interpolated linearly.
 
-    A square of four neighbours is cut along both of its diagonals, so that neither counts more.
+    A square of four neighbours is cut along both of its diagonals, so that both have equal weight.
 
     Args:
         grid: one scan.
-        intensity: of the cloud, or without points.
-        rgb: of the cloud, or without points.
-        reach: what neighbours are.
+        intensity: of the cloud, or empty.
+        rgb: of the cloud, or empty.
+        reach: limits for neighbours.
         is_void: (rows, cols) of the wall.
         sums: added to.
     """
@@ -90,7 +90,7 @@ def recover_between(
             if chosen[0] < 0:
                 continue
             _place(grid, chosen[0], corners[0])
-            # The four squares about a point, of each the half with its right angle there.
+            # The four squares around a point, of each the half with its right angle there.
             for quarter in range(4):
                 across = column + (step if quarter % 2 else -step)
                 down = row + (step if quarter // 2 else -step)
@@ -110,12 +110,12 @@ def recover_between(
 def take_means(
     cells: NDArray[np.int64], sums: Sums, is_void: NDArray[np.bool_], values: CellValues
 ) -> None:
-    """Return some void cells the mean of what triangles laid into them, if any did.
+    """Set some void cells to the mean of the triangles that cover them, if any.
 
     Args:
         cells: flat indices.
         sums: of the triangles.
-        is_void: (cells,), made false where a cell is filled.
+        is_void: (cells,), cleared where a cell is filled.
         values: written where a cell is filled.
     """
     for cell in cells:
@@ -134,7 +134,7 @@ def take_means(
 
 @compiled
 def _place(grid: ScanGrid, point: int, place: NDArray[np.float64]) -> None:
-    """Column, row and depth of a point."""
+    """Return column, row and depth of a point."""
     offsets = grid.offsets
     x, y, z = offsets.x[point], offsets.y[point], offsets.z[point]
     m = grid.wall_from_offset
@@ -161,7 +161,7 @@ def _fill(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add a triangle to the void cells whose centres lie in it."""
+    """Add a triangle to the void cells whose centres are in it."""
     ax, ay, bx, by = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cx, cy = corners[2, 0], corners[2, 1]
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)

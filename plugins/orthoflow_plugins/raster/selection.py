@@ -17,25 +17,25 @@ from orthoflow.products import Planes
 Constraint = Literal["vertical", "horizontal", "any"]
 Place = tuple[float, float, float]
 
-# How far a plane may lean and still count as vertical or horizontal.
+# Maximum tilt of a plane that counts as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
-# A plane counts as part of a larger wall's relief below this angle and above this overlap.
+# A plane belongs to a larger wall's relief below this angle and above this overlap.
 _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallChoice:
-    """What decides which planes are rastered.
+    """The criteria by which planes are rastered.
 
     Attributes:
         constraint: direction of the planes.
         min_area_m2: smallest rectangle; the plane with the most support is exempt.
-        n_walls_max: at most so many, by support.
-        skip_covered: leave out planes that a larger wall shows as its relief.
-        buffer_m: gives how far the wall of a plane reaches in front of and behind it.
-        ranks: these planes and no others, whatever else is said; empty for no such choice.
-        near: (x, y, z) in metres: to each the plane of the right direction whose rectangle is
+        n_walls_max: maximum number, by support.
+        skip_covered: omit planes that a larger wall shows as its relief.
+        buffer_m: returns the depths of a plane's wall in front of and behind it.
+        ranks: only these planes, whatever the other criteria; empty for no such choice.
+        near: (x, y, z) in metres: for each the plane of the right direction whose rectangle is
             nearest, and no others; empty for no such choice.
     """
 
@@ -49,10 +49,10 @@ class WallChoice:
 
 
 def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
-    """Indices of the planes to raster, by support, largest first.
+    """Return indices of the planes to raster, by support, largest first.
 
     Raises:
-        MethodError: no plane has the wanted direction or rank, or there is none at all.
+        MethodError: no plane has the requested direction or rank, or there is none at all.
     """
     if len(planes) == 0:
         raise MethodError("no plane was found in the cloud, at least one is needed for a wall")
@@ -73,7 +73,8 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
     if choice.near:
         return sorted({nearest_plane(planes, fitting, np.array(place)) for place in choice.near})
     large = [k for k in fitting if area_m2(planes.corners[k]) >= choice.min_area_m2]
-    # The best supported plane stays whatever its size: a scan of one small object has a wall too.
+    # The plane with the most support is exempt from the size: a scan of one small object has a wall
+    # too.
     chosen: list[int] = []
     for index in sorted({fitting[0], *large}):
         if len(chosen) == choice.n_walls_max:
@@ -96,12 +97,12 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
 
 
 def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
-    """Planes left out, of those up to the last that was looked at -> the wall they lie on.
+    """Return planes left out, up to the last that was examined -> the wall that shows them.
 
     Args:
         planes: by support.
-        choice: what decided.
-        chosen: what `chosen_planes` chose of them by it.
+        choice: the criteria.
+        chosen: result of `chosen_planes` for them.
     """
     if not choice.skip_covered or choice.ranks or choice.near:
         return {}
@@ -122,12 +123,12 @@ def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) ->
 
 
 def chosen_relief(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
-    """Planes chosen by a point near them that lie on a better supported wall -> that wall.
+    """Return planes chosen by a nearby point that lie on a better supported wall -> that wall.
 
     Args:
         planes: by support.
-        choice: what decided; empty without `near`, and where relief is not left out anyway.
-        chosen: what `chosen_planes` chose of them by it.
+        choice: the criteria; empty without `near`, and if relief is not left out anyway.
+        chosen: result of `chosen_planes` for them.
     """
     if not choice.skip_covered or not choice.near:
         return {}
@@ -141,14 +142,14 @@ def chosen_relief(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> 
 
 
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
-    """Index of the plane nearest to a point (3,), of equally near ones the better supported."""
+    """Return the plane nearest to a point (3,), of equally near ones the better supported."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
 
 
 def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
-    """Distance of a point (3,) from what is known of a plane's surface.
+    """Return the distance of a point (3,) from the measured surface of a plane.
 
-    That is the nearest of its connected parts, or its rectangle where no parts are known.
+    That is the nearest of its connected parts, or its rectangle without parts.
     """
     rectangles = planes.corners[index][None]
     if planes.part_corners is not None and planes.part_plane is not None:
@@ -158,13 +159,13 @@ def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
 
 
 def area_m2(corners: NDArray[np.float64]) -> float:
-    """Area of a rectangle given by its corners (4, 3), top-left first, counter-clockwise."""
+    """Return the area of a rectangle given by its corners (4, 3), top-left first."""
     down, right = corners[1] - corners[0], corners[3] - corners[0]
     return float(np.linalg.norm(np.cross(down, right)))
 
 
 def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> WallFrame:
-    """Lay the raster over a plane's rectangle, widened on all sides."""
+    """Place the raster over a plane's rectangle, widened on all sides."""
     corners = planes.corners[index]
     right = _unit(corners[3] - corners[0])
     down = _unit(corners[1] - corners[0])
@@ -176,7 +177,7 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
 
 
 def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> float:
-    """Distance of a point (3,) from a rectangle (4, 3)."""
+    """Return the distance of a point (3,) from a rectangle (4, 3)."""
     sides = np.array([corners[3] - corners[0], corners[1] - corners[0]])
     shares = (place - corners[0]) @ sides.T / np.maximum((sides**2).sum(axis=1), 1e-12)
     nearest = corners[0] + np.clip(shares, 0.0, 1.0) @ sides
@@ -184,7 +185,7 @@ def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> flo
 
 
 def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:
-    """Whether a plane lies within a wall's buffer, parallel to it and mostly inside its frame."""
+    """Whether a plane is within a wall's buffer, parallel to it and mostly inside its frame."""
     normal = planes.normal[wall]
     if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
         return False

@@ -1,4 +1,4 @@
-"""Compiled passes that make the surface of a wall: what the points of each cell add up to.
+"""Compiled passes that compute the surface of a wall from the points of each cell.
 
 They run over the entries of `raster_kernels`, each thread on the cells it owns.
 """
@@ -15,20 +15,20 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_kernels import BLOCK, Entries, is_own
 
-# The mean of more points lies near the centre of their cell. Of few it may lie aside, and over many
-# cells alike: where the scan's step is a whole part of a cell, by up to half a step.
+# With more points the mean is near the centre of the cell. With few it may be off, and over many
+# cells in the same way: by up to half a point spacing if the cell is a multiple of it.
 FEW_POINTS: Final = 16
 
 
 class FewPoints(NamedTuple):
-    """Where the points lie of cells with few of them, all flat over cells.
+    """Positions of the points of cells with few of them, all flat over cells.
 
     Attributes:
         n_inside: points in each cell.
         depths_m: the surface.
         layer_m: a point farther than this from the surface belongs to another layer.
         n_summed: uint8, points on the surface in cells with few points.
-        places: (cells, 2) float32, of these to the right of and below the centre, in cells.
+        places: (cells, 2) float32, sum of their positions right of and below the centre, in cells.
     """
 
     n_inside: NDArray[np.uint32]
@@ -54,10 +54,10 @@ def keep_nearest_around(
         entries: one chunk.
         offsets: of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
-        winners: (cells,) of `WINNER`, updated; points count in the cell that they lie in.
+        winners: (cells,) of `WINNER`, updated; points count in their own cell.
         width: columns of the raster.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     m = wall_from_offset
     height = winners.size // width
@@ -118,15 +118,15 @@ def sort_into_cells(
     owners: int,
     owner: int,
 ) -> None:
-    """Write each depth behind those its cell already holds.
+    """Append each depth to those of its cell.
 
     Args:
         entries: one chunk.
-        first_cell: the first of the cells that are asked for; points in others are passed over.
-        cursors: (cells asked for,) where the cell's next depth goes; moved on.
+        first_cell: first of the requested cells; points in others are skipped.
+        cursors: (requested cells,) where the cell's next depth goes; advanced.
         sorted_m: (points inside,) depths grouped by cell.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     for block in range(entries.n_inside.size):
         first = block * BLOCK
@@ -148,11 +148,11 @@ def median_depths(
     first: int,
     end: int,
 ) -> None:
-    """Median depth of each cell's best supported layer.
+    """Set the median depth of each cell's best supported layer.
 
-    The depths of a cell are split into layers where neighbours in depth lie more than `layer_m`
-    apart; the layer with the most points counts, among equals the one nearest the viewer. So no
-    depth lies between two surfaces, and a stray point does not matter.
+    The depths of a cell are split into layers at differences of more than `layer_m`; the layer with
+    the most points is used, among equals the one nearest the viewer. So no depth is between two
+    surfaces, and a stray point does not matter.
 
     Args:
         ends: (cells,) end of each cell's depths in `sorted_m`.
@@ -214,17 +214,17 @@ def add_values(  # noqa: PLR0913, PLR0917
     owners: int,
     owner: int,
 ) -> None:
-    """Sum the values of the points that lie on the surface of their cell.
+    """Sum the values of the points on the surface of their cell.
 
     Args:
         entries: one chunk.
-        values: (points of the cloud, channels); points whose first channel is NaN do not count.
-        has_value: (points of the cloud,) which of them count, or without points: all.
+        values: (points of the cloud, channels); points whose first channel is NaN are ignored.
+        has_value: (points of the cloud,) which points to use, or empty: all.
         depths_m: (cells,) the surface.
         layer_m: a point farther than this from the surface belongs to another layer.
         sums: (cells, channels + 1); the last channel counts the points.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     channels = values.shape[1]
     for block in range(entries.n_inside.size):
@@ -254,15 +254,15 @@ def add_places(
     owners: int,
     owner: int,
 ) -> None:
-    """Sum the places of the points on the surface, of cells with few points.
+    """Sum the positions of the points on the surface, of cells with few points.
 
     Args:
         entries: one chunk.
         offsets: of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
         few: added to.
-        owners: a power of two, how many threads share the cells.
-        owner: whose cells to visit.
+        owners: number of threads that share the cells, a power of two.
+        owner: the thread whose cells to visit.
     """
     m = wall_from_offset
     for block in range(entries.n_inside.size):
@@ -271,7 +271,7 @@ def add_places(
             cell = entries.cells[k]
             if not is_own(cell, owners, owner) or few.n_inside[cell] > FEW_POINTS:
                 continue
-            # Nothing lies on the surface of a void cell, whose depth is not a number.
+            # A void cell has no surface; its depth is NaN.
             if not abs(entries.depths_m[k] - few.depths_m[cell]) <= few.layer_m:
                 continue
             point = entries.points[k]

@@ -1,4 +1,4 @@
-"""The surface of a wall: one depth per cell, and what the points on it measured."""
+"""The surface of a wall: one depth per cell, and the measurements of its points."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from orthoflow_plugins.raster.depth_filters import denoised, without_specks
 from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, lay_net
 from orthoflow_plugins.raster.rules import SurfaceRule
 
-# What is made of cells for a moment is made of so many.
+# Temporary arrays are limited to this many cells.
 CELLS_AT_ONCE: Final = 1 << 20
-# The depths of so many points are sorted at once: 256 MB.
+# Number of depths sorted at once: 256 MB.
 _POINTS_AT_ONCE: Final = 1 << 26
 
 
@@ -45,10 +45,10 @@ class CellSurface:
         count: uint32.
         intensity: float32, NaN where void, or None.
         rgb: (cells, 3) uint8, 0 where void, or None.
-        has_rgb: (cells,) which have a colour; None where all with points have.
+        has_rgb: (cells,) which have a colour; None if all with points have.
         percentiles_m: (cells, k) float32, NaN in cells without points, or None.
-        places: (cells, 2) float32, where the points of a cell lie to the right of and below its
-            centre, in cells; (0, 0) where many do, NaN where none does.
+        places: (cells, 2) float32, position of the points of a cell right of and below its centre,
+            in cells; (0, 0) for many points, NaN for none.
     """
 
     depth_m: NDArray[np.float32]
@@ -64,13 +64,13 @@ class CellSurface:
 def surface_of(
     cloud: PointCloud, slab: Slab, rule: SurfaceRule, net: Net | None = None
 ) -> CellSurface:
-    """Lay a cloud into the raster of a wall.
+    """Bin a cloud into the raster of a wall.
 
     Args:
         cloud: the points.
         slab: of the wall, or of a part of it.
         rule: how.
-        net: of the surface tin over these cells, where the slab is a part; it is the surface's.
+        net: triangulation for the surface tin over these cells, if the slab is a part.
     """
     if rule.is_of_one_point:
         surface = _surface_of_winners(cloud, slab, rule, net)
@@ -82,9 +82,9 @@ def surface_of(
 
 
 def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> CellSurface:
-    """Carry intensity and colour of cells with few points from these to the centre of the cell.
+    """Extrapolate intensity and colour of cells with few points from these to the cell's centre.
 
-    Rules that take a single point take its values as they are.
+    Rules that use a single point take its values unchanged.
     """
     if rule.is_of_one_point or (surface.intensity is None and surface.rgb is None):
         return surface
@@ -102,7 +102,7 @@ def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> C
         threads=rule.threads,
     )
     if intensity is not None and surface.intensity is not None:
-        # Beside cells without intensity a cell keeps its own.
+        # Next to cells without intensity a cell keeps its own.
         is_lost = few[~np.isfinite(intensity[few])]
         intensity[is_lost] = surface.intensity[is_lost]
     if surface.has_rgb is not None:
@@ -124,7 +124,7 @@ def _surface_of_winners(
         )
     taken = partial(values_of_winners, winners, threads=rule.threads)
     intensity, rgb = cloud.intensity, cloud.rgb
-    # A nearest neighbour may lie in the next cell; a cell without a point of its own stays void.
+    # A nearest neighbour may be in the next cell; a cell without a point of its own stays void.
     has_point = winners["n_points"] > 0
     surface = CellSurface(
         depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
@@ -160,7 +160,7 @@ def _contest(
 
 
 def vertices_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Vertices:
-    """The points nearest to the centres of their cells, through which the surface tin goes."""
+    """Return the points nearest to the centres of their cells, the vertices of the surface tin."""
     winners = empty_winners(slab.n_cells, threads=rule.threads)
     for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(rule.threads, _contest(cloud, slab, rule, entries, winners))
@@ -176,7 +176,7 @@ def _vertices(winners: NDArray[np.void], slab: Slab) -> Vertices:
 
 
 def _spanned(surface: CellSurface, net: Net) -> CellSurface:
-    """Replace what the points of cells tell by what the net does, at the centres."""
+    """Replace the values of points in cells by those of the triangulation at the centres."""
     is_known = np.isfinite(net.depth_m)[:, np.newaxis]
     return replace(
         surface,
@@ -188,7 +188,7 @@ def _spanned(surface: CellSurface, net: Net) -> CellSurface:
 
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
-    """Two or three passes: count, sort if a median is wanted, average what lies on the surface."""
+    """Two or three passes: count, sort for a median, average the points on the surface."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(
@@ -236,7 +236,7 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
 
     Args:
         n_points: (cells,).
-        moments: (cells, 2) sums of depths and squared depths; used up.
+        moments: (cells, 2) sums of depths and squared depths; overwritten.
 
     Returns:
         (cells,) metres, NaN with fewer than two points.
@@ -259,7 +259,7 @@ class _Group:
     """The depths of all points inside some neighbouring cells, cell after cell.
 
     Attributes:
-        cells: which of the raster.
+        cells: the range of cells.
         depths_m: (points,) float32.
         ends: (cells,) where the depths of the next cell begin.
     """
@@ -272,7 +272,7 @@ class _Group:
 def _grouped(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
 ) -> Iterator[_Group]:
-    """Sort the depths of all points inside by cells, so many points at once."""
+    """Yield the depths of all points inside, sorted by cell, some points at a time."""
     width = slab.frame.width
     totals = np.cumsum(count, dtype=np.int64)
     first = n_before = 0
@@ -295,7 +295,7 @@ def _grouped(
 def _medians_m(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
 ) -> NDArray[np.float32]:
-    """Medians (cells,) of the cells' best supported layers."""
+    """Return medians (cells,) of the cells' best supported layers."""
     medians_m = np.empty(count.size, dtype=np.float32)
     for group in _grouped(cloud, slab, count, threads=rule.threads):
         _sort_depths(group, medians_m[group.cells], rule)
@@ -311,7 +311,7 @@ def _sort_depths(group: _Group, medians_m: NDArray[np.float32], rule: SurfaceRul
 def _percentiles_m(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
 ) -> NDArray[np.float32]:
-    """Percentiles (cells, k) of all points of a cell, linear between two of them as numpy's."""
+    """Return percentiles (cells, k) of all points of a cell, interpolated as by numpy."""
     percentiles_m = np.full((count.size, len(rule.percentiles)), np.nan, dtype=np.float32)
     for group in _grouped(cloud, slab, count, threads=rule.threads):
         into = percentiles_m[group.cells]
@@ -340,7 +340,7 @@ def _averaged_values(
     threads: int,
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
     channels = _channels(cloud)
-    # Whole numbers for colours: half the memory, and exact.
+    # Integers for colours: half the memory, and exact.
     sums = [
         np.zeros(
             (slab.n_cells, values.shape[1] + 1),
@@ -376,7 +376,7 @@ def _averaged_values(
         else:
             rgb = np.empty((slab.n_cells, 3), dtype=np.uint8)
             has_rgb = None if cloud.has_rgb is None else sum_of_values[:, -1] > 0
-        # Means take several times the memory of what is kept of them.
+        # Means take several times the memory of the result.
         for first in range(0, slab.n_cells, CELLS_AT_ONCE):
             part = slice(first, first + CELLS_AT_ONCE)
             with np.errstate(invalid="ignore"):
@@ -389,7 +389,7 @@ def _averaged_values(
 
 
 def _channels(cloud: PointCloud) -> list[tuple[NDArray[np.generic], NDArray[np.bool_]]]:
-    """Values of the points, and which have some; without points where all have, or NaN tells."""
+    """Return values of the points, and which have one; empty if all have, or if NaN marks them."""
     channels: list[tuple[NDArray[np.generic], NDArray[np.bool_]]] = []
     of_all = np.empty(0, dtype=np.bool_)
     if cloud.intensity is not None:

@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from orthoflow_plugins.raster.nets import Net
     from orthoflow_plugins.raster.surfaces import CellSurface
 
-# Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
+# Bytes per cell: of a finished wall, and additionally during the passes over one wall.
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
 _MEMORY_SHARE: Final = 0.75
-# Larger walls are rastered in bands of so many cells: 1.5 GB of memory.
+# Larger walls are rastered in bands of this many cells: 1.5 GB of memory.
 _BAND_CELLS: Final = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallRaster:
-    """A rastered wall, and how far apart the scan's points lie on it."""
+    """A rastered wall, and the point spacing of the scan on it."""
 
     wall: Wall
     scan_step_m: float
@@ -46,7 +46,7 @@ def require_memory(frames: Sequence[WallFrame]) -> None:
         MethodError: the rasters would not fit into memory.
     """
     sizes = [frame.width * frame.height for frame in frames]
-    # What is large lies in files once it is done; in bands it takes the memory of a band.
+    # A large wall is kept in files when finished; processed in bands it takes the memory of a band.
     kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     working = min(max(sizes), _BAND_CELLS)
     needed = _BYTES_KEPT * kept + _BYTES_WORKING * working
@@ -76,9 +76,9 @@ def rastered_wall(
         cloud: the points.
         slab: of the wall.
         rule: how.
-        planes: of which the wall is one.
+        planes: all planes, of which the wall is one.
         index: of the wall's plane.
-        allocate: gives the arrays of a large wall, by name.
+        allocate: returns the arrays of a large wall, by name.
     """
     if slab.n_cells > _BAND_CELLS:
         raster = _rastered_in_bands(cloud, slab, rule, allocate)
@@ -107,7 +107,7 @@ def rastered_wall(
 
 @dataclass(frozen=True, kw_only=True)
 class _Raster:
-    """The surface over a slab, and where it comes from.
+    """The surface over a slab, and the state of its cells.
 
     Attributes:
         surface: flat over the cells.
@@ -133,7 +133,7 @@ def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule, net: Net | None =
 def _rastered_in_bands(
     cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate
 ) -> _Raster:
-    """Raster a wall band by band; memory is that of one band."""
+    """Raster a wall band by band, with the memory of one band."""
     from orthoflow_plugins.raster.surfaces import CellSurface
 
     whole: dict[str, NDArray[np.generic]] = {}
@@ -159,7 +159,7 @@ def _rastered_in_bands(
 
 
 def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate) -> Net:
-    """The net of a large wall: its corners are found band by band, and lie in files as it does."""
+    """Triangulate a large wall: its vertices are found band by band, and are kept in files."""
     from orthoflow_plugins.raster.nets import Vertices, lay_net
     from orthoflow_plugins.raster.surfaces import vertices_of
 
@@ -186,7 +186,7 @@ def _in_files(raster: _Raster, allocate: Allocate) -> _Raster:
 
 
 def _fields_of(surface: CellSurface) -> dict[str, NDArray[np.generic]]:
-    """Arrays of a surface that a wall keeps, by name."""
+    """Return arrays of a surface that a wall keeps, by name."""
     found = {field.name: getattr(surface, field.name) for field in fields(surface)}
     return {
         name: values for name, values in found.items() if name != "places" and values is not None
@@ -194,7 +194,7 @@ def _fields_of(surface: CellSurface) -> dict[str, NDArray[np.generic]]:
 
 
 def _where_known(raster: _Raster, shape: tuple[int, int], allocate: Allocate) -> NDArray[np.uint8]:
-    """1 where a cell has a colour, else 0; of a large wall in a file."""
+    """Return 1 where a cell has a colour, else 0; in a file for a large wall."""
     mask = raster.mask.reshape(shape)
     if mask.size <= _BAND_CELLS:
         known = (mask > 0).astype(np.uint8)

@@ -43,8 +43,7 @@ from orthoflow_plugins.segment.sight_lines import sight_lines
 _UPRIGHT: Final = math.sin(math.radians(30.0))
 # What lies farther behind a plane is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
-# Empty areas are openings by their shape alone: they fill so much of their rectangle, as round
-# windows do. Shadows do not.
+# Empty areas must fill this share of their rectangle, as round windows do. Shadows do not.
 _FILLED_LEAST: Final = 0.7
 _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_data"}
 NO_CLOUD: Final = DiagnosticSpec(
@@ -70,20 +69,20 @@ OTHER_CELLS: Final = DiagnosticSpec(
 
 
 class SegmentOpenings(Method):
-    """Find windows, doors and niches: what lies behind a wall's face, or shows nothing.
+    """Find windows, doors and niches: areas of a wall behind its face, or without points.
 
-    Connected cells of a wall that lie behind its face, or are empty, are an opening where
-    a square of some width fits in and the face was measured along most of the rim. The face is the
-    plane, or where more than half of the wall lies behind that, the middle of what does. With the
-    cloud, lines of sight are followed: an area through which some went is `through`; where they
-    ended before the wall it is hidden, and no opening. What is empty without either, and about as
-    compact as a round window, is `no data`, glass or a mirror most often; what has a measured back
-    is a `niche`, shut doors and windows set back among them.
+    Connected cells behind the face of a wall, or empty ones, are an opening if a square of some
+    width fits in and the face was measured along most of their border. The face is the plane, or
+    the median of the cells behind it if these are more than half of the wall. With the cloud, lines
+    of sight are followed: an area through which some passed is `through`; where they ended in front
+    of the wall it is hidden, and not an opening. An empty area without either that is about as
+    compact as a round window is `no data`, most often glass or a mirror; one with a measured back
+    is a `niche`, including closed doors and windows set back.
 
-    Sides are lines through the borders of the cells along them. Each states how exact it is, by
-    cells, the spacing of the points and its own scatter. With orthoimages of photos, long sides
-    move to the edge of the picture that is surely the same, where the scan is too coarse for as
-    good a place.
+    Sides are lines through the borders of the cells along them. The accuracy of each is stated,
+    from the size of cells, the point spacing and its own scatter. With orthoimages of photos, long
+    sides move to the corresponding edge of the picture if it is unambiguous and the scan is less
+    accurate.
     """
 
     id: ClassVar[str] = "segment.openings"
@@ -106,7 +105,7 @@ class SegmentOpenings(Method):
     )
 
     class Params(MethodParams):
-        """What counts as an opening."""
+        """The criteria of an opening."""
 
         behind_m: float = Field(
             default=0.05,
@@ -133,19 +132,19 @@ class SegmentOpenings(Method):
         level: bool = Field(default=False, description="Look at floors, ceilings and slopes, too.")
 
     class In(Ports):
-        """Walls; the cloud shows what is hidden, orthoimages make sides more exact."""
+        """Walls; the cloud shows what is hidden, orthoimages refine sides."""
 
         walls: Walls
         cloud: PointCloud | None = None
         orthoimages: Orthoimages | None = None
 
     class Out(Ports):
-        """What was found."""
+        """The openings found."""
 
         openings: Openings
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Look at wall after wall."""
+        """Search wall after wall."""
         walls = inputs.walls
         chosen = [
             place
@@ -185,7 +184,7 @@ class SegmentOpenings(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Found:
-    """Openings of one wall, and how many areas were none for want of a rim or of shape."""
+    """Return the openings of one wall, and the number of areas rejected by border or by shape."""
 
     wall: Wall
     openings: tuple[Opening, ...]
@@ -232,7 +231,7 @@ def _opening(
     wall: Wall, relief: Relief, area: Area, outline: Outline, by_image: NDArray[np.bool_]
 ) -> Opening:
     frame = wall.frame
-    # Of every nth cell; the first is the first.
+    # Of every nth cell, beginning with the first.
     cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
     places = frame.raster_from_wall(cells)
     spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
@@ -258,9 +257,9 @@ def _opening(
 def _grey(
     images: Orthoimages | None, wall: Wall, relief: Relief, ctx: StepContext
 ) -> NDArray[np.float32] | None:
-    """Grey (rows, cols) 0..255 of the wall's orthoimage on the relief's cells, None without."""
+    """Return grey (rows, cols) 0..255 of the wall's orthoimage on the relief's cells, or None."""
     image = _image_of(images, wall)
-    # What the cloud painted has the edges of the cells that its points fell into, not finer ones.
+    # An orthoimage painted from the cloud has the edges of its cells, not finer ones.
     if image is None or set(image.sources) <= {"cloud"}:
         return None
     if not image.frame.has_cells_of(wall.frame):
@@ -273,7 +272,7 @@ def _grey(
 
 
 def _image_of(images: Orthoimages | None, wall: Wall) -> Orthoimage | None:
-    """Its orthoimage, by the number of the plane."""
+    """Return its orthoimage, by the number of the plane."""
     for image in () if images is None else images.images:
         if image.number == wall.plane_index:
             return image
@@ -287,7 +286,7 @@ def _draw(
     openings: list[Opening],
     ctx: StepContext,
 ) -> None:
-    """Draw outlines over the orthoimage, or else what the laser saw."""
+    """Draw outlines over the orthoimage, or else over the intensity."""
     frame, step = wall.frame, relief.step
     if grey is not None:
         shown = grey / 255.0

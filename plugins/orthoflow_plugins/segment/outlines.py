@@ -1,4 +1,4 @@
-"""Outlines of areas of cells: straight sides where they are straight, and how exact each is."""
+"""Outlines of areas of cells with straight sides, and the accuracy of each side."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from orthoflow.geometry.rings import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 
-# Corners nearer to the line between their neighbours are cells' and noise.
+# Corners closer to the line between their neighbours are caused by cells and noise.
 _STRAIGHT_CELLS: Final = 2.0
-# Once sides are straight lines, so little is no corner.
+# Once sides are straight lines, a smaller turn is not a corner.
 _JOINED_CELLS: Final = 1.0
-# Of shorter sides the corners are left where they are.
+# The corners of shorter sides are not moved.
 _FITTED_CELLS: Final = 8.0
 # Sides that meet at a smaller angle keep the corner between them.
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
-# The ends of a side belong to its corners, and what lies farther off than this is something else.
+# The ends of a side belong to its corners, and cells farther away than this are not part of it.
 _ENDS_CELLS: Final = 3.0
 _FAR_CELLS: Final = 3.0
-# How far beyond a side the wall's face is looked for, and how much of it is enough.
+# How far beyond a side the wall's face is searched, and how much of it suffices.
 _BESIDE_CELLS: Final = (2.0, 3.0, 4.0)
 _BESIDE_LEAST: Final = 0.5
-# Standard deviation of a place of which nothing is known but an interval of length 1.
+# Standard deviation of a position known to an interval of length 1.
 _UNIFORM: Final = 1.0 / math.sqrt(12.0)
-# The cell through which a border runs may be either side's, so it lies anywhere in two.
+# The cell crossed by a border may be on either side, so the border is within two cells.
 _BORDER_CELLS: Final = 2.0
 
 
@@ -41,8 +41,8 @@ class Outline:
     Attributes:
         corners: (n, 2) column and row, the centre of the first cell at (0.5, 0.5),
             counter-clockwise for the viewer.
-        sigma: (n,) cells, across each side, from corner i to the next.
-        seen_share: (n,) of each side, along which the wall's face was measured beside it.
+        sigma: (n,) cells, perpendicular to each side, from corner i to the next.
+        seen_share: (n,) share of each side along which the wall's face was measured.
     """
 
     corners: NDArray[np.float64]
@@ -67,12 +67,12 @@ class Outline:
 
 
 def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
-    """Draw the outline of an area; None where nothing is left of it.
+    """Draw the outline of an area; None if nothing is left of it.
 
     Args:
         area: its cells.
-        relief: what it was found in.
-        spacing_m: of the scan's points, between which borders may lie anywhere.
+        relief: the relief in which it was found.
+        spacing_m: point spacing of the scan; a border can be anywhere between two points.
     """
     ring = _ring(area.cells)
     kept = _corner_places(ring)
@@ -92,9 +92,9 @@ def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Side:
-    """A piece of a ring, by the places of its ends, and the line through the middles along it.
+    """A piece of a ring, by the indices of its ends, and the line fitted through it.
 
-    `middle` and `direction` are None where it is too short for a line of its own.
+    `middle` and `direction` are None if it is too short for a line of its own.
     """
 
     first: int
@@ -112,7 +112,7 @@ class _Side:
 
 
 def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Middles (n, 2) of the cells' sides along the border, counter-clockwise for the viewer."""
+    """Midpoints (n, 2) of cell sides along the border, counter-clockwise for the viewer."""
     from orthoflow.files.polygons import outlines
 
     found = outlines(cells.astype(np.int16) - 1)
@@ -129,15 +129,15 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Places in a ring where it turns (Douglas and Peucker)."""
+    """Return the indices of a ring at which it turns (Douglas and Peucker)."""
     import cv2
 
-    # Half cells are exact in whole numbers, by which the corners are found again.
+    # Half cells are exact as integers, by which the corners are found again.
     doubled = np.rint(2.0 * ring).astype(np.int32)
     simple = cv2.approxPolyDP(doubled[:, None, :], 2.0 * _STRAIGHT_CELLS, closed=True)[:, 0]
     place_of = {(int(x), int(y)): place for place, (x, y) in enumerate(doubled)}
     kept = sorted(place_of[(int(x), int(y))] for x, y in simple)
-    # Where it began to look, a corner is left that need not be one.
+    # The point at which the algorithm starts is kept, although it need not be a corner.
     for place in list(kept):
         at = kept.index(place)
         before, after = ring[kept[at - 1]], ring[kept[(at + 1) % len(kept)]]
@@ -151,7 +151,7 @@ def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
-    """Leave out short sides that only cut the corner in which their neighbours meet."""
+    """Drop short sides that only cut the corner in which their neighbours meet."""
     kept = list(sides)
     for side in sides:
         at = kept.index(side)
@@ -165,7 +165,7 @@ def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
 
 
 def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
-    """Fit a line through the middles between two corners, those far off left out."""
+    """Fit a line through the midpoints between two corners, without outliers."""
     along = ring[first : last + 1] if first <= last else np.vstack([ring[first:], ring[: last + 1]])
     begin, end = along[0], along[-1]
     length = float(np.linalg.norm(end - begin))
@@ -197,7 +197,7 @@ def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
 
 
 def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
-    """Make one side of two between which the outline hardly turns."""
+    """Join two sides between which the outline hardly turns."""
     joined = list(sides)
     while len(joined) > 3:
         corners = _corners(joined)
@@ -215,12 +215,12 @@ def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
 
 
 def _corners(sides: list[_Side]) -> NDArray[np.float64]:
-    """Corners (n, 2) at which sides begin."""
+    """Return the corners (n, 2) at which sides begin."""
     return np.array([_corner(sides[k - 1], sides[k]) for k in range(len(sides))])
 
 
 def _corner(before: _Side, after: _Side) -> NDArray[np.float64]:
-    """Where two sides meet; near the place where the cells have their corner."""
+    """Return where two sides meet, close to the corner of the cells."""
     met = _meeting(before, after)
     if met is not None and np.linalg.norm(met - after.begin) <= _FITTED_CELLS:
         return met
@@ -244,7 +244,7 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Of a side: a cell's own and that of the points, whose lines may run along it, and scatter."""
+    """Sigma of a side: of a cell, of the points, which may run along it, and of its scatter."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))
@@ -252,7 +252,7 @@ def _sigma(side: _Side, spacing: float) -> float:
 
 
 def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Share (n,) of each side beside which the wall's face was measured."""
+    """Return the share (n,) of each side along which the wall's face was measured."""
     rows, columns = is_face.shape
     shares = np.zeros(len(corners))
     for k, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -260,7 +260,7 @@ def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> ND
         length = float(np.linalg.norm(way))
         if length <= 0.0:
             continue
-        # Counter-clockwise for the viewer with rows downwards: outside is to the right of the way.
+        # Counter-clockwise for the viewer with rows downwards: outside is to the right.
         outwards = np.array([-way[1], way[0]]) / length
         at = begin + ((np.arange(math.ceil(length)) + 0.5) / math.ceil(length))[:, None] * way
         found = np.zeros(len(at), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Where lines of sight crossed a wall, or ended before it: what makes an empty cell an opening."""
+"""Where lines of sight crossed a wall or ended in front of it, to classify empty cells."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
-# Rays are counted on tiles of about this side, which hold many.
+# Rays are counted on tiles of about this side, which hold many rays.
 _TILE_M: Final = 0.05
-# Of larger clouds one point of every so many is asked, spread by chance (Fibonacci hashing).
+# Of larger clouds one point of this many is used, spread by Fibonacci hashing.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
-# Without stations, what lies so far behind or before an empty place, square to the wall, tells.
+# Without stations, points this far behind or in front of an empty place decide.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
-# Single points far off are gross errors of the scanner: of the rays at a tile, so many must agree.
+# Isolated distant points are gross errors: this many rays of a tile must agree.
 _RAYS_LEAST: Final = 2
 _SHARE_LEAST: Final = 0.2
 
@@ -31,9 +31,9 @@ class SightLines:
     """What lines of sight show about a wall, on tiles of its raster.
 
     Attributes:
-        side: cells of the wall that a tile is wide and high.
-        crossed: (rows, cols) bool, rays went through the wall here.
-        stopped: (rows, cols) bool, rays ended before it here, and none went through.
+        side: cells along the side of a tile.
+        crossed: (rows, cols) bool, rays passed through the wall here.
+        stopped: (rows, cols) bool, rays ended in front of it here, and none passed through.
     """
 
     side: int
@@ -51,13 +51,12 @@ class SightLines:
 def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
     """Follow the rays of a cloud to a wall.
 
-    Where it is known from which station each point was seen, it is the end of a ray that is
-    followed from there to the wall's plane, or prolonged to it. Otherwise the wall is looked at
-    squarely.
+    If the station of each point is known, the point is the end of a ray that is followed from there
+    to the wall's plane, or extended to it. Otherwise rays perpendicular to the wall are assumed.
 
     Args:
         cloud: the points.
-        slab: the wall's raster, and how far before and behind its plane points belong to it.
+        slab: the wall's raster, and its depths in front of and behind its plane.
     """
     frame = slab.frame
     side = max(1, min(round(_TILE_M / frame.gsd_m), *frame.shape))
@@ -71,7 +70,7 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
             asked = (depth_m > -_BEHIND_MOST_M) & (depth_m < _BEFORE_MOST_M)
         else:
             from_station = tiles.wall_from_world(starts)
-            # Seen from behind, or along the plane, a ray tells nothing.
+            # A ray from behind, or along the plane, shows nothing.
             asked = (from_station[:, 2] > np.maximum(depth_m, 0.0)) & (from_station[:, 2] > 0.0)
             fall = np.where(asked, from_station[:, 2] - depth_m, 1.0)
             share = np.where(asked, from_station[:, 2] / fall, 0.0)[:, None]
@@ -102,7 +101,7 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
 def _rays(
     cloud: PointCloud,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64] | None]]:
-    """Ends (n, 3) of rays, block by block, and where they began where that is known."""
+    """Yield ends (n, 3) of rays, block by block, and their starts if known."""
     # Without the scan of each point, some scans may have been taken from elsewhere.
     stations = cloud.stations if cloud.stations_source == "file" else None
     scan = cloud.scan

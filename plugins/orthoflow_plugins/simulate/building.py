@@ -1,4 +1,4 @@
-"""Building a scene out of rectangles: walls with what stands out of them and goes into them."""
+"""Building a scene out of rectangles: walls with relief and recesses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Paint:
     """A texture with its parameters.
 
     Attributes:
-        kind: how it is painted.
+        kind: pattern.
         rgb: ground colour, 0..255.
         reflectance: for the laser, 0..1.
         contrast: 0..1.
@@ -39,7 +39,7 @@ class Paint:
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """One rectangle of a scene in the making: where, how large, and what it is."""
+    """One rectangle of a scene under construction: position, size and meaning."""
 
     centre: NDArray[np.float64]
     axis_a: NDArray[np.float64]
@@ -58,7 +58,7 @@ class TruePlane:
     Attributes:
         name: label.
         plane: the plane, normal towards the room.
-        outline: (4, 3) float64 metres, a rectangle on it that contains what belongs to it.
+        outline: (4, 3) float64 metres, a rectangle on it that contains all of its surface.
     """
 
     name: str
@@ -110,10 +110,10 @@ class SceneDraft:
 
 @dataclass(frozen=True, kw_only=True)
 class Side:
-    """A wall, floor or ceiling in the making, with coordinates of its own.
+    """A wall, floor or ceiling under construction, with coordinates of its own.
 
     Attributes:
-        draft: what the rectangles go to.
+        draft: the draft that receives the rectangles.
         foot: (3,) point of the wall nearest to the room's origin; a = b = 0.
         axis_a: (3,) to the right for a viewer in the room.
         axis_b: (3,) up in the wall.
@@ -183,13 +183,13 @@ class Side:
             self.box(bar, depth_m, paint, base_m=base_m)
 
     def recess(self, extent: Extent, depth_m: float, paint: Paint, *, plane: int = -1) -> Extent:
-        """Add a recess `depth_m` behind the wall; give the hole that the wall needs."""
+        """Add a recess `depth_m` behind the wall; return the hole that the wall needs."""
         self.place(extent, -depth_m, paint, SurfaceRole.RECESS, plane=plane)
         self.rims(extent, (-depth_m, 0.0), paint, SurfaceRole.RECESS)
         return extent
 
     def true_plane(self, name: str, extent: Extent, depth_m: float = 0.0) -> int:
-        """Announce a plane parallel to the wall; give its number."""
+        """Register a plane parallel to the wall; return its number."""
         a0, a1, b0, b1 = extent
         foot = self.foot + depth_m * self.normal
         outline = np.array(
@@ -227,10 +227,10 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
     """Begin a wall.
 
     Args:
-        draft: what the rectangles go to.
-        omega_deg: direction of the outward normal, as markiewicz2015 gives it.
+        draft: the draft that receives the rectangles.
+        omega_deg: direction of the outward normal, as in markiewicz2015.
         phi_deg: its inclination.
-        distance_m: of the wall from the room's origin.
+        distance_m: distance of the wall from the room's origin.
     """
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
     outward = np.array(
@@ -271,11 +271,11 @@ def add_block(
     """Add a free-standing box.
 
     Args:
-        draft: what the rectangles go to.
+        draft: the draft that receives the rectangles.
         base: (3,) middle of its bottom, metres.
         yaw_deg: turn about the vertical; 0 puts the first size along x.
         size_m: length, depth, height.
-        paint: all its faces.
+        paint: texture of all its faces.
     """
     yaw = math.radians(yaw_deg)
     along = np.array([math.cos(yaw), math.sin(yaw), 0.0])

@@ -1,4 +1,4 @@
-"""What leaves the simulation: cloud, truth and check points, and what is reported of them."""
+"""The results of the simulation: cloud, truth and check points, and their metrics."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _LIFT_M: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Delivery:
-    """A scanned room and where it lies.
+    """A scanned room and its position in the world.
 
     Attributes:
         room: the room, in its own frame.
         scan: the scans, in the same frame.
-        world_from_room: (3, 3) rotation; exact where it is of zeros, ones and minus ones.
+        world_from_room: (3, 3) rotation; exact if it consists of zeros, ones and minus ones.
         shift_world_m: (3,) world position of the room's origin.
     """
 
@@ -98,7 +98,7 @@ def truth_of(
     shots: tuple[Shot, ...],
     parameters: Mapping[str, JsonValue],
 ) -> Truth:
-    """Return the truth; planes come in the order of their numbers of points.
+    """Return the truth; planes are sorted by their numbers of points.
 
     Args:
         delivery: the scanned room.
@@ -138,11 +138,11 @@ def truth_of(
 
 @dataclass(frozen=True, kw_only=True)
 class ScanStep:
-    """Spacing of the points on a wall, as if they were in a square grid.
+    """Spacing of the points on a wall, as if they formed a square grid.
 
     Attributes:
-        median_m: half of the wall is scanned at least as finely.
-        p90_m: nine tenths are.
+        median_m: half of the wall is scanned at least this finely.
+        p90_m: nine tenths of the wall are.
     """
 
     median_m: float
@@ -197,7 +197,7 @@ def _contact_sheet(photos: Photos) -> bytes:
 
 
 def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | None:
-    """Measure the scan step on a plane from the points in tiles of 10 cm; None without tiles."""
+    """Measure the point spacing on a plane from tiles of 10 cm; None without tiles."""
     frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
     counts = np.zeros(frame.shape, dtype=np.int64)
     for start in range(0, len(cloud), _CHUNK):
@@ -213,7 +213,7 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | Non
 
 
 def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tiles whose neighbours all hold points: no rim of the wall cuts them."""
+    """Tiles whose neighbours all hold points, so that they are not cut by the wall's border."""
     padded = np.pad(filled, 1)
     inner = np.ones_like(filled)
     for row in range(3):
@@ -274,7 +274,7 @@ def _true_planes(
 def _corners_world(
     item: TruePlane, normal: NDArray[np.float64], delivery: Delivery
 ) -> NDArray[np.float64]:
-    """Corners of the rectangle along the wall axes that holds the plane's outline."""
+    """Return corners of the rectangle along the wall axes that contains the plane's outline."""
     outline = item.outline @ delivery.world_from_room.T
     axes = wall_axes(normal, delivery.up_world)
     low, high = (outline @ axes.T).min(axis=0), (outline @ axes.T).max(axis=0)
@@ -283,7 +283,7 @@ def _corners_world(
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Root mean square distance of each plane's points, summed block by block in order."""
+    """Return the RMS distance of each plane's points, summed block by block in order."""
     offsets = planes.offset - planes.normal @ cloud.origin
     sums = np.zeros(len(planes))
     for start in range(0, len(cloud), _CHUNK):
@@ -294,24 +294,24 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
             distances = Plane(
                 normal=planes.normal[index], offset_m=float(offsets[index])
             ).distances_m(points[label == index].astype(np.float64))
-            # Not as a product: BLAS adds in another order with another number of threads.
+            # Not as a product: the order of sums in BLAS depends on the number of threads.
             sums[index] += float(np.square(distances).sum())
     return np.sqrt(sums / np.maximum(planes.n_points, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Spots(Rows):
-    """Places on rectangles: rectangle (n,), and (a, b) metres (n, 2) on it."""
+    """Positions on rectangles: rectangle (n,), and (a, b) metres (n, 2) on it."""
 
     rectangle: NDArray[np.int64]
     in_rectangle: NDArray[np.float64]
 
     def moved(self, step: NDArray[np.float64]) -> _Spots:
-        """Move all places by (2,) or each by (n, 2)."""
+        """Move all positions by (2,) or each by (n, 2)."""
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:
-        """Points (n, 3) from the scene's origin."""
+        """Return points (n, 3) from the scene's origin."""
         chosen = self.rectangle
         return (
             scene.centre[chosen]
@@ -331,16 +331,16 @@ def check_points(
 ) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
-    `flat` ones are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
-    `vertical edge` ones are front corners of mouldings. A station sees each of them.
+    `flat` points are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
+    `vertical edge` points are front corners of mouldings. A station sees each of them.
 
     Args:
         scene: the room, in its own frame.
-        views: the same, arranged for viewing.
+        views: the same, prepared for rendering.
         stations: (s, 3) metres, room frame.
         world_from_room: (3, 3) rotation.
         shift_world_m: (3,) world position of the room's origin.
-        n_most: so many of each class, or what there are.
+        n_most: maximum number of each class.
     """
     chosen = {
         _FLAT: _spread(_crossings(scene, views, stations), n_most),
@@ -372,7 +372,7 @@ def _crossings(
 
 
 def _lattice(scene: Scene, index: int) -> _Spots:
-    """Crossings of the painted lines of a fresco."""
+    """Return crossings of the painted lines of a fresco."""
     step = _LATTICE * scene.texture_params[index, 5]
     a0, a1, b0, b1 = scene.extent[index] / step
     a, b = np.meshgrid(np.arange(np.ceil(a0), a1), np.arange(np.ceil(b0), b1))
@@ -383,7 +383,7 @@ def _lattice(scene: Scene, index: int) -> _Spots:
 def _corners(
     scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Front corners of mouldings parallel to the plane."""
+    """Return front corners of mouldings parallel to the plane."""
     walls = np.flatnonzero((scene.plane_index == _MAIN_WALL) & (scene.role == SurfaceRole.WALL))
     normal, foot = scene.normal[walls[0]], scene.centre[walls[0]]
     heights = (scene.centre - foot) @ normal
@@ -398,7 +398,7 @@ def _corners(
         in_rectangle=scene.extent[fronts][:, [[0, 2], [0, 3], [1, 2], [1, 3]]].reshape(-1, 2),
     )
     seen = _are_seen(scene, views, spots.moved(_INSIDE_M * inwards), stations)
-    # Where bars meet, their common corner lies in the middle of a face and shows no edge.
+    # Where bars meet, their common corner is in the middle of a face and shows no edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
     return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
 
@@ -406,7 +406,7 @@ def _corners(
 def _are_seen(
     scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Which places (n,) any station sees."""
+    """Report which positions (n,) any station sees."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:
@@ -416,7 +416,7 @@ def _are_seen(
 
 
 def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
-    """Which places (n,) have a surface at their own height, whatever rectangle it belongs to."""
+    """Report which positions (n,) have a surface at their own height, of any rectangle."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)
@@ -424,7 +424,7 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
 
 
 def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
-    """Points that lie far from each other: each next one is the farthest from all."""
+    """Return points far from each other: each next one is the farthest from all."""
     if len(points) <= n_most:
         return points
     chosen = [0]

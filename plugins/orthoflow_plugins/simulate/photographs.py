@@ -1,6 +1,6 @@
-"""The simulated photographer: where he stands, with which camera, and the JPEG files he brings.
+"""The simulated photographer: positions, camera, and the JPEG files.
 
-Layouts are those of markiewicz2015; pictures are made worse as lenses and sensors do.
+Layouts are those of markiewicz2015; pictures are degraded as by lenses and sensors.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
 
 PhotoLayout = Literal["none", "quick", "variant1", "variant2"]
 
-# Free of furniture and walls: along the main wall, towards it, and over the room's origin.
+# Free of furniture and walls: along the main wall, towards it, and above the room's origin.
 _FREE_LOW_M: Final = (-2.3, -1.65, -1.15)
 _FREE_HIGH_M: Final = (2.3, 1.95, 1.3)
-# Between floor and this height furniture stands behind the middle of the room.
+# Between the floor and this height furniture stands behind the middle of the room.
 _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# Lowest and highest of legs and of the upper body, over the room's origin, and half their widths.
+# Lowest and highest of legs and of the upper body, above the room's origin, and half widths.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
     *("centre", "axis_a", "axis_b", "extent"),
     *("plane_index", "role", "texture", "texture_params"),
 )
-# A focal length as files state it is off by up to so much.
+# Maximum relative error of a focal length in a file.
 _EXIF_ERROR: Final = 0.02
-# Levels go about with this root of the light.
+# Grey levels are about this root of the light.
 _GAMMA: Final = 2.2
 
 
@@ -70,7 +70,7 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class ShotPlan:
-    """What photos are wanted.
+    """Which photos are requested.
 
     Attributes:
         layout: which walls, and how many photos.
@@ -85,11 +85,11 @@ class ShotPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """What the pictures suffer from.
+    """The degradation of the pictures.
 
     Attributes:
-        noise_grey: standard deviation of a pixel and channel.
-        vignetting: share of the light that is lost in the corners.
+        noise_grey: standard deviation per pixel and channel.
+        vignetting: share of the light lost in the corners.
         supersample: rays per side of a pixel.
         exposures: photos get between 1 less and 1 plus this times the light.
     """
@@ -102,11 +102,11 @@ class Film:
 
 @dataclass(frozen=True, kw_only=True)
 class _Layout:
-    """A camera and what it is pointed at.
+    """A camera and its targets.
 
     Attributes:
         footprint_m: width and height of a photo on the wall.
-        distance_m: from the wall.
+        distance_m: distance from the wall.
         targets: number of the wall, and (a, b) on it.
     """
 
@@ -145,9 +145,9 @@ _WALL_NAMES: Final = ("main wall", "opposite wall", "right wall", "left wall")
 
 
 def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
-    """Plan the photos of a layout; the generator decides where exactly each is taken.
+    """Plan the photos of a layout; the generator varies their positions.
 
-    The photographer aims at a place, but stands aside and holds the camera a little askew. All
+    The photographer aims at a place, but stands aside and holds the camera slightly askew. All
     photos share one camera with Brown distortion.
     """
     if plan.layout == "none":
@@ -164,14 +164,14 @@ def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Return the scene as each photo finds it, with people before the main wall; none without any.
+    """Return the scene of each photo, with people in front of the main wall, if any.
 
-    Each is there in every other photo, somewhere along the wall and 0.5 to 1.4 m before it, and
-    keeps its clothes.
+    Each person is in every other photo, somewhere along the wall and 0.5 to 1.4 m in front of it,
+    in the same clothes.
     """
     if not count:
         return ()
-    # Of a stream of their own: without them photos stay what they were.
+    # From a random stream of their own: without people photos are unchanged.
     drawn = rng.spawn(1)[0]
     clothes = drawn.uniform(15.0, 240.0, (count, 2, 3))
     along, towards = main_wall_axes()
@@ -218,19 +218,19 @@ def take_photos(
     ctx: StepContext,
     rng: np.random.Generator,
 ) -> Photos:
-    """Take all photos of a room in its own frame; what is known of the camera is not in them.
+    """Take all photos of a room in its own frame, without camera data.
 
     Args:
-        views: the room, or as each of the photos finds it.
+        views: the room, or the scene of each photo.
         shots: the photos.
-        film: what they suffer from.
-        ctx: of the step.
-        rng: of all noise.
+        film: their degradation.
+        ctx: context of the step.
+        rng: generator of all noise.
     """
     if not shots:
         return Photos(photos=())
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
-    # Of a stream of their own: photos of one exposure stay what they were.
+    # From a random stream of their own: photos of equal exposure are unchanged.
     light = 1.0 + film.exposures * rng.spawn(1)[0].uniform(-1.0, 1.0, len(shots))
     photos = []
     for place, shot in enumerate(shots):
@@ -253,7 +253,7 @@ def take_photos(
 
 
 def calibrated(photos: Photos, calibration: Calibration) -> Photos:
-    """Give the photos with the calibration that all of them share; an empty one changes nothing."""
+    """Return the photos with their common calibration; an empty one changes nothing."""
     if not calibration.intrinsics:
         return photos
     known = calibration.intrinsics[0]
@@ -261,7 +261,7 @@ def calibrated(photos: Photos, calibration: Calibration) -> Photos:
 
 
 def calibration_of(shots: tuple[Shot, ...], *, is_known: bool) -> Calibration:
-    """Return the calibration of the one camera; empty when it is not known or there is no photo."""
+    """Return the calibration of the camera; empty if it is unknown or there is no photo."""
     if not (shots and is_known):
         return Calibration(patterns=(), intrinsics=())
     return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(shots[0].camera),))
@@ -344,7 +344,7 @@ def _shot(
 
 
 def _where_one_can_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest place to one (3,) that is inside the room and outside the furniture."""
+    """Return the position nearest to a given one (3,) inside the room and outside the furniture."""
     axes = np.vstack([main_wall_axes(), _UP])
     place = np.clip(axes @ wanted, _FREE_LOW_M, _FREE_HIGH_M)
     if place[1] < -0.35 or place[1] > 1.2:

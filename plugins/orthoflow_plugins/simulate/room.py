@@ -1,4 +1,4 @@
-"""`simulate.room`: a scanned palace room of which everything is known."""
+"""`simulate.room`: a scanned palace room with complete truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 SpectralGap = Literal["none", "easy", "hard", "inverted"]
 
 _PANORAMA_FACTOR: Final = 3.0
-# How much of what the laser sees is a pattern of its own.
+# Share of what the laser sees that has a pattern of its own.
 _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
     "none": 0.0,
     "easy": 0.3,
@@ -49,17 +49,17 @@ _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
 
 
 class SimulateRoom(Method):
-    """Scan and photograph a decorated room with relief, niche, door and an object before its wall.
+    """Scan and photograph a decorated room with relief, niche, door and a free-standing object.
 
-    Two scans per station: a panorama, and a detail scan of the main wall. Points come scan by
-    scan, column by column, from the lowest row up. Distances are noisy by range, incidence and
+    Two scans per station: a panorama, and a detail scan of the main wall. Points come scan by scan,
+    column by column, from the lowest row up. The noise of distances depends on range, incidence and
     material; some points are gross outliers, and at edges the distances of two surfaces mix. All
-    noise is a function of the seed and the place in the scan, so threads cannot change it.
+    noise is a function of the seed and the position in the scan, so it does not depend on threads.
 
-    Photos come from one free-hand camera with Brown distortion, a little aside and askew, as JPEG
-    files in the sRGB colours of the scene. `photos` is empty for `photo_layout: none`,
-    `calibration` is empty when the camera is not calibrated; a focal length as EXIF states it,
-    wrong by up to 2 %, is known in any case.
+    Photos come from one free-hand camera with Brown distortion, slightly off target and askew, as
+    JPEG files in the sRGB colours of the scene. `photos` is empty for `photo_layout: none`,
+    `calibration` is empty if the camera is not calibrated; the focal length in the EXIF data, wrong
+    by up to 2 %, is known in any case.
     """
 
     id: ClassVar[str] = "simulate.room"
@@ -82,7 +82,7 @@ class SimulateRoom(Method):
     )
 
     class Params(MethodParams):
-        """How the room is scanned and photographed, and where in the world it lies."""
+        """How the room is scanned and photographed, and where it is in the world."""
 
         scan_step_m: float = Field(
             0.0042,
@@ -253,11 +253,11 @@ class SimulateRoom(Method):
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Give the compiler, whose mathematical functions make the points, and what writes JPEG."""
+        """Versions of the compiler, whose functions compute the points, and of the JPEG writer."""
         return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Build the room, scan and photograph it, and write down the truth."""
+        """Build the room, scan and photograph it, and return the truth."""
         del inputs
         from orthoflow.geometry.scene_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import (
@@ -308,7 +308,7 @@ class SimulateRoom(Method):
             photo_rng,
         )
         cloud = cloud_of(delivery)
-        # Of rooms as they always were, records do not change.
+        # Records of rooms with default parameters do not change.
         added = {
             "decoration": "designed",
             "design_seed": None,
@@ -331,7 +331,7 @@ class SimulateRoom(Method):
 
 
 def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
-    """(3, 3) rotation about the room's z; the unit matrix, to the bit, for no turn."""
+    """Return the (3, 3) rotation about the room's z; exactly the unit matrix without rotation."""
     if turn_deg == 0.0:
         return np.eye(3)
     cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))

@@ -1,8 +1,8 @@
-"""The simulated room: four decorated walls, none quite square to the next, and what stands inside.
+"""The simulated room: four decorated walls, none quite perpendicular to the next, and objects.
 
-Room frame: metres, z up, origin in the middle of the room 1.5 m over the floor. The main wall is
+Room frame: metres, z up, origin in the middle of the room 1.5 m above the floor. The main wall is
 that of markiewicz2015: omega 102 deg, leaning by 0.8 deg. Other rooms have walls drawn from a
-family: cornices, pilasters, niches, panels, and doors that are set back.
+family: cornices, pilasters, niches, panels, and recessed doors.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
 _MAIN_WALL_M: Final = 2.4
 _MAIN_OMEGA_DEG: Final = 102.0
-# Area of the main wall that can be seen, and how much of it is textile at most and by design.
+# Visible area of the main wall, and the share of textile on it: at most, and by design.
 _MAIN_WALL_M2: Final = 16.7
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
-# Walls reach a little past the corners of the room, where others hide them.
+# Walls extend slightly past the corners of the room, where others hide them.
 _FULL: Final[Extent] = (-2.9, 2.9, FLOOR_M - 0.1, CEILING_M + 0.1)
 
 _STUCCO = Paint(
@@ -61,30 +61,29 @@ _BLUE = Paint(
     kind=TextureKind.FRESCO, rgb=(150, 170, 178), reflectance=0.5, period_m=0.34, seed=301
 )
 _RED = Paint(kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.5, period_m=0.34, seed=401)
-# Walls that are drawn: name, ground, and from corner to corner.
+# Drawn walls: name, ground, and from corner to corner.
 _DRAWN: Final = (
     ("main wall", _OCHRE, (-2.7, 2.7)),
     ("opposite wall", _GREEN, (-2.7, 2.7)),
     ("right wall", _BLUE, (-2.4, 2.0)),
     ("left wall", _RED, (-2.0, 2.4)),
 )
-# How far what is drawn runs on behind the adjoining walls, the floor and the ceiling.
+# How far drawn objects extend behind the adjoining walls, the floor and the ceiling.
 _BEYOND_M: Final = 0.1
-# A bay narrower than this stays bare, and so does the wall beside and over what is in it.
+# A bay narrower than this stays bare, and so does the wall beside and above what is in it.
 _BAY_LEAST_M: Final = 0.7
 _BESIDE_M: Final = 0.12
 
 
 @dataclass(frozen=True, kw_only=True)
 class RoomPlan:
-    """What the room is like.
+    """The properties of the room.
 
     Attributes:
         relief: scale of all mouldings, 1 = as designed (up to 15 cm).
-        obstacle: an object stands free before the main wall.
+        obstacle: an object stands free in front of the main wall.
         spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
-        textile_share: share of the main wall that is covered by one repeated motif, at most
-            `MOST_TEXTILE`.
+        textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
     """
 
     relief: float
@@ -110,8 +109,8 @@ def build_room(plan: RoomPlan, rng: np.random.Generator | None = None) -> Room:
     """Build the room.
 
     Args:
-        plan: what it is like.
-        rng: draws the four walls from a family; without, they are as designed.
+        plan: its properties.
+        rng: draws the four walls from a family; without it they are as designed.
     """
     draft = SceneDraft()
     sides = wall_sides(draft)
@@ -194,7 +193,7 @@ def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
 
 
 def _cloths(share: float) -> list[Extent]:
-    """Hang cloth over a share of the main wall: the panel in the middle first, then beside it."""
+    """Cover a share of the main wall with cloth: the panel in the middle first, then beside it."""
     middle: Extent = (-0.73, 0.83, -1.3, 1.3)
     by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
     beside: list[Extent] = [
@@ -312,7 +311,7 @@ def _furnish(draft: SceneDraft, plan: RoomPlan) -> None:
     yaw_deg = _MAIN_OMEGA_DEG - 90.0
     floor = FLOOR_M * _UP
     if plan.obstacle:
-        # A screen 0.6 m before the main wall, turned so that no face is parallel to it.
+        # A screen 0.6 m in front of the main wall, turned so that no face is parallel to it.
         add_block(
             draft,
             base=floor + 0.1 * along + 1.78 * towards,
@@ -375,7 +374,7 @@ def _visible_rectangle(item: TruePlane, bounds: list[Plane]) -> NDArray[np.float
 
 
 def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
-    """Keep the part of a convex polygon (n, 3) before a plane (Sutherland and Hodgman)."""
+    """Keep the part of a convex polygon (n, 3) in front of a plane (Sutherland and Hodgman)."""
     distances = bound.distances_m(polygon)
     kept: list[NDArray[np.float64]] = []
     for start in range(len(polygon)):
@@ -390,13 +389,13 @@ def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True)
 class WallPaints:
-    """What a drawn wall is painted with.
+    """The textures of a drawn wall.
 
     Attributes:
         ground: the wall itself, and its niches.
         relief: cornice, pilasters and skirting.
         panel: mouldings of panels.
-        door: of doors.
+        door: doors.
     """
 
     ground: Paint
@@ -410,10 +409,10 @@ class WallDrawing:
     """How a wall is drawn.
 
     Attributes:
-        full: extent of the wall, a little past the corners of the room.
+        full: extent of the wall, slightly past the corners of the room.
         shown: extent between the adjoining walls, the floor and the ceiling.
-        relief: scale of all that stands out.
-        paints: what it is painted with.
+        relief: scale of all relief.
+        paints: its textures.
     """
 
     full: Extent
@@ -423,15 +422,15 @@ class WallDrawing:
 
 
 def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Generator) -> None:
-    """Build a wall with relief up to 0.3 m before it and recesses up to 0.45 m behind it.
+    """Build a wall with relief up to 0.3 m in front of it and recesses up to 0.45 m behind it.
 
-    Niches and doors are announced as planes of their own.
+    Niches and doors are registered as planes of their own.
 
     Args:
-        wall: where it stands.
+        wall: the wall.
         name: of its plane.
         drawing: how.
-        rng: draws what there is.
+        rng: draws the objects.
     """
     plane = wall.true_plane(name, drawing.full)
     top_m = _draw_cornice(wall, drawing, rng)
@@ -445,7 +444,7 @@ def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Genera
 
 
 def _draw_cornice(wall: Side, drawing: WallDrawing, rng: np.random.Generator) -> float:
-    """Build up to three steps under the ceiling, or none; give where they begin."""
+    """Build up to three steps under the ceiling, or none; return where they begin."""
     a0, a1, _, _ = drawing.full
     ceiling_m = drawing.shown[3]
     n_steps = int(rng.integers(0, 4))
@@ -460,7 +459,7 @@ def _draw_cornice(wall: Side, drawing: WallDrawing, rng: np.random.Generator) ->
 def _draw_pilasters(
     wall: Side, drawing: WallDrawing, top_m: float, rng: np.random.Generator
 ) -> list[Extent]:
-    """Build pilasters, maybe in the corners too, and a skirting; give the bays between them."""
+    """Build pilasters, maybe in the corners too, and a skirting; return the bays between them."""
     a0, a1, floor_m, _ = drawing.shown
     n_inner, is_cornered = int(rng.integers(0, 4)), bool(rng.random() < 0.5)
     width_m, depth_m = rng.uniform(0.16, 0.4), drawing.relief * rng.uniform(0.03, 0.2)
@@ -486,7 +485,7 @@ def _draw_pilasters(
 def _draw_bay(
     wall: Side, name: str, where: tuple[Extent, WallDrawing], rng: np.random.Generator
 ) -> list[Extent]:
-    """Build a niche, a door, a panel or nothing between two pilasters; give the wall's holes."""
+    """Build a niche, a door, a panel or nothing between two pilasters; return the wall's holes."""
     (left, right, floor_m, top_m), drawing = where
     kind = str(rng.choice(["niche", "door", "panel", "bare"]))
     width_m = min(rng.uniform(0.6, 1.3), right - left - 2.0 * _BESIDE_M)

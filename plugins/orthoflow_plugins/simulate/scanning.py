@@ -1,8 +1,8 @@
-"""The simulated scanner: where it stands, what it sweeps, what it measures and how wrong it is.
+"""The simulated scanner: stations, scan patterns, measurements and their errors.
 
-Noise depends on the place in the grid of angles only, so that threads cannot change it.
+Noise depends only on the position in the grid of angles, so it does not depend on threads.
 
-Of a material the laser sees what the eye does not. Red lead, gold, wet plaster and retouchings
+The laser does not see a material as the eye does. Red lead, gold, wet plaster and retouchings
 change order between the laser's one wavelength and the three broad bands of a camera. Per material,
 reflectance falls with red and rises with green, each by a gain and a power of its own; wet patches
 are darker, retro-reflecting spots blind the detector.
@@ -27,23 +27,24 @@ from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.room_model import main_wall_axes
 
-# `Scanned.rectangle` of a ray that met nothing, and of a gross outlier or a mixed distance.
+# `Scanned.rectangle` of a ray without a hit, and of a gross outlier or a mixed distance.
 _MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
-# No scan of the zenith: its points would crowd the ceiling over the station.
+# No scan of the zenith: its points would crowd the ceiling above the station.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
-# Along the main wall, towards it, and over the origin, metres; clear of everything in the room.
+# Along the main wall, towards it, and above the origin, metres; clear of all objects in the room.
 _PLACES_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
-# Ranges of what is drawn per material: reflectance of black, falls with red, rises with green.
+# Ranges of the values drawn per material: reflectance of black, decrease with red, increase with
+# green.
 _BLACK: Final = (0.75, 0.9)
 _RED: Final = (0.6, 0.85)
 _GREEN: Final = (0.4, 0.65)
@@ -54,7 +55,7 @@ _WET_M: Final = 0.7
 _WET_FROM: Final = 0.6
 _WET_DARKER: Final = 0.45
 _WAVES: Final = 24
-# Half the length of a room: bent by the whole `bending_m` there.
+# Half the length of a room, where it is bent by the whole `bending_m`.
 _BENT_M: Final = 5.0
 _SPOT_EVERY_M: Final = 0.4
 _SPOT_SHARE: Final = 0.05
@@ -63,12 +64,12 @@ _SPOT_RADIUS_M: Final = 0.012
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """One scan: a station and the angles it looks along, in the room frame.
+    """One scan: a station and its directions, in the room frame.
 
     Attributes:
         station: (3,) metres.
         azimuth: of column 0, radians from x towards y.
-        elevation: of row 0, radians over the horizon.
+        elevation: of row 0, radians above the horizon.
         step: between columns and between rows, radians.
         n_columns: number of columns.
         n_rows: number of rows.
@@ -86,20 +87,21 @@ class Sweep:
 
 @dataclass(frozen=True, kw_only=True)
 class Errors:
-    """How wrong the scanner is.
+    """The errors of the scanner.
 
     Attributes:
-        noise_m: standard deviation of a distance at 3 m, square onto a plain wall.
+        noise_m: standard deviation of a distance at 3 m, perpendicular to a plain wall.
         outlier_share: share of points at a random distance.
         beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
         colour_noise: standard deviation of a colour, grey levels.
-        inversion: how far the laser sees contrast the other way round, as `LaserBand` has it.
-        band_seed: of the materials in the laser's band, and of what the points share.
-        registration_m: standard deviation of each coordinate of a station's place.
+        inversion: share of inverted contrast in what the laser sees, as in `LaserBand`.
+        band_seed: seed of the materials in the laser's band, and of errors that points have in
+            common.
+        registration_m: standard deviation of each coordinate of a station.
         bending_m: how far the room's ends are bent from its middle, as by drift along a path.
         shared_m: standard deviation of each coordinate that neighbouring points of all scans have
             in common, as in clouds from photos.
-        shared_length_m: distance over which that changes.
+        shared_length_m: correlation length of that.
     """
 
     noise_m: float
@@ -116,7 +118,7 @@ class Errors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scanned(Rows):
-    """What a scan gives, one entry per ray, column by column.
+    """The result of a scan, one entry per ray, column by column.
 
     Attributes:
         x: float32 metres from the room's origin; y and z likewise.
@@ -142,7 +144,7 @@ class Scan:
     Attributes:
         points: what was measured.
         scan: (n,) number of the scan.
-        row: (n,) place in the scan's grid; column likewise.
+        row: (n,) position in the scan's grid; column likewise.
         column: see row.
         stations: (s, 3) where each scan was made, room frame.
     """
@@ -160,7 +162,7 @@ class SweepPlan:
 
     Attributes:
         n_stations: number of stations.
-        scan_step_m: step of the detail scan of the main wall at the foot of the perpendicular.
+        scan_step_m: spacing of the detail scan of the main wall at the foot of the perpendicular.
         panorama_step_m: likewise of the panorama.
     """
 
@@ -229,7 +231,7 @@ class Scanner:
 
     Args:
         scene: the scene, its origin at (0, 0, 0).
-        errors: how wrong the scanner is.
+        errors: errors of the scanner.
     """
 
     def __init__(self, scene: Scene, errors: Errors) -> None:
@@ -245,8 +247,8 @@ class Scanner:
         Args:
             sweep: the scan.
             first: column.
-            last: column, not included.
-            scanned: filled, entries of the whole scan.
+            last: last column, exclusive.
+            scanned: output, entries of the whole scan.
         """
         echoes = self._echoes(sweep, first, last)
         into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
@@ -288,7 +290,7 @@ class Scanner:
     def _measured(
         self, sweep: Sweep, echoes: _Echoes, rectangle: NDArray[np.int32]
     ) -> NDArray[np.float64]:
-        """Distances as measured; marks gross outliers and mixed distances as spoilt."""
+        """Return distances as measured; marks gross outliers and mixed distances as spoilt."""
         states, distance = echoes.states, echoes.distance
         sigma = _range_sigma(
             distance, echoes.cosine, self._is_cloth[rectangle], self._errors.noise_m
@@ -306,7 +308,7 @@ class Scanner:
         return measured
 
     def _mixed(self, sweep: Sweep, echoes: _Echoes) -> NDArray[np.float64]:
-        """Mixed distances where the rim of the spot, at a hashed side, meets another depth."""
+        """Mixed distances where the edge of the spot, at a hashed side, meets another depth."""
         states, distance = echoes.states, echoes.distance
         turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
         aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(echoes.elevation))
@@ -323,18 +325,19 @@ class Scanner:
 def shared_errors(
     points: NDArray[np.float64], station: NDArray[np.float64], errors: Errors
 ) -> NDArray[np.float64]:
-    """Return what points (3, n) of a station are off by together with others (3, n), metres."""
+    """Return the common errors of points (3, n) of a station, metres."""
     off = np.zeros_like(points)
     if errors.registration_m:
         place_mm = np.rint(1e3 * station).astype(np.int64) % 2**31
         of_station = np.random.default_rng([errors.band_seed, *place_mm.tolist()])
         off += errors.registration_m * of_station.normal(size=(3, 1))
     if errors.bending_m:
-        # A parabola across the longer way through the room, upwards and sideways.
+        # A parabola along the longer axis of the room, upwards and sideways.
         along = (points[0] / _BENT_M) ** 2
         off[1:] += errors.bending_m * along / math.sqrt(2.0)
     if errors.shared_m:
-        # Waves of random directions: their sum is as good as Gaussian, with a Gaussian correlation.
+        # Waves of random directions: their sum is practically Gaussian, with a Gaussian
+        # correlation.
         waves = np.random.default_rng([errors.band_seed, 1])
         for axis in range(3):
             ways = waves.normal(size=(_WAVES, 3)) / errors.shared_length_m
@@ -367,7 +370,7 @@ def _allocated(n_points: int, ctx: StepContext) -> Scanned:
 
 
 def _only_hits(scan: Scan) -> Scan:
-    """Leave out rays that met nothing; a closed room has none, then nothing is copied."""
+    """Drop rays without a hit; a closed room has none, then nothing is copied."""
     hit = scan.points.rectangle != _MISSED
     if bool(hit.all()):
         return scan
@@ -396,7 +399,7 @@ def _panorama(station: NDArray[np.float64], step: float, seed: int) -> Sweep:
 def _detail(
     station: NDArray[np.float64], outline: NDArray[np.float64], step: float, seed: int
 ) -> Sweep:
-    """Scan the window of angles that just holds the main wall."""
+    """Scan the smallest window of angles that contains the main wall."""
     _, towards = main_wall_axes()
     forward = math.atan2(towards[1], towards[0])
     # Along the edges too: seen from below, the middle of an upper edge is higher than its ends.
@@ -419,15 +422,15 @@ def _detail(
 
 @dataclass(frozen=True, kw_only=True)
 class _Echoes:
-    """The rays of some columns and what they meet, one entry per ray.
+    """The rays of some columns and their hits, one entry per ray.
 
     Attributes:
         azimuth: radians; elevation likewise.
         elevation: see azimuth.
         ways: (3, n) unit directions.
         hits: what they meet.
-        states: random states of their places in the grid.
-        distance: metres to what they meet, some where they meet nothing.
+        states: random states of their positions in the grid.
+        distance: metres to the hit, arbitrary without one.
         cosine: of the angle of incidence.
     """
 
@@ -453,14 +456,14 @@ def _range_sigma(
     is_cloth: NDArray[np.bool_],
     noise_m: float,
 ) -> NDArray[np.float64]:
-    """Standard deviation of a distance: grows with range and slope, and on cloth."""
+    """Return the standard deviation of a distance: it grows with range and slope, and on cloth."""
     slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
     cloth = np.where(is_cloth, 1.4, 1.0)
     return noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
 
 
 def _gross(states: NDArray[np.uint64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances of gross outliers: most fall short, some go far."""
+    """Return distances of gross outliers: most are too short, some too long."""
     short = distance * (0.3 + 0.68 * uniforms(states, 2))
     far = distance + 2.0 * uniforms(states, 2)
     return np.where(uniforms(states, 1) < 0.8, short, far)
@@ -471,9 +474,9 @@ class LaserBand:
     """The laser's band in one scene.
 
     Attributes:
-        scene: whose rectangles are seen; its origin at (0, 0, 0).
-        inversion: 0 when the laser sees what the scene's textures show, 1 when all contrast goes
-            by the materials' own response.
+        scene: the scene with the rectangles; its origin at (0, 0, 0).
+        inversion: 0 if the laser sees what the scene's textures show, 1 if all contrast follows
+            from the materials' own response.
         seed: of materials, patches and spots.
     """
 
@@ -487,10 +490,10 @@ class LaserBand:
         points: NDArray[np.float64],
         colours: NDArray[np.float32],
     ) -> NDArray[np.float64]:
-        """What the laser sees of points.
+        """Return what the laser sees of points.
 
         Args:
-            rectangle: (n,) that each lies on.
+            rectangle: (n,) rectangle of each point.
             points: (3, n) metres.
             colours: (4, n) red, green, blue 0..255, and the texture's own reflectance.
 
@@ -535,7 +538,7 @@ class LaserBand:
 def _smooth_noise(
     x: NDArray[np.float64], y: NDArray[np.float64], seed: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Noise 0..1 that is smooth between the points of a lattice, and its own per seed."""
+    """Return noise 0..1 that is smooth between the points of a lattice, and differs per seed."""
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     s, t = x - column, y - row
     s, t = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
