@@ -38,6 +38,24 @@ _SUMMARIES: Final = {
     "check": "Run the conformance suite on a method.",
 }
 
+# Header -> key of the JSON.
+_COLUMNS: Final = {
+    "methods": {
+        "method": "id",
+        "state": "state",
+        "distribution": "distribution",
+        "summary": "summary",
+    },
+    "kinds": {
+        "kind": "name",
+        "takes": "in",
+        "gives": "out",
+        "distribution": "distribution",
+        "summary": "summary",
+    },
+    "products": {"product": "name", "distribution": "distribution", "summary": "summary"},
+}
+
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
     help="List, show and check methods, and write a plugin of your own.",
@@ -59,17 +77,13 @@ def plugins_list(*, as_json: bool) -> int:
     if as_json:
         echo_json(found)
         return EXIT_GOOD
-    for section, name, columns in (
-        ("methods", "id", ("state", "distribution", "summary")),
-        ("kinds", "name", ("in", "out", "distribution", "summary")),
-        ("products", "name", ("distribution", "summary")),
-    ):
-        header = (section.removesuffix("s"), *columns)
-        echo_table(header, [_row(one, (name, *columns)) for one in found[section]])
-        echo()
+    for section, columns in _COLUMNS.items():
+        if section != "methods":
+            echo()
+        echo_table(tuple(columns), [_row(one, columns.values()) for one in found[section]])
     problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
-        echo("what is wrong:", *(f"- {problem}" for problem in problems))
+        echo("", "what is wrong:", *(f"- {problem}" for problem in problems))
     for one in found["broken"]:
         echo(f"`orthoflow plugins show {one['plugin']}` prints its traceback")
     return EXIT_GOOD

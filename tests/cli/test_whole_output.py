@@ -334,8 +334,25 @@ class In(Ports):
     more: PointCloud | None = None
 
 
-def test_parameters_are_said_with_type_limits_and_unit() -> None:
-    assert plugins_commands._parameters(Params) == [
+@pytest.fixture
+def laboratory(monkeypatch: pytest.MonkeyPatch) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    monkeypatch.setattr(plugins_commands, "discover_catalog", lambda: catalog)
+
+
+def answer(*arguments: str, code: int = 0) -> str:
+    result = CliRunner().invoke(program, ["plugins", *arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.usefixtures("laboratory")
+def test_parameters_are_shown_with_type_limits_and_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    method = plugins_commands.discover_catalog().method("plane.ransac").load()
+    monkeypatch.setattr(method, "Params", Params)
+    monkeypatch.setattr(method, "In", In)
+    shown = json.loads(answer("show", "plane.ransac", "--json"))
+    assert [tuple(one.values()) for one in shown["params"]] == [
         ("cell_m", "number > 0 <= 1", 0.02, "m", "Edge of a cell."),
         ("limit_deg", "number | null", None, "deg", "Limit."),
         ("n_most", "integer >= 1 < 10", 3, "", "Number."),
@@ -347,24 +364,13 @@ def test_parameters_are_said_with_type_limits_and_unit() -> None:
         ("memory_mib", "integer", 1, "MiB", "Memory."),
         ("plain", "boolean", True, "", ""),
     ]
-    assert plugins_commands._ports(In) == [("cloud", "cloud", True), ("more", "cloud", False)]
-    assert plugins_commands._type_text({}, {}) == "any"
-    assert plugins_commands._type_text({"$ref": "#/$defs/a"}, {"a": {"type": "object"}}) == "object"
+    assert [tuple(one.values()) for one in shown["in"]] == [
+        ("cloud", "cloud", True),
+        ("more", "cloud", False),
+    ]
     units = {"a_mm": "mm", "a_px": "px", "a_rad": "rad", "a_s": "s", "a_grey": "grey levels"}
     units |= {"a_cells": "cells", "m": "", "a_b": ""}
     assert {name: unit_of(name) for name in units} == units
-
-
-@pytest.fixture
-def laboratory(monkeypatch: pytest.MonkeyPatch) -> None:
-    catalog = laboratory_catalog(monkeypatch)
-    monkeypatch.setattr(plugins_commands, "discover_catalog", lambda: catalog)
-
-
-def answer(*arguments: str, code: int = 0) -> str:
-    result = CliRunner().invoke(program, ["plugins", *arguments])
-    assert result.exit_code == code, result.output
-    return result.output
 
 
 @pytest.mark.usefixtures("laboratory")
@@ -382,9 +388,9 @@ def test_a_method_is_shown_with_ports_and_parameters() -> None:
         "out   planes  planes\n"
         "out   labels  labels\n"
         "\n"
-        "parameter    type          default  unit  description\n"
-        "tolerance_m  number > 0    0.05     m     Distance that counts as on the plane.\n"
-        "iterations   integer >= 1  2000           Trials.\n"
+        "parameter    type               default  unit  description\n"
+        "tolerance_m  number > 0 | auto  0.05     m     Distance that counts as on the plane.\n"
+        "iterations   integer >= 1       2000           Trials.\n"
     )
     told = json.loads(answer("show", "plane.ransac", "--json"))
     assert told == {
@@ -401,7 +407,7 @@ def test_a_method_is_shown_with_ports_and_parameters() -> None:
         "params": [
             {
                 "name": "tolerance_m",
-                "type": "number > 0",
+                "type": "number > 0 | auto",
                 "default": 0.05,
                 "unit": "m",
                 "description": "Distance that counts as on the plane.",
