@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
 
 from orthoflow.catalog.distributions import (
     DistributionInfo,
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 
 EntryState = Literal["fine", "broken", "clash"]
+# Environment variable: distributions or entry points, with commas between.
+DISABLED: Final = "ORTHOFLOW_DISABLED_PLUGINS"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,12 +167,14 @@ class Catalog:
         kinds: by name.
         products: by type name.
         broken: plugins that failed to load; they spoil only a workflow that needs them.
+        disabled: names of plugins that the environment switches off.
     """
 
     methods: Mapping[str, MethodEntry]
     kinds: Mapping[str, KindEntry]
     products: Mapping[str, ProductEntry]
     broken: tuple[BrokenPlugin, ...] = ()
+    disabled: tuple[str, ...] = ()
 
     def method(self, method_id: str) -> MethodEntry:
         """Return a method that can be loaded.
@@ -270,4 +274,7 @@ class Catalog:
         return [method for method, entry in self.methods.items() if entry.spec.kind == kind]
 
     def _hint_at_broken(self) -> str:
-        return "".join(f"; {plugin}" for plugin in self.broken)
+        hints = [f"; {plugin}" for plugin in self.broken]
+        if self.disabled:
+            hints.append(f"; {DISABLED} switches off {', '.join(self.disabled)}")
+        return "".join(hints)

@@ -15,6 +15,7 @@ from typing import Final, Generic, TypeVar
 import pluggy
 
 from orthoflow.catalog.catalog import (
+    DISABLED,
     BrokenPlugin,
     Catalog,
     EntryState,
@@ -50,7 +51,6 @@ _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 # Whose names nobody else takes away.
 OWN: Final = "orthoflow-tls"
-DISABLED: Final = "ORTHOFLOW_DISABLED_PLUGINS"
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
 
@@ -85,16 +85,15 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
     found = _installed_entry_points() if entry_points is None else entry_points
     announcements: list[_Announcement] = []
     broken: list[BrokenPlugin] = []
-    disabled = {canonical_name(name) for name in os.environ.get(DISABLED, "").split(",")}
-    described = [
-        (entry, distribution)
-        for entry in found
-        if canonical_name(entry.name) not in disabled
-        and canonical_name((distribution := describe_distribution(entry)).name) not in disabled
-    ]
+    named = {canonical_name(name) for name in os.environ.get(DISABLED, "").split(",")}
+    disabled: list[str] = []
+    described = [(entry, describe_distribution(entry)) for entry in found]
     for entry, distribution in sorted(
         described, key=lambda item: (item[1].name, item[0].name, item[0].value)
     ):
+        if {canonical_name(entry.name), canonical_name(distribution.name)} & named:
+            disabled.append(entry.name)
+            continue
         try:
             with guarded(f"plugin {entry.name} of {distribution}"):
                 announcements.append(_announce(entry, distribution))
@@ -105,7 +104,13 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
     products = _collect_products(announcements)
     kinds = _collect_kinds(announcements, frozenset(products))
     methods = _collect_methods(announcements, kinds, products)
-    return Catalog(methods=methods, kinds=kinds, products=products, broken=tuple(broken))
+    return Catalog(
+        methods=methods,
+        kinds=kinds,
+        products=products,
+        broken=tuple(broken),
+        disabled=tuple(disabled),
+    )
 
 
 def _installed_entry_points() -> Iterable[EntryPoint]:

@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from typing import Final, Literal
 
 import click
 
@@ -13,9 +24,96 @@ from orthoflow.cli.commands import (
     json_option,
     store_option,
 )
-from orthoflow.cli.diagnosis import Diagnosis, diagnose_libraries, diagnose_machine
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
+from orthoflow.system import usable_cores
 from orthoflow.version import __version__
+
+_IMPORT_TIMEOUT_S: Final = 120
+_COMFORTABLE_DISK_BYTES: Final = 5 * 1024**3
+_COMFORTABLE_MEMORY_BYTES: Final = 2 * 1024**3
+
+_EVERYTHING: Final = "everything"
+# Distribution on the package index -> the module that is imported, and what needs it.
+LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
+    "click": ("click", _EVERYTHING),
+    "h5py": ("h5py", _EVERYTHING),
+    "jinja2": ("jinja2", "the report"),
+    "networkx": ("networkx", _EVERYTHING),
+    "numpy": ("numpy", _EVERYTHING),
+    "pluggy": ("pluggy", _EVERYTHING),
+    "pydantic": ("pydantic", _EVERYTHING),
+    "rich": ("rich", "live progress"),
+    "ruamel.yaml": ("ruamel.yaml", _EVERYTHING),
+    "numba": ("numba", "methods of simulate, plane, raster, ortho and inspect"),
+    "scipy": ("scipy", "methods of plane and inspect"),
+    "opencv-python-headless": ("cv2", "photos, previews: simulate.room, raster and ortho"),
+    "rasterio": ("rasterio", "GeoTIFF files: what raster and mosaic publish"),
+    "laspy": ("laspy", "LAS and LAZ files: read.scan, --to laz"),
+    "lazrs": ("lazrs", "compressed LAZ files: read.scan, --to laz"),
+    "pye57": ("pye57", "E57 files: read.scan, --to e57"),
+    "pyproj": ("pyproj", "coordinate systems: read.scan, cameras of Metashape"),
+    "pandas": ("pandas", "text files of points: read.scan"),
+    "pillow": ("PIL", "EXIF data of photos: read.photos, ortho"),
+    "simplejpeg": ("simplejpeg", "damage in JPEG files: read.photos"),
+    "psutil": ("psutil", "free memory: methods of raster"),
+    "threadpoolctl": ("threadpoolctl", "cores of each step"),
+    "matplotlib": ("matplotlib", "methods of plane, which draw their plans with it"),
+    "mahotas": ("mahotas", "inspection by SURF features"),
+    "pycolmap": ("pycolmap", "bundle adjustment"),
+    "pyceres": ("pyceres", "bundle adjustment"),
+    "libusb-package": ("libusb_package", "open3d on machines without libusb-1.0"),
+    "open3d-cpu": ("open3d", "comparators of open3d; the default methods work without it"),
+    "fonttools": ("fontTools", "fonts of the system in sheets"),
+    "ezdxf": ("ezdxf", "CAD drawings: --to dxf"),
+    "reportlab": ("reportlab", "sheets: --to sheet"),
+    "cryptography": ("cryptography", "signatures of records: sign, verify --signer"),
+    "distributed": ("distributed", "clusters: --executor dask"),
+}
+_CORE: Final = frozenset(
+    ("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich", "ruamel.yaml")
+)
+# What a plain installation lacks, and how `pip install` names it.
+_EXTRAS: Final = {"cryptography": "cryptography[ssh]", "distributed": "distributed"}
+# Part of the message of an import that fails -> the system package that is missing.
+_SYSTEM_PACKAGES: Final = {
+    "libGL.so": "libgl1",
+    "libX11.so": "libx11-6",
+    "libusb": "libusb-1.0-0",
+    "libgomp": "libgomp1",
+}
+# The wheel of open3d needs libusb-1.0.so.0, which libusb-package carries: loaded globally, it is
+# found when open3d is imported.
+_OPEN3D_PRELUDE: Final = """
+import ctypes
+try:
+    import libusb_package
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+except (ImportError, OSError, TypeError):
+    pass
+"""
+
+Verdict = Literal["ok", "limited", "missing"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what was looked at.
+        verdict: ok, limited (works, with a restriction) or missing.
+        found: version, size or setting.
+        cost: what does not work because of it, and the way out; empty when ok.
+        use: what needs it, where that is a library.
+        is_core: orthoflow cannot work without it.
+    """
+
+    name: str
+    verdict: Verdict
+    found: str
+    cost: str = ""
+    use: str = ""
+    is_core: bool = False
 
 
 @click.command(cls=Command)
@@ -26,43 +124,39 @@ def doctor(store: Path, *, as_json: bool) -> int:
 
     Ends with 4 when something is missing without which nothing works.
     """
-    findings = [*diagnose_machine(store), *diagnose_libraries(), *_diagnose_plugins()]
-    broken_core = any(item.is_core and item.verdict == "missing" for item in findings)
+    # A library that is broken may crash the process that imports it.
+    with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
+        libraries = list(pool.map(_library, LIBRARIES))
+    findings = [*_machine(), *_store(store), *libraries, *_plugins()]
+    is_broken = any(item.is_core and item.verdict == "missing" for item in findings)
     if as_json:
-        echo_json(
+        listed = [
             {
-                "version": __version__,
-                "ok": not broken_core,
-                "findings": [
-                    {
-                        "name": item.name,
-                        "verdict": item.verdict,
-                        "found": item.found,
-                        "for": item.use,
-                        "cost": item.cost,
-                        "core": item.is_core,
-                    }
-                    for item in findings
-                ],
+                "name": item.name,
+                "verdict": item.verdict,
+                "found": item.found,
+                "for": item.use,
+                "cost": item.cost,
+                "core": item.is_core,
             }
-        )
+            for item in findings
+        ]
+        echo_json({"version": __version__, "ok": not is_broken, "findings": listed})
     else:
-        _print(findings, broken_core=broken_core)
-    return EXIT_PLUGIN_MISSING if broken_core else EXIT_GOOD
+        _print(findings, is_broken=is_broken)
+    return EXIT_PLUGIN_MISSING if is_broken else EXIT_GOOD
 
 
-def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
+def _print(findings: list[Finding], *, is_broken: bool) -> None:
     echo(f"orthoflow {__version__}", "")
     echo_table(
         ("what", "verdict", "found", "for"),
         [(item.name, item.verdict, item.found, item.use) for item in findings],
     )
-    costs = [item for item in findings if item.cost]
+    costs = [f"- {item.name}: {item.cost}" for item in findings if item.cost]
     if costs:
-        echo("", "What that costs:")
-    for item in costs:
-        echo(f"- {item.name}: {item.cost}")
-    if broken_core:
+        echo("", "What that costs:", *costs)
+    if is_broken:
         echo("", "something that everything needs is missing")
     elif costs:
         echo("", f"orthoflow works, with {counted(len(costs), 'restriction')}")
@@ -70,38 +164,109 @@ def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
         echo("", "everything works")
 
 
-def _diagnose_plugins() -> list[Diagnosis]:
+def _library(name: str) -> Finding:
+    module, use = LIBRARIES[name]
+    is_core = name in _CORE
     try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        version = ""
+    problem = _import_problem(module)
+    if not problem:
+        return Finding(name, "ok", version or "present", use=use, is_core=is_core)
+    if version:
+        lacks = (package for part, package in _SYSTEM_PACKAGES.items() if part in problem)
+        package = next(lacks, "")
+        way_out = f"apt-get install {package}" if package else "reinstall it"
+        found = f"{version}, but {problem}"
+    else:
+        wanted = _EXTRAS.get(name, name)
+        way_out = f"pip install '{wanted}'" if "[" in wanted else f"pip install {wanted}"
+        found = "not installed"
+    verdict: Verdict = "limited" if name in _EXTRAS and not version else "missing"
+    return Finding(name, verdict, found, f"not available: {use} ({way_out})", use, is_core)
+
+
+def _import_problem(module: str) -> str:
+    prelude = _OPEN3D_PRELUDE if module == "open3d" else ""
+    command = [sys.executable, "-c", f"{prelude}\nimport {module}"]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=_IMPORT_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return f"its import takes longer than {_IMPORT_TIMEOUT_S} s"
+    if done.returncode == 0:
+        return ""
+    if done.returncode < 0:
+        return f"its import crashes (signal {-done.returncode})"
+    lines = done.stderr.decode(errors="replace").split("\n")
+    return f"its import fails: {next(filter(None, map(str.strip, reversed(lines))), 'no message')}"
+
+
+def _machine() -> Iterator[Finding]:
+    found = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    if (platform.system(), platform.machine()) == ("Linux", "x86_64"):
+        yield Finding("platform", "ok", found)
+    else:
+        yield Finding("platform", "limited", found, "only Linux on x86-64 is tested")
+    yield Finding("cores", "ok", str(usable_cores()))
+    try:
+        from orthoflow.engine.measuring import available_memory
+
+        n_bytes = available_memory().available
+    except (ImportError, OSError, KeyError, ValueError):
+        # The engine does not load when a core library is missing, which is a finding of its own.
+        yield Finding("memory", "limited", "unknown", "cannot be measured")
+        return
+    yield _enough(
+        Finding("memory", "ok", f"{n_bytes / 1024**3:.1f} GiB available"),
+        "scans of many millions of points will not fit",
+        is_enough=n_bytes >= _COMFORTABLE_MEMORY_BYTES,
+    )
+
+
+def _enough(finding: Finding, cost: str, *, is_enough: bool) -> Finding:
+    return finding if is_enough else Finding(finding.name, "limited", finding.found, cost)
+
+
+def _store(store: Path) -> Iterator[Finding]:
+    places = (store.absolute(), *store.absolute().parents)
+    folder = next(place for place in places if place.is_dir())
+    free = shutil.disk_usage(folder).free
+    yield _enough(
+        Finding("disk of the store", "ok", f"{free / 1024**3:.1f} GiB free"),
+        "long runs may fill it (orthoflow cache gc, or --store DIR)",
+        is_enough=free >= _COMFORTABLE_DISK_BYTES,
+    )
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+    except OSError as error:
+        problem = f"{folder} cannot be written: {(error.strerror or str(error)).lower()}"
+        cost = "no run can start here (choose another folder with --store DIR)"
+        yield Finding("store", "missing", problem, cost, is_core=True)
+    else:
+        yield Finding("store", "ok", f"{store} is writable", is_core=True)
+
+
+def _plugins() -> Iterator[Finding]:
+    try:
+        from orthoflow.catalog.catalog import DISABLED
         from orthoflow.catalog.discovery import discover_catalog
 
         catalog = discover_catalog()
     except ImportError as error:
         cost = "no method can be found; install what is missing"
-        return [Diagnosis(name="plugins", verdict="missing", found=str(error), cost=cost)]
-    findings = [
-        Diagnosis(
-            name="plugins",
-            verdict="ok",
-            found=counted(len(catalog.methods), "method"),
-        )
-    ]
-    findings += [
-        Diagnosis(
-            name=f"plugin {broken.entry_point}",
-            verdict="missing",
-            found=f"{broken.distribution} fails to load",
-            cost=f"its methods are missing: {broken.error}",
-        )
-        for broken in catalog.broken
-    ]
+        yield Finding("plugins", "missing", str(error), cost)
+        return
+    yield Finding("plugins", "ok", counted(len(catalog.methods), "method"))
+    for broken in catalog.broken:
+        cost = f"its methods are missing: {broken.error}"
+        name = f"plugin {broken.entry_point}"
+        yield Finding(name, "missing", f"{broken.distribution} fails to load", cost)
+    for name in catalog.disabled:
+        cost = f"its methods are missing: {DISABLED} names it"
+        yield Finding(f"plugin {name}", "limited", "switched off", cost)
     looked_at = [entry.looked_at() for entry in catalog.methods.values()]
-    problems = dict.fromkeys(
-        entry.problem
-        for entry in (*catalog.products.values(), *catalog.kinds.values(), *looked_at)
-        if entry.problem
-    )
-    findings += [
-        Diagnosis(name="plugins", verdict="limited", found="not usable as it is", cost=problem)
-        for problem in problems
-    ]
-    return findings
+    entries = (*catalog.products.values(), *catalog.kinds.values(), *looked_at)
+    for problem in dict.fromkeys(entry.problem for entry in entries if entry.problem):
+        yield Finding("plugins", "limited", "not usable as it is", problem)

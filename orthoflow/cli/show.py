@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, RecordCommand, code_for, json_option
-from orthoflow.cli.diagnosis import LIBRARIES
+from orthoflow.cli.doctor import LIBRARIES
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
     ROWS_MOST,
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 # Of metrics beside each other, so that lines stay within a wide window.
 _COLUMNS_MOST: Final = 5
 _NOTHING: Final = "-"
-_OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 
 @click.command(cls=RecordCommand)
@@ -219,7 +218,7 @@ def _print_environments(run: Run) -> None:
             f"{counted(environment.cores, 'core')}, {counted(environment.threads, 'thread')}"
             f"{commit}",
         )
-        used = [name for name in packages if name.lower() in _OWN_LIBRARIES]
+        used = [name for name in packages if name.lower() in LIBRARIES]
         others = f" and {len(packages) - len(used)} others (--json names them)"
         echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
 

@@ -2,306 +2,219 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import platform
 import re
+import shutil
 import subprocess
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli import diagnosis, doctor, program
-from orthoflow.cli.diagnosis import Library, diagnose_library, diagnose_machine
+from orthoflow.cli import program
+from orthoflow.cli.doctor import LIBRARIES
 from orthoflow.engine import measuring
-from orthoflow.version import __version__
 
 GIB = 1 << 30
-CLICK = Library(distribution="click", module="click", use="everything", is_core=True)
 
 
-def module_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> str:
-    (tmp_path / "fragile_library.py").write_text(code, encoding="utf-8")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return "fragile_library"
+@pytest.fixture
+def libraries(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[str, str]]:
+    """The libraries that are looked at: one that is here."""
+    looked_at = {"click": ("click", "everything")}
+    monkeypatch.setattr("orthoflow.cli.doctor.LIBRARIES", looked_at)
+    return looked_at
 
 
-def library(module: str, *, distribution: str = "click", is_core: bool = False) -> Library:
-    return Library(
-        distribution=distribution, module=module, use="E57 files: read.scan", is_core=is_core
-    )
+@pytest.fixture(autouse=True)
+def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A machine with nothing to find fault with."""
+    memory = measuring.AvailableMemory(available=8 * GIB, total=8 * GIB)
+    monkeypatch.setattr(measuring, "available_memory", lambda: memory)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=99 * GIB))
+    monkeypatch.chdir(tmp_path)
 
 
-def test_a_library_that_imports_is_ok() -> None:
-    found = diagnose_library(CLICK)
-    assert (found.verdict, found.cost) == ("ok", "")
-    assert found.found[0].isdigit()
+def findings(*options: str, code: int = 0) -> dict[str, dict[str, Any]]:
+    result = CliRunner().invoke(program, ["doctor", "--json", *options])
+    assert result.exit_code == code, result.output
+    answer = json.loads(result.stdout)
+    assert answer["ok"] is (code == 0)
+    return {item["name"]: item for item in answer["findings"]}
 
 
-def test_a_missing_library_costs_what_it_is_used_for() -> None:
-    found = diagnose_library(library("not_there_at_all", distribution="not-there-at-all"))
-    assert found.verdict == "missing"
-    assert found.found == "not installed"
-    assert found.cost == "not to be had: E57 files: read.scan (pip install not-there-at-all)"
+@pytest.mark.usefixtures("libraries")
+def test_where_all_is_there_everything_works() -> None:
+    result = CliRunner().invoke(program, ["doctor", "--store", "new/er"])
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert lines[-1] == "everything works"
+    assert [line.split()[0] for line in lines if "  ok  " in line] == [
+        *("platform", "cores", "memory", "disk", "store", "click", "plugins"),
+    ]
+    assert not Path("new").exists()
 
 
-def test_a_missing_extra_is_a_restriction_only() -> None:
-    extra = Library(
-        distribution="no-such", module="no_such", use="signatures", extra="no-such[ssh]"
-    )
-    found = diagnose_library(extra)
-    assert (found.verdict, found.found, found.use) == ("limited", "not installed", "signatures")
-    assert found.cost == "not to be had: signatures (pip install 'no-such[ssh]')"
-
-
-def test_every_library_that_an_installation_brings_is_looked_at_and_said_what_it_is_for() -> None:
+def test_every_library_that_an_installation_brings_is_looked_at() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
     extras = project["project"]["optional-dependencies"]
     brought = {
         re.match(r"[\w.-]+", text).group()  # type: ignore[union-attr]
         for text in (*project["project"]["dependencies"], *extras["sign"], *extras["dask"])
     }
-    looked_at = {library.distribution: library for library in diagnosis.LIBRARIES}
     # The wheel of open3d has another name on Linux; laspy[lazrs] brings lazrs.
-    assert looked_at.keys() - {"lazrs"} == brought - {"open3d"}
-    assert all(library.use for library in looked_at.values())
-    assert {name for name, library in looked_at.items() if library.extra} == {
-        *("cryptography", "distributed")
-    }
+    assert LIBRARIES.keys() - {"lazrs"} == brought - {"open3d"}
 
 
 @pytest.mark.parametrize(
-    ("code", "found", "way_out"),
+    ("name", "code", "described", "exit_code"),
     [
         (
-            "raise ImportError('libGL.so.1: cannot open shared object file')",
-            "its import fails: ImportError: libGL.so.1: cannot open shared object file",
-            "apt-get install libgl1",
+            "not-there-at-all",
+            None,
+            ("missing", "not installed", "not available: E57 (pip install not-there-at-all)"),
+            0,
+        ),
+        # Of an extra that nobody asked for, and of what nothing works without.
+        (
+            "cryptography",
+            None,
+            ("limited", "not installed", "not available: E57 (pip install 'cryptography[ssh]')"),
+            0,
+        ),
+        ("h5py", None, ("missing", "not installed", "not available: E57 (pip install h5py)"), 4),
+        (
+            "rasterio",
+            "raise ImportError('libGL.so.1: cannot open it')",
+            (
+                "missing",
+                "1.0, but its import fails: ImportError: libGL.so.1: cannot open it",
+                "not available: E57 (apt-get install libgl1)",
+            ),
+            0,
         ),
         (
+            "rasterio",
             "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
-            "its import crashes (signal 11)",
-            "reinstall it",
+            (
+                "missing",
+                "1.0, but its import crashes (signal 11)",
+                "not available: E57 (reinstall it)",
+            ),
+            0,
         ),
+        (
+            "rasterio",
+            "import os; os._exit(3)",
+            (
+                "missing",
+                "1.0, but its import fails: no message",
+                "not available: E57 (reinstall it)",
+            ),
+            0,
+        ),
+        ("rasterio", "", ("ok", "1.0", ""), 0),
     ],
-    ids=["system library missing", "crash"],
 )
-def test_an_installed_library_that_does_not_import_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, found: str, way_out: str
+def test_a_library_that_does_not_import_costs_what_it_is_used_for(
+    libraries: dict[str, tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    code: str | None,
+    described: tuple[str, str, str],
+    exit_code: int,
 ) -> None:
-    diagnosed = diagnose_library(library(module_that(tmp_path, monkeypatch, code)))
-    assert diagnosed.verdict == "missing"
-    assert diagnosed.found.endswith(f", but {found}")
-    assert diagnosed.cost.startswith("not to be had: E57 files: read.scan (")
-    assert way_out in diagnosed.cost
+    libraries[name] = ("fragile_library", "E57")
+    packages = Path("packages")
+    info = packages / f"{name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    if code is not None:
+        (packages / "fragile_library.py").write_text(code)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        monkeypatch.syspath_prepend(packages)
+    else:
+        from importlib import metadata
+
+        def version(asked: str) -> str:
+            raise metadata.PackageNotFoundError(asked)
+
+        monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setenv("PYTHONPATH", str(packages.absolute()))
+    entry = findings(code=exit_code)[name]
+    assert (entry["verdict"], entry["found"], entry["cost"]) == described
+    assert entry["core"] is (exit_code == 4)
 
 
-def test_doctor_is_content_when_all_libraries_are_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(diagnosis, "LIBRARIES", (CLICK,))
-    result = CliRunner().invoke(program, ["doctor", "--store", str(tmp_path / "new")])
-    assert result.exit_code == 0
-    assert [line.split()[0] for line in result.stdout.splitlines() if "  ok  " in line][:2] == [
-        "platform",
-        "cores",
-    ]
+@pytest.mark.usefixtures("libraries")
+def test_an_import_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wait(command: list[str], *, timeout: float, **_: object) -> None:
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(subprocess, "run", wait)
+    assert findings(code=4)["click"]["found"].endswith("its import takes longer than 120 s")
 
 
-@pytest.mark.parametrize(("is_core", "code"), [(True, 4), (False, 0)], ids=["core", "method"])
-def test_only_a_missing_core_library_ends_with_4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_core: bool, code: int
-) -> None:
-    missing = library("not_there_at_all", distribution="not-there-at-all", is_core=is_core)
-    monkeypatch.setattr(diagnosis, "LIBRARIES", (CLICK, missing))
-    result = CliRunner().invoke(program, ["doctor", "--store", str(tmp_path), "--json"])
-    assert result.exit_code == code
-    answer = json.loads(result.stdout)
-    assert answer["ok"] is (code == 0)
-    entry = next(item for item in answer["findings"] if item["name"] == "not-there-at-all")
-    assert entry["verdict"] == "missing"
-    assert entry["core"] is is_core
-
-
+@pytest.mark.usefixtures("libraries")
 def test_a_store_where_nothing_can_be_written_is_named() -> None:
     # /proc takes no files, not even from root.
-    findings = {item.name: item for item in diagnose_machine(Path("/proc/none"))}
-    store = findings["store and numba cache"]
-    assert (store.verdict, store.is_core) == ("missing", True)
-    assert store.found.startswith("/proc cannot be written: ")
-    assert store.cost == "no run can start here (choose another folder with --store DIR)"
+    store = findings("--store", "/proc/none", code=4)["store"]
+    assert store["found"].startswith("/proc cannot be written: ")
+    assert store["cost"] == "no run can start here (choose another folder with --store DIR)"
 
 
+@pytest.mark.usefixtures("libraries")
 @pytest.mark.parametrize(
-    ("n_bytes", "verdict", "found"),
-    [
-        (2 * GIB, "ok", "2.0 GiB available"),
-        (2 * GIB - 1, "limited", "2.0 GiB available"),
-        (GIB // 2, "limited", "0.5 GiB available"),
-    ],
+    ("free", "verdict"), [(5 * GIB, "ok"), (5 * GIB - 1, "limited"), (GIB // 4, "limited")]
 )
-def test_little_memory_is_told(
-    monkeypatch: pytest.MonkeyPatch, n_bytes: int, verdict: str, found: str
+def test_little_memory_and_little_disk_are_restrictions(
+    monkeypatch: pytest.MonkeyPatch, free: int, verdict: str
 ) -> None:
-    here = measuring.AvailableMemory(available=n_bytes, total=n_bytes)
-    monkeypatch.setattr(measuring, "available_memory", lambda: here)
-    told = diagnosis._diagnose_memory()
-    assert (told.verdict, told.found, bool(told.cost)) == (verdict, found, verdict != "ok")
+    memory = measuring.AvailableMemory(available=free - 3 * GIB, total=free)
+    monkeypatch.setattr(measuring, "available_memory", lambda: memory)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    found = findings()
+    for name in ("memory", "disk of the store"):
+        assert found[name]["verdict"] == verdict
+        assert bool(found[name]["cost"]) == (verdict != "ok")
 
+
+@pytest.mark.usefixtures("libraries")
+def test_what_is_not_known_or_not_tested_is_a_restriction(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise KeyError("MemTotal")
 
     monkeypatch.setattr(measuring, "available_memory", fail)
-    unknown = diagnosis._diagnose_memory()
-    assert (unknown.verdict, unknown.found, unknown.cost) == (
-        "limited",
-        "unknown",
-        "cannot be measured",
-    )
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    found = findings()
+    assert found["memory"]["cost"] == "cannot be measured"
+    assert found["platform"]["cost"] == "only Linux on x86-64 is tested"
 
 
-@pytest.mark.parametrize(
-    ("n_bytes", "verdict", "found"),
-    [
-        (5 * GIB, "ok", "5.0 GiB free"),
-        (5 * GIB - 1, "limited", "5.0 GiB free"),
-        (GIB // 4, "limited", "0.2 GiB free"),
-    ],
-)
-def test_little_room_on_the_disk_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int, verdict: str, found: str
-) -> None:
-    asked = []
-
-    def disk_usage(folder: Path) -> SimpleNamespace:
-        asked.append(folder)
-        return SimpleNamespace(free=n_bytes)
-
-    monkeypatch.setattr(diagnosis.shutil, "disk_usage", disk_usage)
-    disk, store = diagnosis._diagnose_store(tmp_path / "new" / "er")
-    # Of what is not there yet the folder that it will lie in counts.
-    assert asked == [tmp_path]
-    assert (disk.name, disk.is_core) == ("disk of the store", False)
-    assert (disk.verdict, disk.found, bool(disk.cost)) == (verdict, found, verdict != "ok")
-    assert (store.verdict, store.cost, store.is_core) == ("ok", "", True)
-    assert store.found == f"{tmp_path / 'new' / 'er'} is writable"
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("system", "machine", "verdict"),
-    [
-        ("Linux", "x86_64", "ok"),
-        ("Linux", "aarch64", "limited"),
-        ("Darwin", "x86_64", "limited"),
-    ],
-)
-def test_other_platforms_are_untested(
-    monkeypatch: pytest.MonkeyPatch, system: str, machine: str, verdict: str
-) -> None:
-    monkeypatch.setattr(platform, "system", lambda: system)
-    monkeypatch.setattr(platform, "machine", lambda: machine)
-    told = diagnosis._diagnose_platform()
-    assert told.verdict == verdict
-    assert told.found.endswith(f", {system} {machine}")
-    assert told.cost == ("" if verdict == "ok" else "only Linux on x86-64 is tested")
-
-
-@pytest.mark.parametrize(
-    ("problem", "way_out"),
-    [
-        ("libGL.so.1: cannot open", "libgl1"),
-        ("libX11.so.6: cannot open", "libx11-6"),
-        ("libusb-1.0.so.0: no", "libusb-1.0-0"),
-        ("libgomp.so.1: no", "libgomp1"),
-    ],
-)
-def test_a_missing_system_library_is_named_by_its_package(problem: str, way_out: str) -> None:
-    assert diagnosis._way_out(problem) == (
-        f"install the system package {way_out}, e.g. apt-get install {way_out}"
-    )
-    assert diagnosis._way_out("no module named x") == "reinstall it"
-
-
-def test_a_library_that_crashes_or_says_nothing_is_told() -> None:
-    crash = "os as _o; _o.kill(_o.getpid(), 11)"
-    assert diagnosis._import_problem(crash) == "its import crashes (signal 11)"
-    assert diagnosis._import_problem("os as _o; _o._exit(3)") == "its import fails: no message"
-    assert diagnosis._import_problem("json") == ""
-    assert diagnosis._import_problem("no_such_thing") == (
-        "its import fails: ModuleNotFoundError: No module named 'no_such_thing'"
-    )
-
-
-def test_a_library_that_takes_too_long_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def waits(command: list[str], *, timeout: float, **_: object) -> None:
-        raise subprocess.TimeoutExpired(command, timeout)
-
-    monkeypatch.setattr(diagnosis.subprocess, "run", waits)
-    assert re.fullmatch(
-        r"its import takes longer than \d+(\.\d)? s", diagnosis._import_problem("x")
-    )
-
-
-def test_every_library_of_the_core_is_one() -> None:
-    core = {library.distribution for library in diagnosis.LIBRARIES if library.is_core}
-    assert core == {
-        *("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich"),
-        "ruamel.yaml",
-    }
-
-
-def test_plugins_are_counted_and_broken_ones_cost_their_methods(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    broken = SimpleNamespace(entry_point="odd", distribution="odd-methods", error="no such name")
-    entry = SimpleNamespace(problem="", looked_at=lambda: entry)
-    catalog = SimpleNamespace(
-        methods={"a.b": entry, "a.c": entry},
-        broken=(broken,),
-        products={},
-        kinds={},
-    )
-    monkeypatch.setattr("orthoflow.catalog.discovery.discover_catalog", lambda: catalog)
-    fine, odd = doctor._diagnose_plugins()
-    assert (fine.name, fine.verdict, fine.found, fine.cost) == ("plugins", "ok", "2 methods", "")
-    assert (odd.name, odd.verdict, odd.is_core) == ("plugin odd", "missing", False)
-    assert (odd.found, odd.cost) == (
-        *("odd-methods fails to load", "its methods are missing: no such name"),
-    )
+@pytest.mark.usefixtures("libraries")
+def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    packages = Path("packages")
+    info = packages / "odd-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[orthoflow.plugins]\nodd = odd_hooks\n")
+    monkeypatch.syspath_prepend(packages)
+    (packages / "odd_hooks.py").write_text("raise NameError('no such name')")
+    assert findings()["plugin odd"]["found"] == "odd 1.0 fails to load"
+    result = CliRunner().invoke(program, ["doctor"])
+    assert "- plugin odd: its methods are missing: NameError: no such name" in result.output
+    assert result.output.splitlines()[-1] == "orthoflow works, with 1 restriction"
+    monkeypatch.setenv("ORTHOFLOW_DISABLED_PLUGINS", "odd")
+    assert findings()["plugin odd"]["found"] == "switched off"
+    unknown = CliRunner().invoke(program, ["plugins", "show", "plane.odd"])
+    assert unknown.exit_code == 2
+    assert "ORTHOFLOW_DISABLED_PLUGINS switches off odd" in unknown.output
 
     def fail() -> None:
         raise ImportError("no pluggy")
 
     monkeypatch.setattr("orthoflow.catalog.discovery.discover_catalog", fail)
-    (none,) = doctor._diagnose_plugins()
-    assert (none.name, none.verdict, none.found) == ("plugins", "missing", "no pluggy")
-    assert none.cost == "no method can be found; install what is missing"
-
-
-@pytest.mark.parametrize(
-    ("costs", "broken_core", "last"),
-    [
-        ([], False, "everything works"),
-        (["", "slow"], False, "orthoflow works, with 1 restriction"),
-        (["no E57", "slow"], False, "orthoflow works, with 2 restrictions"),
-        (["nothing"], True, "something that everything needs is missing"),
-    ],
-)
-def test_the_last_line_says_whether_it_works(
-    costs: list[str], broken_core: bool, last: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    findings = [
-        dataclasses.replace(diagnose_library(CLICK), name=f"part{k}", cost=cost)
-        for k, cost in enumerate(costs)
-    ]
-    doctor._print(findings, broken_core=broken_core)
-    said = capsys.readouterr().out.splitlines()
-    assert said[0] == f"orthoflow {__version__}"
-    assert said[-1] == last
-    told = [f"- part{k}: {cost}" for k, cost in enumerate(costs) if cost]
-    assert [line for line in said if line.startswith("- ")] == told
-    assert ("What that costs:" in said) == bool(told)
+    assert findings()["plugins"]["found"] == "no pluggy"
