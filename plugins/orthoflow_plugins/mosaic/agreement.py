@@ -1,4 +1,4 @@
-"""How well the sources of a wall agree: in place where they overlap, in colour along seams."""
+"""Agreement of the sources of a wall: in position in overlaps, in colour along seams."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
-# Flat patches show no displacement, and weak peaks show chance.
+# Flat patches show no displacement, and weak peaks are due to chance.
 _CONTRAST_LEAST_GREY: Final = 3.0
 _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
@@ -28,7 +28,7 @@ _ROWS_AT_ONCE: Final = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class Overlaps:
-    """How far pairs of photos lie apart where both show a wall.
+    """Displacements between pairs of photos that show the same part of a wall.
 
     Attributes:
         shifts_cells: (n, 2) displacements (u, v) of the second against the first photo.
@@ -44,12 +44,12 @@ class Overlaps:
 def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overlaps:
     """Measure the displacements between layers in patches of a wall.
 
-    Patches of 64 x 64 cells that both layers paint wholly are compared by phase correlation, which
-    is good to about a tenth of a cell.
+    Patches of 64 x 64 cells that both layers paint completely are compared by phase correlation,
+    which is accurate to about a tenth of a cell.
 
     Args:
         layers: photos of one wall.
-        of_all_pairs: compare every two layers of a patch, not the two best only.
+        of_all_pairs: compare every two layers of a patch, not only the best two.
     """
     import cv2
 
@@ -75,7 +75,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
 
 
 def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
-    """Row and column of patches, and two layers that paint them wholly."""
+    """Yield row and column of patches, and two layers that paint them completely."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
         return []
@@ -90,7 +90,7 @@ def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, in
 
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Mean quality of each patch, 0 where the layer does not paint all of it."""
+    """Return the mean quality of each patch, 0 if the layer does not paint all of it."""
     qualities: list[NDArray[np.float64]] = []
     columns = shape[1] * PATCH_CELLS
     for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):
@@ -108,7 +108,7 @@ def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class SeamSteps:
-    """What changes where one source follows another.
+    """Colour differences where one source follows another.
 
     Attributes:
         grey: (n,) float64 difference in luminance of both sources in a cell at a seam.
@@ -126,8 +126,8 @@ def seam_steps(
 
     Args:
         source: (rows, cols) index of the layer that paints each cell, -1 for none.
-        layers: what the index counts.
-        balance: how their colours are balanced, or None.
+        layers: the layers to which the index refers.
+        balance: the colour balance, or None.
     """
 
     def shown(index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -160,7 +160,7 @@ def seam_steps(
 def _before_seams(
     source: NDArray[np.int16], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
+    """Yield rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
     found: list[NDArray[np.int64]] = []
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
         strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
@@ -173,10 +173,10 @@ def _before_seams(
 
 
 def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
-    """Cells at seams, and those of them at depth edges; some rows at a time."""
+    """Count cells at seams, and those of them at depth edges; some rows at a time."""
     n_seam = n_edge_seam = 0
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        # The row below tells of the last one.
+        # The row below decides about the last one.
         rows = slice(first, first + _ROWS_AT_ONCE + 1)
         seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
         n_seam += int(np.count_nonzero(seam))
@@ -186,7 +186,7 @@ def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) 
 
 
 def is_seam(source: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Cells whose right or lower neighbour comes from another source."""
+    """Return cells whose right or lower neighbour comes from another source."""
     seam = np.zeros(source.shape, dtype=np.bool_)
     seam[:, :-1] |= _differ(source[:, :-1], source[:, 1:])
     seam[:-1] |= _differ(source[:-1], source[1:])

@@ -1,11 +1,11 @@
-"""How the colours of layers are balanced: what is added to their light, smooth over each wall.
+"""Colour balance of layers: corrections of their light, smooth over each wall.
 
-Only what is smooth over blocks of cells is changed. Two layers are therefore never mixed: detail
-is that of one photo everywhere, and there are no double contours, whatever parallax is left.
+Only changes that are smooth over blocks of cells are made. Two layers are therefore never mixed:
+detail comes from one photo everywhere, and there are no double contours, whatever parallax remains.
 
-What makes photos alike is an exposure each, the light their lens loses, a smooth field each, in
-logarithms, so that factors add up. Where two photos show the same blocks of a wall, what is added
-to one less what is added to the other must be how they differ.
+The model is an exposure per photo, the vignetting of its lens, and a smooth field per photo, in
+logarithms, so that factors add up. Where two photos show the same blocks of a wall, the difference
+of their corrections must equal their observed difference.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-# Sides of blocks in cells, at most, and about how many blocks a small wall has.
+# Maximum side of blocks in cells, and the approximate number of blocks of a small wall.
 _BLOCK_CELLS_MOST: Final = 16
 _BLOCKS_LEAST: Final = 4_000
-# Photos of which nothing has to be changed by more than this factor do not differ.
+# Photos that need no correction by more than this factor do not differ.
 _ALIKE: Final = 0.02
-# Differences are smooth over so many blocks; where fewer than so much is known, they fade.
+# Smoothing radius of differences in blocks; with less known than this they fade.
 _SMOOTH_BLOCKS: Final = 1.5
 _KNOWN_LEAST: Final = 0.02
-# What two balanced photos differ by beyond this is another thing, not another light.
+# Larger differences of two balanced photos are due to different objects, not to light.
 _SAME_THING: Final = 0.15
 # Focal lengths of one lens differ by less than about this factor.
 _SAME_ZOOM: Final = 0.1
-# An overlap of fewer blocks says nothing, and more than so many say no more.
+# A smaller overlap in blocks is not used, and a larger one is sampled.
 _LEAST_BLOCKS: Final = 4
 _BLOCKS_MOST: Final = 200
 _INDEPENDENT: Final = 50.0
-# What two photos differ by in a block besides: at least.
+# Minimum additional difference of two photos in a block.
 _SPREAD_LEAST: Final = 0.01
-# How far exposures, lens terms and nodes of fields may be expected from 0, in logarithms.
+# Prior standard deviations of exposures, lens terms and nodes of fields, in logarithms.
 _EXPOSURE_PRIOR: Final = 1.0
 _LENS_PRIOR: Final = 0.5
 _FIELD_PRIOR: Final = 0.05
-# Holds fields at 0.
+# Fixes fields at 0.
 _NO_FIELD: Final = 1e-9
 # Nodes along each side of a field.
 _NODES: Final = 4
@@ -63,14 +63,14 @@ _OUTLIER: Final = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Balance:
-    """What is added to the logarithm of the light of each layer of a wall.
+    """The correction of the logarithm of the light of each layer of a wall.
 
     Attributes:
         blocks: of the wall.
-        lights: of each layer, as it is.
+        lights: of each layer, uncorrected.
         logs: (rows, cols, 3) float32 in the blocks of each layer's box; bilinear between their
-            middles.
-        exposures: how they came about.
+            centres.
+        exposures: the model they come from.
     """
 
     blocks: Blocks
@@ -81,13 +81,13 @@ class Balance:
     def shown(
         self, index: int, colours: Colours, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> Colours:
-        """Return colours (n, 3) of a layer, in its cells at rows and columns (n,), as balanced."""
+        """Return balanced colours (n, 3) of a layer, in its cells at rows and columns (n,)."""
         return lit(colours, self.log_gains(index, rows, columns))
 
     def log_gains(
         self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """What is added (n, 3) to the logarithm of a layer's light in cells."""
+        """Return the correction (n, 3) of the logarithm of a layer's light in cells."""
         logs, box = self.logs[index], self.lights[index].box
         row, down = _between(rows, self.blocks.rows, box[0])
         column, right = _between(columns, self.blocks.columns, box[1])
@@ -106,10 +106,10 @@ class Balance:
 def _between(
     cells: NDArray[np.int64], edges: NDArray[np.int64], part: slice
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Between which blocks cells (n,) lie: the first of two (n,), and how far on (n, 1), 0 to 1."""
+    """Blocks between which cells (n,) are: the first of two (n,), and the weight (n, 1)."""
     n_blocks = part.stop - part.start
     middles = 0.5 * (edges[part] + edges[part.start + 1 : part.stop + 1])
-    # Cells of one row or column share what is looked up.
+    # Cells of one row or column share the lookup.
     at = np.interp(np.arange(edges[-1]) + 0.5, middles, np.arange(n_blocks))
     first = np.minimum(at.astype(np.int64), max(0, n_blocks - 2))
     return first[cells], (at - first).astype(np.float32)[cells][:, None]
@@ -122,13 +122,13 @@ def balance_of(
     *,
     is_local: bool,
 ) -> Balance | None:
-    """Find what makes layers of a wall alike; None where they are.
+    """Find the corrections that make layers of a wall equal; None if they already are.
 
     Args:
         layers: that paint something, at least one.
         wall: its surface, or None.
-        cameras: of each layer, where it is a photo whose camera is known.
-        is_local: find what is smooth over a photo, too, not only its exposure.
+        cameras: of each layer, if it is a photo with a known camera.
+        is_local: also find smooth fields, not only exposures.
     """
     shape = layers[0].frame.shape
     blocks = Blocks.over(shape, _block_cells(shape))
@@ -146,7 +146,7 @@ def balance_of(
 
 
 def _block_cells(shape: tuple[int, int]) -> int:
-    """Side of the blocks of a wall, cells."""
+    """Return the side of the blocks of a wall, cells."""
     return int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
 
 
@@ -157,7 +157,7 @@ def _radii(
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
-    """Where in their photos the blocks of layers lie."""
+    """Return where in their photos the blocks of layers are."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -166,7 +166,7 @@ def _radii(
             found.append(None)
             continue
         lens = camera.intrinsics
-        # Adjusted photo by photo, focal lengths of one lens differ a little.
+        # Adjusted photo by photo, focal lengths of one lens differ slightly.
         key = (lens.width, lens.height, round(math.log(lens.fx) / _SAME_ZOOM))
         rows, columns = down[light.box[0]], right[light.box[1]]
         middles = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1).reshape(-1, 2)
@@ -174,7 +174,7 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Beyond the photo nothing is painted; the corner stands for what cannot be projected.
+        # Nothing is painted beyond the photo; the corner represents what cannot be projected.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -190,17 +190,17 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def with_seams(
     balance: Balance, source: NDArray[np.int16], wall: Wall | None, *, feather_cells: int
 ) -> Balance:
-    """Bring the layers together near their seams, with what they still differ by there.
+    """Blend the layers near their seams by the remaining differences.
 
-    Each layer goes over a width to what those about a seam show on average, by the share of each
-    in the neighbourhood. Blocks with depth edges, and those in which two layers show different
-    things, say nothing of their difference; where nothing is known it fades to none.
+    Over a width, each layer changes to the mean of the layers at a seam, weighted by the share of
+    each in the neighbourhood. Blocks with depth edges, and those in which two layers show different
+    objects, are not used for the difference; where nothing is known it fades to none.
 
     Args:
         balance: of the layers.
         source: (rows, cols) index of the layer that paints each cell, -1 for none.
         wall: its surface, or None.
-        feather_cells: how far from a seam colours change.
+        feather_cells: distance from a seam within which colours change.
     """
     blocks = balance.blocks
     side = float(np.diff(blocks.rows).max())
@@ -212,7 +212,7 @@ def with_seams(
         says[edges > 0.0] = 0.0
     logs = [values.copy() for values in balance.logs]
     for i, j, shared in pairs(balance.lights):
-        # One of the two may end at the seam: the other goes over beyond it.
+        # One of the two may end at the seam: the other blends beyond it.
         around = _grown(shared, _reach(_SMOOTH_BLOCKS), blocks.shape)
         apart = _apart(balance, (i, j), shared, around, says)
         if apart is None:
@@ -231,14 +231,14 @@ def with_seams(
 def _apart(
     balance: Balance, pair: tuple[int, int], shared: Box, around: Box, says: NDArray[np.float32]
 ) -> NDArray[np.float32] | None:
-    """Smooth difference (rows, cols, 3), second less first, of two balanced layers.
+    """Return the smooth difference (rows, cols, 3), second less first, of two balanced layers.
 
     Args:
         balance: of all layers.
         pair: the two.
         shared: blocks in the boxes of both.
-        around: these and some more, of which the difference is given.
-        says: (rows, cols) 0 in blocks of the wall that say nothing, else 1.
+        around: these with a margin, for which the difference is returned.
+        says: (rows, cols) 0 in blocks of the wall that are not used, else 1.
     """
     parts = [inside(shared, balance.lights[k].box) for k in pair]
     first, second = (
@@ -259,10 +259,10 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class _Shares:
-    """How much of the neighbourhood of a block each layer paints, of what is painted there.
+    """The share of each layer in what is painted around a block.
 
     Attributes:
-        boxes: of each layer and as far about it as it counts.
+        boxes: of each layer, with the margin within which it counts.
         values: (rows, cols) float32 in them.
         total: (rows, cols) float32 of all layers together, over the wall.
     """
@@ -273,7 +273,7 @@ class _Shares:
 
     @classmethod
     def of(cls, balance: Balance, source: NDArray[np.int16], spread: float) -> _Shares:
-        """Spread the cells of each layer over so many blocks."""
+        """Spread the cells of each layer over neighbouring blocks."""
         blocks = balance.blocks
         reach = _reach(spread)
         boxes, values = [], []
@@ -292,7 +292,7 @@ class _Shares:
         return cls(boxes=tuple(boxes), values=tuple(values), total=total)
 
     def within(self, index: int, part: Box) -> NDArray[np.float32]:
-        """Share of a layer in the blocks of a part of its box."""
+        """Return the share of a layer in the blocks of a part of its box."""
         value = self.values[index][inside(part, self.boxes[index])]
         return np.asarray(value / np.maximum(self.total[part], np.float32(1e-6)), np.float32)
 
@@ -323,11 +323,11 @@ def _grown(box: Box, reach: int, shape: tuple[int, int]) -> Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Radii:
-    """How far from the middle of its photo each block of a layer's box lies.
+    """The distance from the middle of its photo of each block of a layer's box.
 
     Attributes:
         values: (rows, cols) float32, 1 in the corners of the photo.
-        lens: number of the lens; photos of one lens lose light alike.
+        lens: number of the lens; photos of one lens have the same vignetting.
     """
 
     values: NDArray[np.float32]
@@ -336,7 +336,7 @@ class Radii:
 
 @dataclass(frozen=True, kw_only=True)
 class Exposures:
-    """What is added to the logarithm of the light of each layer.
+    """The model of the correction of the logarithm of the light of each layer.
 
     Attributes:
         exposures: (k, 3) per layer and channel.
@@ -349,7 +349,7 @@ class Exposures:
     nodes: NDArray[np.float64]
 
     def logs(self, index: int, light: BlockLight, radii: Radii | None) -> NDArray[np.float64]:
-        """Return what is added (rows, cols, 3) in the blocks of a layer's box."""
+        """Return the correction (rows, cols, 3) in the blocks of a layer's box."""
         rows, columns = (_hats(np.arange(size), size) for size in light.log_light.shape[:2])
         logs: NDArray[np.float64] = self.exposures[index] + np.einsum(
             "ri,cj,ijk->rck", rows, columns, self.nodes[index], optimize=True
@@ -377,15 +377,15 @@ class _Overlap:
 def estimate(
     lights: Sequence[BlockLight], radii: Sequence[Radii | None], *, is_local: bool = True
 ) -> Exposures:
-    """Find what makes overlaps most alike, robustly: moved things and glare count little.
+    """Find the most equal overlaps, robustly: moved objects and glare have little weight.
 
     Exposures and lenses come first, from what all channels have in common; exposures of channels
-    and fields take up what is left, the fields as little as they can.
+    and fields absorb the rest, the fields as little as possible.
 
     Args:
         lights: of the layers of a wall.
-        radii: of the same layers; None where a layer's camera is not known.
-        is_local: find fields, too.
+        radii: of the same layers; None if a layer's camera is unknown.
+        is_local: also find fields.
     """
     count = len(lights)
     n_lenses = 1 + max((item.lens for item in radii if item is not None), default=-1)
@@ -441,7 +441,7 @@ def _corner(part: Box) -> NDArray[np.int64]:
 
 
 def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
-    """One column per layer: what is added to the first less what is added to the second."""
+    """Return one column per layer: correction of the first less that of the second."""
     from scipy.sparse import csr_array
 
     layers = np.repeat(
@@ -456,7 +456,7 @@ def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
 def _lens_columns(
     overlaps: Sequence[_Overlap], radii: Sequence[Radii | None], n_lenses: int
 ) -> csr_array:
-    """Two columns per lens."""
+    """Return two columns per lens."""
     from scipy.sparse import csr_array
 
     columns = np.zeros((sum(len(item.apart) for item in overlaps), 2 * n_lenses))
@@ -473,7 +473,7 @@ def _lens_columns(
 
 
 def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -> csr_array:
-    """A column per node of each layer's field."""
+    """Return a column per node of each layer's field."""
     from scipy.sparse import csr_array
 
     n_nodes = _NODES**2
@@ -493,7 +493,7 @@ def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -
 
 
 def _hats(places: NDArray[np.int64], size: int) -> NDArray[np.float64]:
-    """Weights (n, nodes) of the nodes along a side of so many blocks, linear between them."""
+    """Weights (n, nodes) of the nodes along a side of this many blocks, linear in between."""
     at = (places + 0.5) / size * (_NODES - 1)
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(_NODES)))
 
@@ -509,9 +509,9 @@ def _solved(
     priors: NDArray[np.float64],
     overlaps: Sequence[_Overlap],
 ) -> NDArray[np.float64]:
-    """Robust least squares (unknowns, channels) with priors of 0.
+    """Solve robust least squares (unknowns, channels) with priors of 0.
 
-    Weights are those of Cauchy, with the spread of each pair's residuals.
+    Weights are those of Cauchy, with the scatter of each pair's residuals.
     """
     from scipy.sparse import diags_array, hstack
     from scipy.sparse.linalg import spsolve
@@ -526,7 +526,7 @@ def _solved(
         for part in np.split(np.arange(len(apart)), ends[:-1]):
             spread = max(_SPREAD_LEAST, median_deviation(residuals[part], 0.0))
             counted = min(1.0, _INDEPENDENT / len(part)) / spread**2
-            # At first nothing is known of exposures, and what lies apart is no outlier.
+            # Exposures are unknown at first, and large differences are not outliers.
             limit = np.inf if sweep == 0 else _OUTLIER * spread
             weights[part] = counted / (1.0 + (residuals[part] / limit) ** 2)
         weighted = matrix.T @ diags_array(weights)

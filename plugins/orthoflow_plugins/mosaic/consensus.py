@@ -1,9 +1,9 @@
-"""Where photos contradict each other: passing people and vehicles lose to what others show.
+"""Contradictions between photos: people and vehicles are replaced by what other photos show.
 
-Photos of one place, and the scan's own colours, are witnesses of how light it is over blocks of
-some centimetres, once what is smooth between two of them (light, exposure) is taken out. A photo
-does not paint a region where another photo contradicts it that more witnesses bear out. Gloss
-differs, too; there, as everywhere, only another photo's colours take the place of a photo's.
+Photos of one place, and the scan's own colours, are independent observations of light over blocks
+of some centimetres, after smooth differences between them (light, exposure) are removed. A photo
+does not paint a region where another photo contradicts it that more observations confirm. Gloss
+differs, too; there, as everywhere, only another photo's colours replace a photo's.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from orthoflow_plugins.mosaic.light import common, inside, light_of_levels
 if TYPE_CHECKING:
     from orthoflow.geometry.levels import Colours
 
-# Sides of blocks: wider than photos lie apart, narrower than a limb.
+# Sides of blocks: wider than the displacement of photos, narrower than a limb.
 _BLOCK_M: Final = 0.025
 _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
-# Added to light, so that noise of what is almost black is no difference.
+# Added to light, so that noise of almost black cells is not a difference.
 _DARK: Final = 0.02
-# Two witnesses contradict each other where they differ by so much in the logarithm of light, and by
-# so many deviations of all blocks; a region has a core in which they differ by twice as much.
+# Two observations contradict each other if they differ by this much in the logarithm of light, and
+# by this many deviations of all blocks; a region has a core in which they differ by twice as much.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
-# What is smooth over so many blocks is light.
+# Differences that are smooth over this many blocks are due to light.
 _SMOOTH_BLOCKS: Final = 40.0
-# Regions: thinner ones are edges that do not fit; gaps of so many blocks close, and rims grow.
+# Regions: thinner ones are misaligned edges; gaps of this many blocks close, and borders grow.
 _OPENING_BLOCKS: Final = 2
 _CLOSING_BLOCKS: Final = 9
 _GROWTH_BLOCKS: Final = 2
-# The grey of a laser bears witness where it goes with that of a photo so well.
+# The grey of a laser is used if its correlation with that of a photo is at least this.
 _LEAST_CORRELATION: Final = 0.6
 _LEAST_BLOCKS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Consensus:
-    """What is left of layers where others contradict them.
+    """The layers without the parts that others contradict.
 
     Attributes:
-        layers: the layers; what they are not to paint is as good as hidden from them.
-        n_outvoted: cells that a photo shows otherwise than the one that paints them now.
-        n_contradicted: cells that one photo alone shows, and the scan otherwise.
+        layers: the layers; cells that they must not paint are marked as hidden.
+        n_outvoted: cells that a photo shows differently from the one that paints them now.
+        n_contradicted: cells that a single photo shows, and the scan differently.
     """
 
     layers: tuple[Layer, ...]
@@ -66,7 +66,7 @@ class Consensus:
 
 @dataclass(frozen=True, kw_only=True)
 class _Witness:
-    """Logarithm of the light (r, c, 3) of the blocks in a box, NaN where a witness says nothing."""
+    """Logarithm of the light (r, c, 3) of the blocks in a box, NaN without an observation."""
 
     box: Box
     log_light: NDArray[np.float64]
@@ -74,12 +74,12 @@ class _Witness:
 
 
 def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate) -> Consensus:
-    """Take from each photo the regions in which better borne out photos contradict it.
+    """Remove from each photo the regions in which better confirmed photos contradict it.
 
     Args:
-        layers: photos of one wall as they are, all of which paint something.
-        wall: what the scan shows of it; None where that is not known.
-        allocate: gives the masks of changed layers, by name.
+        layers: photos of one wall, unmodified, each with painted cells.
+        wall: the wall as scanned; None if unknown.
+        allocate: returns the masks of changed layers, by name.
     """
     shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
     side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
@@ -87,7 +87,8 @@ def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate)
     witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
     scan = None if wall is None else _scan(wall, blocks, witnesses)
     if scan is not None:
-        # A photo shows more of the scan than of any other photo, so that who passes by is less.
+        # A photo has more in common with the scan than with any other photo, so passers-by matter
+        # less.
         witnesses = [_in_light_of(scan, item) for item in witnesses]
     everyone = [*witnesses, *([] if scan is None else [scan])]
     supports, apart = _compared(everyone, len(layers), blocks)
@@ -102,10 +103,10 @@ def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate)
 def _compared(
     everyone: Sequence[_Witness], n_photos: int, blocks: Blocks
 ) -> tuple[NDArray[np.int8], dict[tuple[int, int], NDArray[np.float64]]]:
-    """How many others bear out each photo in each block, and how far any two are apart.
+    """Count the observations that confirm each photo in each block, and compare all pairs.
 
     Args:
-        everyone: the photos, and the scan behind them if it bears witness.
+        everyone: the photos, and the scan after them if it is used.
         n_photos: how many of them are photos.
         blocks: of the wall.
     """
@@ -122,7 +123,7 @@ def _compared(
                 supports[i] += agrees
                 supports[j] += agrees
             else:
-                # Somebody may stand in two photos alike, but in no photo as in the scan.
+                # A person may be in two photos in the same way, but in no photo as in the scan.
                 supports[i] += agrees * np.int8(1 if everyone[j].is_grey else n_photos)
     return supports, apart
 
@@ -133,7 +134,7 @@ def _contradicted(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.float64]:
-    """How far a photo is, in each block, from photos that are borne out better; 0 without any."""
+    """How far a photo differs, in each block, from better confirmed photos; 0 without any."""
     worst = np.zeros(blocks.shape)
     for other in range(len(supports)):
         ratio = apart.get((min(photo, other), max(photo, other)))
@@ -148,7 +149,7 @@ def _n_alone(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> int:
-    """How many blocks one photo alone shows, otherwise than the scan."""
+    """Count the blocks that a single photo shows, differently from the scan."""
     shown = np.array([_known(item, blocks) for item in photos])
     is_alone = shown.sum(axis=0) == 1
     count = 0
@@ -182,7 +183,7 @@ def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Wi
 
 
 def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | None:
-    """The scan's colours, or its grey where it goes with that of the photos."""
+    """Return the scan's colours, or its grey if it correlates with that of the photos."""
     if wall.rgb is not None and wall.rgb_mask is not None:
         return _witness(wall.rgb, wall.rgb_mask > 0, blocks)
     if wall.intensity is None:
@@ -198,7 +199,7 @@ def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | 
 
 
 def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
-    """A grey on the scale of the photos' light; None where it is another."""
+    """Return a grey scaled to the photos' light; None if it does not correlate."""
     given, shown = [np.empty(0)], [np.empty(0)]
     for photo in photos:
         box = common(grey.box, photo.box)
@@ -211,7 +212,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
         return None
     x, y = x[known] - x[known].mean(), y[known]
     slope = float(x @ (y - y.mean()) / (x @ x))
-    # Who passes by is no part of the scale.
+    # Passers-by do not belong to the scale.
     near = np.abs(y - np.median(y) - slope * x) <= _CORE_TIMES * _APART
     if near.sum() < _LEAST_BLOCKS or np.corrcoef(x[near], y[near])[0, 1] < _LEAST_CORRELATION:
         return None
@@ -220,7 +221,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
 
 
 def _in_light_of(scan: _Witness, photo: _Witness) -> _Witness:
-    """A photo without what is smooth of how its light differs from the scan's."""
+    """Return a photo without the smooth difference of its light from the scan's."""
     box = common(scan.box, photo.box)
     if box is None:
         return photo
@@ -240,7 +241,7 @@ def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
 def _difference(
     one: _Witness, other: _Witness, box: Box
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """How two differ (r, c, 3) in a box, in grey where one of them is; and where both are known."""
+    """Difference of two (r, c, 3) in a box, in grey if one of them is, and where both exist."""
     difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
     if one.is_grey or other.is_grey:
         difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
@@ -248,7 +249,7 @@ def _difference(
 
 
 def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What is smooth (r, c, 3) of how two witnesses differ (r, c, 3), NaN where unknown."""
+    """Return the smooth part (r, c, 3) of the difference of two observations, NaN where unknown."""
     known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
     if not known.any():
         return np.zeros(difference.shape)
@@ -261,9 +262,9 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
-    """How far two witnesses are apart in each block, 1 where they begin to contradict each other.
+    """Return the difference of two observations in each block, 1 where a contradiction begins.
 
-    NaN where one says nothing; None where they share no block.
+    NaN where one is missing; None if they share no block.
     """
     box = common(one.box, other.box)
     if box is None:
@@ -281,7 +282,7 @@ def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64
 
 
 def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Means (r, c, 3) of the used values about each block."""
+    """Return means (r, c, 3) of the used values around each block."""
     import cv2
 
     weights = cv2.GaussianBlur(is_used.astype(np.float64), (0, 0), _SMOOTH_BLOCKS)
@@ -290,7 +291,7 @@ def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[
 
 
 def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whole regions in which something is contradicted that has a core."""
+    """Return whole regions with a contradiction that has a core."""
     import cv2
 
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (_OPENING_BLOCKS, _OPENING_BLOCKS))
@@ -305,7 +306,7 @@ def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A region with its rim, where what it shows is mixed with what is behind it."""
+    """Return a region with its border, where its content is mixed with the background."""
     import cv2
 
     side = 2 * _GROWTH_BLOCKS + 1
@@ -316,7 +317,7 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Cells that some layer paints that is not to lose them."""
+    """Return cells that some layer paints that must not lose them."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 
@@ -327,7 +328,7 @@ def _without(
     blocks: Blocks,
     allocate: Allocate,
 ) -> tuple[tuple[Layer, ...], int]:
-    """The layers without their outvoted blocks where another paints; and how many cells that is."""
+    """Layers without their outvoted blocks where another paints, and their cell count."""
     changed = [index for index, region in enumerate(outvoted) if region.any()]
     if not changed:
         return tuple(layers), 0
@@ -345,7 +346,7 @@ def _without(
         painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
         is_out = [region[at] & shows for region, shows in zip(grown, painted, strict=True)]
         stays = _any_left(painted, is_out)
-        # Between two people the rim of one is better than the other.
+        # Between two people the border of one is better than the other.
         is_out = [out & (stays | region[at]) for out, region in zip(is_out, outvoted, strict=True)]
         stays = _any_left(painted, is_out)
         for index in changed:

@@ -1,7 +1,7 @@
-"""How far inside the area that a layer paints its cells lie: of a large layer some rows at a time.
+"""Distances of cells from the border of the area that a layer paints, some rows at a time.
 
-Distances are exact (Meijster 2000): down and up the columns first, which go into a file, then along
-each row over the parabolas that these open. OpenCV's need the whole wall in memory.
+Distances are exact (Meijster 2000): first along the columns, into a file, then along each row over
+the parabolas above the columns. OpenCV needs the whole wall in memory.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _THREADS: Final = 2
 
 
 def column_distances(mask: NDArray[np.uint8], name: str, allocate: Allocate) -> NDArray[np.uint32]:
-    """Distances (rows, cols) down or up the column to what a layer does not paint, or to the rim.
+    """Return distances (rows, cols) along the column to unpainted cells, or to the border.
 
     Args:
         mask: (rows, cols) `LayerMask`.
-        name: of the array that is asked for.
-        allocate: gives it.
+        name: of the array that is allocated.
+        allocate: returns it.
     """
     distances = np.asarray(allocate(name, mask.shape, np.uint32), np.uint32)
     before = np.zeros(mask.shape[1], dtype=np.uint32)
@@ -42,11 +42,11 @@ def column_distances(mask: NDArray[np.uint8], name: str, allocate: Allocate) -> 
 
 
 def depths_inside(distances: NDArray[np.uint32], rows: slice) -> NDArray[np.float32]:
-    """Distances in cells to the nearest cell that a layer does not paint, or to the rim.
+    """Return distances in cells to the nearest cell that a layer does not paint, or to the border.
 
     Args:
-        distances: (rows, cols) as `column_distances` gives them.
-        rows: that are asked for.
+        distances: (rows, cols) from `column_distances`.
+        rows: the requested rows.
     """
     part = np.ascontiguousarray(distances[rows]).view(np.ndarray)
     depths = np.empty(part.shape, dtype=np.float32)
@@ -67,7 +67,7 @@ def look_along_rows(
         end: the row after the last one.
     """
     width = distances.shape[1]
-    # With the rim on either side.
+    # With the border on either side.
     squares = np.zeros(width + 2, dtype=np.int64)
     lowest = np.zeros(width + 2, dtype=np.int64)
     starts = np.zeros(width + 2, dtype=np.int64)
@@ -75,7 +75,7 @@ def look_along_rows(
         for column in range(width):
             distance = np.int64(distances[row, column])
             squares[column + 1] = distance * distance
-        last = _lay_parabolas(squares, lowest, starts)
+        last = _lowest_parabolas(squares, lowest, starts)
         for column in range(width, 0, -1):
             while starts[last] > column:
                 last -= 1
@@ -84,10 +84,10 @@ def look_along_rows(
 
 
 @kernel_part
-def _lay_parabolas(
+def _lowest_parabolas(
     squares: NDArray[np.int64], lowest: NDArray[np.int64], starts: NDArray[np.int64]
 ) -> int:
-    """Find which of the parabolas that stand over the columns are lowest, and from where on.
+    """Find which of the parabolas above the columns are lowest, and from which column on.
 
     Args:
         squares: (columns,) height of the parabola over a column.
@@ -95,7 +95,7 @@ def _lay_parabolas(
         starts: (columns,) first column where each of them is the lowest; likewise.
 
     Returns:
-        Position of the last one.
+        Index of the last one.
     """
     last = 0
     lowest[0], starts[0] = 0, 0

@@ -1,4 +1,4 @@
-"""Areas that a person gives to photos, whatever the rule of the seams says."""
+"""Areas that a person assigns to photos, regardless of the rule for seams."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthoflow.products import InputFiles
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSeams:
-    """Polygons of one wall, each of one of its layers; of overlapping ones the last counts.
+    """Polygons of one wall, each for one of its layers; of overlapping ones the last counts.
 
     Attributes:
         rings: of each polygon, (n, 2) corners as (column, row).
@@ -28,23 +28,23 @@ class DrawnSeams:
     layers: tuple[int, ...]
     n_columns: int
 
-    def wished(self, rows: slice) -> NDArray[np.int16]:
-        """Which layer (rows, cols) a person wants in some rows; -1 where nobody said."""
-        wished = np.full((rows.stop - rows.start, self.n_columns), -1, dtype=np.int16)
+    def chosen(self, rows: slice) -> NDArray[np.int16]:
+        """Return the layer (rows, cols) that a person chose in some rows; -1 without a choice."""
+        chosen = np.full((rows.stop - rows.start, self.n_columns), -1, dtype=np.int16)
         for rings, layer in zip(self.rings, self.layers, strict=True):
             moved = tuple(ring - [0.0, rows.start] for ring in rings)
             lowest = min(float(ring[:, 1].min()) for ring in moved)
             highest = max(float(ring[:, 1].max()) for ring in moved)
-            if highest >= 0.0 and lowest <= len(wished):
-                wished[filled(moved, wished.shape)] = layer
-        return wished
+            if highest >= 0.0 and lowest <= len(chosen):
+                chosen[filled(moved, chosen.shape)] = layer
+        return chosen
 
 
 def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[NamedPolygon]:
     """Read the polygons of all walls, with the properties `photo` and `wall`, its number.
 
     Raises:
-        InputError: a file holds something else, or names what is no layer.
+        InputError: a file has other content, or names something that is not a layer.
     """
     if files is None:
         return []
@@ -71,7 +71,7 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
 def seams_of(
     polygons: Sequence[NamedPolygon], number: int, frame: WallFrame, sources: Sequence[str]
 ) -> DrawnSeams | None:
-    """Return the polygons of a wall in its cells; None where it has none.
+    """Return the polygons of a wall in its cells; None if it has none.
 
     Args:
         polygons: of all walls, in the metres of their GeoTIFFs.

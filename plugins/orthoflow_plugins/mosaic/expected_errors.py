@@ -1,9 +1,9 @@
-"""The expected error of a place that is measured in an orthoimage, cell by cell.
+"""The expected error of a point measured in an orthoimage, cell by cell.
 
-Three causes move what a cell shows along the wall, each independent of the others: the photo's pose
-(its covariance, carried onto the wall), the depth of the cell (times the tangent of the view), and
-what neither explains of how far photos of an overlap lie apart. Overlaps separate the last two:
-photos that see a place from different sides lie apart by its depth, all others by their poses.
+Three independent causes displace the content of a cell along the wall: the photo's pose (its
+covariance, propagated to the wall), the depth of the cell (times the tangent of the view), and the
+displacements of photos in overlaps that neither explains. Overlaps separate the last two: photos
+that see a place from different sides are displaced by its depth, all others by their poses.
 """
 
 from __future__ import annotations
@@ -24,32 +24,35 @@ from orthoflow_plugins.mosaic.agreement import Overlaps
 if TYPE_CHECKING:
     from orthoflow.geometry import WallFrame
 
-# Errors of poses are smooth: they are computed on so many nodes a side and are linear between.
+# Errors of poses are smooth: they are computed at this many nodes per side and interpolated
+# linearly.
 _NODES: Final = 48
-# Noise of phase correlation: 0.06 and 0.07 cells in a drawn room whose poses err by 0.01 cells.
+# Noise of phase correlation: 0.06 and 0.07 cells in a drawn room whose poses have errors of 0.01
+# cells.
 _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
 # A view flatter than 84 degrees paints nothing.
 _MOST_TANGENT: Final = 10.0
-# Interpolated depths are about so much worse than measured ones beside them (`docs/accuracy.md`).
+# Interpolated depths are worse by this factor than measured neighbours (`docs/accuracy.md`).
 _RECOVERED_TIMES: Final = 2.0
-# Spreads of few points scatter; only larger ones, as at edges, say more than the whole raster does.
+# Spreads of few points scatter; only larger ones, as at edges, add to the value of the whole
+# raster.
 _SPREAD_TIMES: Final = 2.0
-# Depths a few centimetres apart scatter by more than neighbours where a cloud errs in patches, as
-# those made of photos do. Relief of rooms makes up to 1.35 times as much (0.98 and 1.3 mm in the
+# Depths a few centimetres apart differ by more than neighbours if a cloud has errors in patches, as
+# clouds from photos do. Relief of rooms explains up to a factor of 1.35 (0.98 and 1.3 mm in the
 # simulated room, 1.2 and 2.4 mm in a stuccoed hall, 1.7 and 5.2 mm in a fountain's stereo cloud).
 _PATCH_M: Final = 0.05
 _PATCHY_TIMES: Final = 1.5
-# Overlaps show errors of depths where tangents of views differ by that much, in so many patches.
+# Overlaps show errors of depths if tangents of views differ by this much, in this many patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
-# Displacements of more than so many deviations are matches of something else.
+# Displacements of more than this many deviations are false matches.
 _OUTLIER: Final = 3.0
 _ROUNDS: Final = 8
 
 
 def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
-    """Count the ties that hold the photos on a wall, and those that check them there.
+    """Count the control and check points of the photos on a wall.
 
     Args:
         cameras: orientations, with the ties that they kept.
@@ -83,12 +86,12 @@ def expected_errors_m(
         wall: its surface.
         source: (rows, cols) index of the photo that paints each cell, -1 for none.
         sources: names of the photos.
-        cameras: of oriented photos, by name; only those with a covariance say how wrong they are.
-        overlaps: how far photos lie apart where two show the wall.
-        allocate: gives the array.
+        cameras: of oriented photos, by name; only those with a covariance have an error.
+        overlaps: displacements between photos where two show the wall.
+        allocate: returns the array.
 
     Returns:
-        (rows, cols), NaN where nothing is painted, or nothing known of its photo.
+        (rows, cols), NaN where nothing is painted, or the error of the photo is unknown.
     """
     frame = wall.frame
     errors_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
@@ -104,7 +107,7 @@ def expected_errors_m(
     noise_m, patchy_m = _depth_noises_m(wall)
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     if excess is not None and excess.depth_m is not None:
-        # Relief of five centimetres looks like errors of that size; overlaps do not confuse them.
+        # Relief of five centimetres looks like errors of that size; overlaps distinguish them.
         patchy_m = excess.depth_m
     unexplained = np.float64(0.0 if excess is None else excess.position_m**2)
     for index, name in enumerate(sources):
@@ -128,7 +131,7 @@ def expected_errors_m(
 
 
 def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
-    """Columns and rows (r, c, 2) of the nodes: the middles of blocks of cells."""
+    """Return columns and rows (r, c, 2) of the nodes: the centres of blocks of cells."""
     rows, columns = ((np.arange(-(-size // step)) + 0.5) * step for size in frame.shape)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -143,7 +146,7 @@ def _pose_variances(
     if camera.covariance is None:
         return None
     viewing, middle = camera.viewing(), frame.origin_world
-    # About the wall: at survey coordinates turns and shifts would cancel each other.
+    # Relative to the wall: at survey coordinates rotations and shifts would cancel each other.
     to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
     covariance = to_local @ camera.covariance @ to_local.T
     near = viewing.shifted(middle)
@@ -161,7 +164,7 @@ def _pose_variances(
     variances[shown] = 0.5 * np.einsum("nij,jk,nik->n", by_pose, covariance, by_pose)
     inside = near.sees(pixels) & shown
     if camera.sigma_wall_m is not None and inside.any():
-        # An estimated lens adds to the pose; what it adds on the wall is stated with it.
+        # An estimated lens adds to the pose; its effect on the wall is stated with it.
         stated = camera.sigma_wall_m**2 / float(np.median(variances[inside]))
         variances *= max(1.0, stated)
     known = np.isfinite(variances)
@@ -172,7 +175,7 @@ def _pose_variances(
 def _between(
     values: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp], step: int
 ) -> NDArray[np.float64]:
-    """Values (n,) at cells, linear between the nodes, level beyond the outermost."""
+    """Return values (n,) at cells, linear between the nodes, constant beyond the outermost."""
     places, shares = [], []
     for cells, size in zip((rows, columns), values.shape, strict=True):
         place = np.clip((cells + 0.5) / step - 0.5, 0.0, size - 1.0)
@@ -187,7 +190,7 @@ def _between(
 
 
 def _depth_noises_m(wall: Wall) -> tuple[float, float]:
-    """Noise of the depths of single cells, and what neighbours err by together; 0 without."""
+    """Noise of the depths of single cells, and the error common to neighbours; 0 without."""
     noise_m = depth_noise_m(wall.depth_m)
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
     apart_m = depth_noise_m(wall.depth_m[::step, ::step])
@@ -203,9 +206,9 @@ def _depth_variances(
     centre: NDArray[np.float64],
     noises_m: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Variances (n,) of a coordinate by the depth of cells, seen from a centre (3,).
+    """Return variances (n,) of a coordinate by the depth of cells, seen from a centre (3,).
 
-    Of the noises, the first is of single cells, the second common to neighbours.
+    The first noise is that of single cells, the second common to neighbours.
     """
     noise_m, patchy_m = noises_m
     gsd_m = wall.frame.gsd_m
@@ -223,11 +226,11 @@ def _depth_variances(
 
 @dataclass(frozen=True, kw_only=True)
 class _Excess:
-    """What displacements in overlaps say beyond stated poses.
+    """Errors in overlaps beyond those of the stated poses.
 
     Attributes:
         position_m: standard deviation of a coordinate of one photo.
-        depth_m: that of depths over a patch; None where views differ too little.
+        depth_m: standard deviation of depths over a patch; None if views differ too little.
     """
 
     position_m: float
@@ -237,11 +240,11 @@ class _Excess:
 def _excess_of_overlaps(
     wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
 ) -> _Excess | None:
-    """Split displacements into those of poses and of depths; None where there are too few.
+    """Split displacements into those of poses and of depths; None if there are too few.
 
-    Squares of displacements are sums of the variances of both poses, of twice what poses do not
-    state, and of the variance of the depth times the square of what the tangents of both views
-    differ by: a least squares fit with weights, without negative variances and outliers.
+    Squares of displacements are sums of the variances of both poses, of twice the unstated variance
+    of poses, and of the variance of the depth times the squared difference of the tangents of both
+    views: a weighted least squares fit, without negative variances and outliers.
     """
     from scipy.optimize import nnls
 
@@ -290,7 +293,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variances (n,) that a pose states at places, and tangents (n, 2) of its views of them."""
+    """Return variances (n,) that a pose states at positions, and tangents (n, 2) of its views."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

@@ -1,4 +1,4 @@
-"""Seams by graph cuts: where two photos look alike, and not along depth edges."""
+"""Seams by graph cuts: where two photos look similar, and not along depth edges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from orthoflow_plugins.mosaic.light import lit_shares
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
 
-# Cuts are made on a smaller picture of about so many cells.
+# Cuts are computed on a smaller picture of about this many cells.
 _CELLS_MOST: Final = 30_000
 _SWEEPS_MOST: Final = 2
 # A seam across a depth edge costs as much as one between black and white.
@@ -27,7 +27,7 @@ _DEPTH_EDGE_COST: Final = 1.0
 # Even where layers are equal a long seam costs more than a short one.
 _LENGTH_COST: Final = 0.01
 _VIEW_WEIGHT: Final = 0.1
-# What a layer does not paint it cannot take.
+# Cost of a cell that a layer does not paint.
 _FORBIDDEN: Final = 1e3
 _UNITS: Final = 1000.0
 
@@ -36,7 +36,7 @@ _UNITS: Final = 1000.0
 class _Scene:
     """The reduced layers: colours (k, rows, cols, 3) 0..1, views (k, rows, cols), edges.
 
-    `views` is the cost of a layer in a cell, `edges` what a seam there costs besides.
+    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam there.
     """
 
     colours: NDArray[np.float32]
@@ -46,7 +46,7 @@ class _Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class CutLabels:
-    """Which layer a cut gives each cell.
+    """The layer that a cut assigns to each cell.
 
     Attributes:
         small: (rows, cols) int16 of the blocks, -1 where no layer paints.
@@ -57,7 +57,7 @@ class CutLabels:
     blocks: Blocks
 
     def in_rows(self, rows: slice) -> NDArray[np.int16]:
-        """Layer (rows, cols) of the cells in some rows of the wall."""
+        """Return the layer (rows, cols) of the cells in some rows of the wall."""
         first_rows, first_columns = self.blocks.rows, self.blocks.columns
         wanted = np.arange(*rows.indices(int(first_rows[-1])))
         blocks = np.searchsorted(first_rows, wanted, side="right") - 1
@@ -76,7 +76,7 @@ def cut_labels(
     Args:
         layers: of one wall.
         wall: its surface, for depth edges, or None.
-        balance: how the colours of the layers are balanced before they are compared, if they are.
+        balance: the colour balance of the layers before they are compared, if any.
     """
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
@@ -134,8 +134,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     source, sink = count, count + 1
     flat = labels.ravel()
     cells = np.arange(count)
-    # Unary costs of keeping (0) and of taking alpha (1). Whole numbers: none is lost in sums, so
-    # that it does not matter which of two neighbours is p.
+    # Unary costs of keeping (0) and of taking alpha (1). Integers, so that sums are exact and it
+    # does not matter which of two neighbours is p.
     views = np.rint(_UNITS * scene.views)
     keep = views.reshape(len(views), -1)[flat, cells]
     take = views[alpha].ravel().copy()
@@ -145,8 +145,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
         p, q = one.ravel(), other.ravel()
         right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
         left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
-        # Where a step over alpha costs less than the seam, a cut cannot tell, and the seam counts
-        # as much as the step.
+        # Where a detour over alpha costs less than the seam, the move is not representable, and the
+        # seam is set to the cost of the detour.
         kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)
@@ -186,14 +186,14 @@ def _seam_cost(
     label_p: NDArray[np.int64],
     label_q: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Cost (n,) of neighbours with these labels, whole units: 0 for equal ones."""
+    """Return the cost (n,) of neighbours with these labels, integers: 0 for equal ones."""
     colours = scene.colours.reshape(len(scene.colours), -1, 3)
     views = scene.views.reshape(len(scene.views), -1)
     edges = scene.edges.ravel()
     cost = _LENGTH_COST + edges[p] + edges[q]
     for cell in (p, q):
         apart = np.abs(colours[label_p, cell] - colours[label_q, cell]).mean(axis=1)
-        # Where only one of them paints there is nothing to compare, and no step to be seen.
+        # Where only one of them paints there is nothing to compare, and no visible step.
         both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
         cost = cost + np.where(both, apart, 0.0)
     return np.where(label_p == label_q, 0.0, np.rint(_UNITS * cost))

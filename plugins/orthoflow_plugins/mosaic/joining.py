@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
 
-# Preference (rows, cols) of a layer in some rows of its wall, made when they are joined: those of a
+# Preference (rows, cols) of a layer in some rows of its wall, computed during joining: those of a
 # large wall would not fit into memory.
 Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
-# Walls with more cells are joined in bands of so many.
+# Walls with more cells are joined in bands of this many.
 _BAND_CELLS: Final = 1 << 25
-# Balanced colours take more than a hundred bytes a cell for a moment.
+# Balancing colours takes more than a hundred bytes per cell temporarily.
 _BALANCED_AT_ONCE: Final = 1 << 20
-# A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
-# at least one looks at it. A filled cell counts less than a painted one.
+# A cell takes the highest state of any layer. Occluded: no source paints it, although at least one
+# faces it. A filled cell ranks below a painted one.
 _RANKED: Final = (
     OrthoMask.NONE,
     OrthoMask.NO_SURFACE,
@@ -49,15 +49,16 @@ _RANK_OF_LAYER_MASK: Final = np.array(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeamWish:
-    """Where seams are wanted.
+class SeamOptions:
+    """Where seams are preferred.
 
     Attributes:
-        rule: says which layer paints a cell that several show as well.
+        rule: decides which layer paints a cell that several show.
         priority: names of photos, for that rule.
-        island_cells_min: smaller patches from one source are painted from the source around
-            them, where that one sees them too.
-        drawn: areas that a person gives to photos, before all rules, where those paint them.
+        island_cells_min: smaller patches from one source are painted from the source around them,
+            if that one sees them too.
+        drawn: areas that a person assigns to photos, which precede all rules where those photos
+            paint them.
     """
 
     rule: SeamRule
@@ -68,7 +69,7 @@ class SeamWish:
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What becomes of each cell, before colours are taken.
+    """The state of each cell, before colours are taken.
 
     Attributes:
         rank: (rows, cols) uint8 position of its state in the order of states.
@@ -81,27 +82,27 @@ class Choice:
 
 def preferences(
     layers: Sequence[Layer],
-    wish: SeamWish,
+    options: SeamOptions,
     *,
     wall: Wall | None = None,
     balance: Balance | None = None,
     allocate: Allocate = in_memory,
 ) -> list[Preference]:
-    """State by a rule how much each layer is preferred in rows of the wall, larger is more.
+    """Return by a rule how much each layer is preferred in rows of the wall; larger is better.
 
     `best-view` is the layers' own quality: incidence, resolution, distance to the photo's border.
-    `voronoi` prefers the layer whose painted area ends farthest off, so that seams lie in the
+    `voronoi` prefers the layer whose painted area ends farthest away, so that seams are in the
     middle of overlaps. `priority` takes photos in the given order, the others by their quality.
-    `graph-cut` lays seams where the layers look alike and away from depth edges of the wall.
+    `graph-cut` puts seams where the layers look similar and away from depth edges of the wall.
 
     Raises:
-        MethodError: `priority` names what is no layer of any wall.
+        MethodError: `priority` names something that is not a layer of any wall.
     """
-    if wish.rule == "voronoi":
+    if options.rule == "voronoi":
         return [_by_depth_inside(layer, index, allocate) for index, layer in enumerate(layers)]
-    if wish.rule == "priority":
-        return _by_order(layers, wish.priority)
-    if wish.rule == "graph-cut" and len(layers) > 1:
+    if options.rule == "priority":
+        return _by_order(layers, options.priority)
+    if options.rule == "graph-cut" and len(layers) > 1:
         cut = cut_labels(layers, wall, balance)
         return [
             partial(_cut_off, layer, index, cut, _best(layers))
@@ -143,37 +144,37 @@ def require_one_raster(layers: Sequence[Layer], name: str) -> None:
 def joined(
     painters: Sequence[Layer],
     others: Sequence[Layer],
-    wish: SeamWish,
+    options: SeamOptions,
     *,
     wall: Wall | None,
     balance: Balance | None,
     allocate: Allocate,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """State what becomes of each cell of a wall, a large one band by band.
+    """Determine the state of each cell of a wall, a large one band by band.
 
     Args:
         painters: layers of the wall that paint something.
-        others: layers that paint nothing; they still tell what is hidden.
-        wish: where seams are wanted.
+        others: layers that paint nothing, but state what is hidden.
+        options: where seams are preferred.
         wall: its surface, for seams off its depth edges, or None.
-        balance: how colours of the painters are balanced, or None.
-        allocate: gives the arrays of the orthoimage, by name.
+        balance: the colour balance of the painters, or None.
+        allocate: returns the arrays of the orthoimage, by name.
 
     Returns:
         (rows, cols) `OrthoMask`, and the index of the painter of each cell, `NOBODY` without one.
     """
     preferred = (
-        preferences(painters, wish, wall=wall, balance=balance, allocate=allocate)
+        preferences(painters, options, wall=wall, balance=balance, allocate=allocate)
         if painters
         else []
     )
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    reach = _island_reach(wish.island_cells_min)
+    reach = _island_reach(options.island_cells_min)
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
         rows = band.rows
-        choice = _choice_in(band.around, painters, others, preferred, wish)
+        choice = _choice_in(band.around, painters, others, preferred, options)
         mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
         source[rows] = choice.source[band.inner]
     return mask, source
@@ -186,13 +187,13 @@ def coloured(
     *,
     allocate: Allocate,
 ) -> Colours:
-    """Take the colour (rows, cols, 3) of each cell from its layer, a large wall band by band.
+    """Return the colour (rows, cols, 3) of each cell from its layer, a large wall band by band.
 
     Args:
         painters: layers of the wall that paint something.
         source: (rows, cols) index of the painter of each cell, `NOBODY` without one.
-        balance: how their colours are balanced; None leaves them untouched.
-        allocate: gives the array.
+        balance: their colour balance; None leaves colours unchanged.
+        allocate: returns the array.
     """
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8
@@ -215,33 +216,33 @@ def _choice_in(
     painters: Sequence[Layer],
     others: Sequence[Layer],
     preferred: Sequence[Preference],
-    wish: SeamWish,
+    options: SeamOptions,
 ) -> Choice:
-    """What becomes of the cells of some rows."""
+    """Return the state of the cells of some rows."""
     parts = [_part(layer, rows) for layer in painters]
     values = [preference(rows) for preference in preferred]
-    if wish.drawn is not None:
-        wished = wish.drawn.wished(rows)
+    if options.drawn is not None:
+        chosen = options.drawn.chosen(rows)
         values = [
-            np.where(wished == index, np.float32(np.inf), value)
+            np.where(chosen == index, np.float32(np.inf), value)
             for index, value in enumerate(values)
         ]
     choice = best_views(
         [*parts, *(_part(layer, rows) for layer in others)],
         [*values, *(layer.quality[rows] for layer in others)],
     )
-    if wish.island_cells_min > 1 and len(painters) > 1:
-        return without_islands(choice, parts, wish.island_cells_min)
+    if options.island_cells_min > 1 and len(painters) > 1:
+        return without_islands(choice, parts, options.island_cells_min)
     return choice
 
 
 def _island_reach(cells_min: int) -> int:
-    """How many rows away a cell may lie that decides who paints another."""
+    """Return how many rows away a cell may influence who paints another."""
     return cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
 
 
 def _part(layer: Layer, rows: slice) -> Layer:
-    """Some rows of a layer, without a copy."""
+    """Return some rows of a layer, without a copy."""
     return replace(
         layer,
         frame=replace(layer.frame, height=rows.stop - rows.start),
@@ -269,10 +270,10 @@ def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32
 
 
 def without_islands(choice: Choice, layers: Sequence[Layer], cells_min: int) -> Choice:
-    """Return small patches to the source that surrounds them, where it shows them as well.
+    """Return small patches to the source that surrounds them, if it shows them as well.
 
-    A patch is connected over sides of cells. The source with the most cells about a cell takes
-    it; what no larger patch's source shows stays as it is.
+    A patch is connected over sides of cells. The source with the most cells around a cell takes it;
+    cells that no larger patch's source shows are unchanged.
     """
     import cv2
 
@@ -325,7 +326,7 @@ def _by_depth_inside(layer: Layer, index: int, allocate: Allocate) -> Preference
 
 
 def _depth_inside(layer: Layer) -> NDArray[np.float32]:
-    """Distance in cells to the nearest cell that the layer does not paint, or to the rim."""
+    """Return the distance in cells to the nearest unpainted cell, or to the border."""
     import cv2
 
     painted = np.pad((layer.mask == LayerMask.PAINTED).astype(np.uint8), 1)

@@ -1,4 +1,4 @@
-"""Light in a layer: between levels of colour and linear light, and its means over blocks."""
+"""Light in a layer: conversion between colour levels and linear light, and means over blocks."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from orthoflow.geometry.levels import Colours
 from orthoflow.products import Layer, LayerMask
 from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means
 
-# Clipped and almost black pixels say nothing of exposure; such a share of a block may be so.
+# Clipped and almost black pixels are useless for exposure; this share of a block may be so.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
 _SAYING_LEAST: Final = 0.95
-# Steps of the table that turns light into levels; between them it is as good as straight.
+# Steps of the table from light to levels; between them it is nearly linear.
 _STEPS: Final = 1 << 16
 
 
 @cache
 def light_of_levels(highest: int) -> NDArray[np.float32]:
-    """Light, 0 to 1, of the levels 0 to `highest` of sRGB (IEC 61966-2-1)."""
+    """Return light, 0 to 1, of the levels 0 to `highest` of sRGB (IEC 61966-2-1)."""
     level = np.arange(highest + 1) / float(highest)
     light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return light.astype(np.float32)
@@ -32,7 +32,7 @@ def light_of_levels(highest: int) -> NDArray[np.float32]:
 
 @cache
 def _share_of_light() -> NDArray[np.float32]:
-    """Level, 0 to 1, of light in equal steps; one more, so that there is always a next."""
+    """Levels, 0 to 1, of light in equal steps; with one more, so that there is always a next."""
     light = np.minimum(np.arange(_STEPS + 1) / (_STEPS - 1.0), 1.0)
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     return level.astype(np.float32)
@@ -43,7 +43,7 @@ def lit_shares(
 ) -> NDArray[np.float64]:
     """Multiply the light of levels (n, 3), 0 to 1, by the exponentials of (n, 3)."""
     light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
-    # Interpolation ends with the table: light that is clipped is white.
+    # Interpolation ends with the table: clipped light is white.
     gained = light * np.exp(log_gains)
     levels = np.interp(gained, np.linspace(0.0, 1.0, _STEPS), _share_of_light()[:_STEPS])
     return np.asarray(levels, dtype=np.float64)
@@ -62,7 +62,7 @@ def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLight:
-    """Mean light of the blocks that a layer paints wholly, in the box about what it paints.
+    """Mean light of the blocks that a layer paints completely, in the box around its painted cells.
 
     Attributes:
         box: rows and columns of blocks.
@@ -75,12 +75,12 @@ class BlockLight:
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
-        """Blocks (rows, cols) whose light is known."""
+        """Return blocks (rows, cols) whose light is known."""
         return ~np.isnan(self.log_light[..., 0])
 
 
 def block_light(layer: Layer, blocks: Blocks) -> BlockLight:
-    """Measure the light over blocks of a layer that paints something."""
+    """Measure the light over blocks of a layer with painted cells."""
     painted = block_means(lambda rows: layer.mask[rows] == LayerMask.PAINTED, blocks)
     box = _box_about(painted > 0.0)
     rows, columns = blocks.cells(box)
@@ -109,7 +109,7 @@ def _light_in(
 
 
 def common(one: Box, other: Box) -> Box | None:
-    """Blocks in both boxes; None where they share none."""
+    """Return the blocks in both boxes; None if they share none."""
     parts = [
         slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True)
     ]
@@ -117,7 +117,7 @@ def common(one: Box, other: Box) -> Box | None:
 
 
 def inside(part: Box, box: Box) -> Box:
-    """Where a part of a box lies in arrays of that box."""
+    """Return where a part of a box is in arrays of that box."""
     rows, columns = (
         slice(inner.start - outer.start, inner.stop - outer.start)
         for inner, outer in zip(part, box, strict=True)
@@ -128,7 +128,7 @@ def inside(part: Box, box: Box) -> Box:
 def pairs(
     lights: Sequence[BlockLight],
 ) -> list[tuple[int, int, Box]]:
-    """Layers whose boxes overlap, and where; by their places, the lower first."""
+    """Return pairs of layers whose boxes overlap, and where, by index, the lower first."""
     found = []
     for i, one in enumerate(lights):
         for j in range(i + 1, len(lights)):

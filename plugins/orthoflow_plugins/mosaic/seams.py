@@ -48,17 +48,17 @@ from orthoflow_plugins.mosaic.drawn_seams import read_seams, seams_of
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
+    SeamOptions,
     SeamRule,
-    SeamWish,
     coloured,
     joined,
     require_one_raster,
     require_sources,
 )
 
-# Arrays of more values than this lie in files.
+# Larger arrays are kept in files.
 _IN_MEMORY_MOST: Final = 1 << 24
-# Of the map of sources: its longest side, its colours, and their share beside the grey.
+# The map of sources: its longest side, its colours, and their share relative to the grey.
 _LONGEST_PX: Final = 900
 _NAMED_RGB: Final = {
     "blue": (31, 119, 180),
@@ -73,7 +73,7 @@ _NAMED_RGB: Final = {
     "cyan": (23, 190, 207),
 }
 _TINT: Final = 0.45
-# Empty cells are told of in words where photos lack so many of a wall, and causes of so many.
+# Share of empty cells of a wall, and share of a cause in it, before a warning.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
@@ -115,24 +115,24 @@ EMPTY_CELLS: Final = DiagnosticSpec(
 
 
 class MosaicSeams(Method):
-    """Take each cell from the layer that shows it best; make photos alike where they differ.
+    """Take each cell from the layer that shows it best; balance photos where they differ.
 
     A single layer passes through. Of several the one that `seams` prefers paints a cell, the first
     among equals; a cell that one layer measured is never taken from another's filling. Small
-    patches from one source are given to the source around them where that one sees them too.
+    patches from one source are assigned to the source around them if that one sees them too.
 
-    `best-view` goes by incidence, resolution and distance to the photo's border, cell by cell;
-    `voronoi` lays seams into the middle of overlaps, `graph-cut` where photos look alike and, with
-    the walls wired, off their depth edges; `priority` goes by a given order of photos. How far the
-    photos of an overlap lie apart, and how far colours step along the seams, is reported.
+    `best-view` decides by incidence, resolution and distance to the photo's border, cell by cell;
+    `voronoi` puts seams into the middle of overlaps, `graph-cut` where photos look similar and,
+    with the walls wired, off their depth edges; `priority` uses a given order of photos. The
+    displacements between photos in overlaps, and the colour steps along the seams, are reported.
 
-    Where photos contradict each other over a region, a photo that others and the scan's colours
-    bear out paints it (`robust`): who passes by in one photo is left out.
+    If photos contradict each other over a region, a photo that others and the scan's colours
+    confirm paints it (`robust`): people who pass by in one photo are left out.
 
-    Colours are balanced unless `gains: none`: an exposure per photo, what its lens loses towards
-    the corners (with the cameras wired), a smooth field per photo, and what is left near seams.
-    All of this is smooth over cells; detail is of one photo everywhere, so that nothing is mixed.
-    Photos that agree within 2 % stay untouched.
+    Colours are balanced unless `gains: none`: an exposure per photo, the vignetting of its lens
+    (with the cameras wired), a smooth field per photo, and the remaining differences near seams.
+    All of this is smooth over cells; detail comes from one photo everywhere, so that nothing is
+    mixed. Photos that agree within 2 % are unchanged.
     """
 
     id: ClassVar[str] = "mosaic.seams"
@@ -184,7 +184,7 @@ class MosaicSeams(Method):
         MetricSpec(
             "contradicted_share", label="cells where photos disagree and none is in the majority"
         ),
-        # Of the walls that were checked, all together.
+        # Of all checked walls together.
         MetricSpec(
             "expected_mm_median",
             label="expected error of a point measured in the orthoimages, median",
@@ -200,7 +200,7 @@ class MosaicSeams(Method):
     )
 
     class Params(MethodParams):
-        """How the choice between layers is made and kept calm."""
+        """How the layer of a cell is chosen, and how specks are avoided."""
 
         seams: SeamRule = Field(
             "best-view", description="Which layer paints what several of them show."
@@ -310,15 +310,15 @@ class _Joined:
 
     Attributes:
         image: the orthoimage.
-        overlaps: how far the two best photos of places lie apart.
-        all_overlaps: the same of every two photos.
-        steps: of colours along seams.
+        overlaps: displacements between the two best photos of places.
+        all_overlaps: the same for every two photos.
+        steps: colour differences along seams.
         n_seam: cells of seams.
-        n_edge_seam: cells of seams at depth edges, None when the surface is not known.
-        untouched: the same of the photos as they are.
-        balance: how colours were balanced, None where they are untouched.
-        n_outvoted: cells that another photo showed otherwise than the one that paints them.
-        n_contradicted: cells that one photo alone shows, and the scan otherwise.
+        n_edge_seam: cells of seams at depth edges, None if the surface is unknown.
+        untouched: the same for the unbalanced photos.
+        balance: the colour balance, None if colours are unchanged.
+        n_outvoted: cells that another photo showed differently from the one that paints them.
+        n_contradicted: cells that a single photo shows, and the scan differently.
     """
 
     image: Orthoimage
@@ -334,7 +334,7 @@ class _Joined:
 
     @property
     def gains(self) -> dict[str, JsonValue]:
-        """Factors on the light of each source, per channel; empty where none was changed."""
+        """Return factors on the light of each source, per channel; empty if none was changed."""
         if self.balance is None:
             return {}
         factors = np.exp(self.balance.exposures.exposures).round(4).tolist()
@@ -348,7 +348,7 @@ class _Surroundings:
     Attributes:
         wall: its surface, or None.
         cameras: of photos, by name.
-        drawn: areas that a person gives to photos, of all walls.
+        drawn: areas that a person assigns to photos, of all walls.
         number: of the wall.
     """
 
@@ -361,7 +361,7 @@ class _Surroundings:
 def _allocated(
     ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
 ) -> NDArray[np.generic]:
-    """Memory for an orthoimage, in a file for a large one."""
+    """Return memory for an orthoimage, in a file for a large one."""
     if math.prod(shape) <= _IN_MEMORY_MOST:
         return np.zeros(shape, dtype=dtype)
     return ctx.allocate("orthoimages", f"{wall}.{name}", shape, dtype).view(np.ndarray)
@@ -376,19 +376,19 @@ def _join(
 ) -> _Joined:
     wall = surroundings.wall
     require_one_raster(group, name)
-    # What paints nothing is no source; it still tells what is hidden.
+    # A layer that paints nothing is no source, but states what is hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
     agreed = None
     if params.robust and painters:
-        # Before colours are balanced: who passes by says nothing of light.
+        # Before colours are balanced: passers-by are useless for light.
         agreed = consensus(painters, wall, allocate=allocate)
         painters = list(agreed.layers)
     balance = None
     if params.gains != "none" and len(painters) > 1:
         cameras = [surroundings.cameras.get(layer.source) for layer in painters]
         balance = balance_of(painters, wall, cameras, is_local=params.local_balance)
-    wish = SeamWish(
+    options = SeamOptions(
         rule=params.seams,
         priority=params.priority,
         island_cells_min=params.island_cells_min,
@@ -399,7 +399,7 @@ def _join(
             [layer.source for layer in painters],
         ),
     )
-    mask, source = joined(painters, others, wish, wall=wall, balance=balance, allocate=allocate)
+    mask, source = joined(painters, others, options, wall=wall, balance=balance, allocate=allocate)
     untouched = seam_steps(source, painters)
     steps = untouched
     if balance is not None:
@@ -438,7 +438,7 @@ def _with_errors(
     ctx: StepContext,
     allocate: Allocate,
 ) -> Orthoimage:
-    """Add the expected error of each cell, where ties lie on the wall that tell of it."""
+    """Add the expected error of each cell, if ties on the wall determine it."""
     n_control, n_check = ties_on(cameras, image.number)
     if surroundings.wall is None or not surroundings.cameras:
         return image
@@ -470,7 +470,7 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
     if not image.sources:
         ctx.report(EMPTY_IMAGE, subject=image.name)
     else:
-        _tell_of_empty(ctx, image, cameras)
+        _report_empty(ctx, image, cameras)
         white = 255.0 if image.rgb.dtype == np.uint8 else 65535.0
         shown = (OrthoMask.PAINTED, OrthoMask.FILLED)
         if (plain := plain_tone(image.rgb, image.mask, shown, white=white)) is not None:
@@ -481,8 +481,8 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
         ctx.figure(f"wall_{image.number}_sources", _source_map(image), _caption(image))
 
 
-def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
-    """State in words why cells show nothing, where that is for want of photos."""
+def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
+    """Report why cells are empty, if photos are missing."""
     words = {
         OrthoMask.NONE: f"lie in no oriented photo ({_way_to_a_photo(cameras)})",
         OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too flatly (take "
@@ -500,7 +500,7 @@ def _tell_of_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None)
 
 
 def _way_to_a_photo(cameras: Cameras | None) -> str:
-    """State what would fill cells of no oriented photo; one that was refused may lie there."""
+    """Report what would fill cells of no oriented photo; a refused one may show them."""
     if cameras is None:
         return "see which are refused, or take one there"
     n_photos = len(cameras.cameras)
@@ -509,7 +509,7 @@ def _way_to_a_photo(cameras: Cameras | None) -> str:
 
 
 def _source_map(image: Orthoimage) -> bytes:
-    """Picture of an orthoimage tinted by source, seams in white, nothing in black.
+    """Return a picture of an orthoimage tinted by source, seams in white, empty cells in black.
 
     After markiewicz2015, Figure 24.
     """
@@ -524,7 +524,7 @@ def _source_map(image: Orthoimage) -> bytes:
 
 
 def _caption(image: Orthoimage) -> str:
-    """State which colour of `_source_map` stands for which source."""
+    """Report which colour of `_source_map` represents which source."""
     names = list(_NAMED_RGB)
     legend = ", ".join(
         f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)
@@ -555,7 +555,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
         ctx.metric("overlap_u_rms_cells", rms[0], "cells")
         ctx.metric("overlap_v_rms_cells", rms[1], "cells")
-        # In millimetres two runs compare whose cells have other sizes.
+        # Millimetres allow comparison of runs with different cell sizes.
         shifts_mm = np.concatenate(
             [1e3 * item.image.frame.gsd_m * item.overlaps.shifts_cells for item in verdicts]
         )

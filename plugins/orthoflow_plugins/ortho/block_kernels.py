@@ -1,8 +1,8 @@
-"""Compiled passes for blocks of cells that a photo sees as a whole: few projections, many cells.
+"""Compiled passes for blocks of cells that a photo sees entirely: few projections, many cells.
 
-Bounds at nodes of the block tell that nothing hides any of it, or that the cloud hides all of it;
-parabolas through the nodes then give the places of its cells in the photo. Where that is not exact
-enough, or not sure, `visibility_kernels` asks each cell.
+Bounds at nodes of the block decide whether nothing hides any of it, or the cloud hides all of it;
+parabolas through the nodes then give the positions of its cells in the photo. If that is not
+accurate enough, or undecided, `visibility_kernels` tests each cell.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from orthoflow_plugins.ortho.views import (
     WallView,
 )
 
-# What `judge_block` finds.
+# Results of `judge_block`.
 HIDDEN: Final = -1
 UNSURE: Final = 0
 SEEN: Final = 1
-# How far interpolated places may be off, in photo pixels; `cv2.remap` knows 32nds of them.
+# Permitted error of interpolated positions, in photo pixels; `cv2.remap` resolves 1/32 of them.
 PARABOLA_PX: Final = 0.02
-# Blocks that are looked at together where parabolas reach so far.
+# Blocks that are processed together if parabolas are accurate that far.
 WIDE_BLOCKS: Final = 4
-# What describes a row of a block: see `_fit_block`.
+# Terms that describe a row of a block: see `_fit_block`.
 N_TERMS: Final = 15
 
 
 @compiled
 def parabola(x: float) -> tuple[float, float, float]:
-    """Weights of the values at 0, 0.5 and 1 in the parabola through them."""
+    """Return the weights of the values at 0, 0.5 and 1 in the parabola through them."""
     return (2.0 * (x - 0.5) * (x - 1.0), 4.0 * x * (1.0 - x), 2.0 * x * (x - 0.5))
 
 
@@ -54,19 +54,19 @@ def span_block(
     columns: tuple[int, int],
     nodes: NDArray[np.float64],
 ) -> bool:
-    """Project the corners, edge middles and centre of a block at two depths.
+    """Project the corners, edge midpoints and centre of a block at two depths.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         depths: two depths, both below the camera.
         rows: first and last row of the cells.
         columns: first and last column.
-        nodes: (2, 3, 3, 4) filled: at each depth, row and column u, v, the photo pixels that a cell
+        nodes: (2, 3, 3, 4) output: at each depth, row and column u, v, the photo pixels that a cell
             covers, and the depth along the axis where the ray leaves the slab of the raster.
 
     Returns:
-        Whether the camera sees all of them, and whether parabolas through them give the places of
-        the cells in between to `PARABOLA_PX`.
+        Whether the camera sees all of them, and parabolas through them give the positions of the
+        cells in between to `PARABOLA_PX`.
     """
     for layer in range(2):
         for i in range(3):
@@ -130,22 +130,22 @@ def judge_block(
     nodes: NDArray[np.float64],
     box: NDArray[np.float64],
 ) -> int:
-    """Return whether a photo surely sees all known cells of a block, so that none need be asked.
+    """Determine whether a photo certainly sees all known cells of a block.
 
-    What counts for a cell is monotonous over the block or nearly linear, so that the nodes at the
-    lowest and the highest depth bound it. The rays to the camera are known to be free of relief.
+    The quantities of a cell are monotonic over the block or nearly linear, so that the nodes at the
+    lowest and the highest depth bound them. The rays to the camera are known to be free of relief.
 
     Args:
-        view: the camera before the wall.
-        buffer: what else stands before the camera.
+        view: the camera in front of the wall.
+        buffer: depth buffer of other objects.
         high: the highest depth.
         rows: first and last row of the cells.
         columns: first and last column.
-        nodes: of `span_block`.
-        box: (4,) filled with the smallest and largest u, the smallest and largest v.
+        nodes: from `span_block`.
+        box: (4,) output: smallest and largest u, smallest and largest v.
 
     Returns:
-        `SEEN`, `HIDDEN` where the cloud surely hides all of them, or `UNSURE`.
+        `SEEN`, `HIDDEN` if the cloud certainly hides all of them, or `UNSURE`.
     """
     farthest_row = max(abs(view.row - rows[0]), abs(view.row - rows[1])) * view.gsd_m
     farthest_column = max(abs(view.column - columns[0]), abs(view.column - columns[1])) * view.gsd_m
@@ -154,7 +154,7 @@ def judge_block(
     if lift <= view.cosine_least * math.sqrt(lift * lift + aside):
         return UNSURE
     box[0], box[1], box[2], box[3] = math.inf, -math.inf, math.inf, -math.inf
-    # The distance to the camera changes over a wide block: each of its parts is asked by itself.
+    # The distance to the camera changes over a wide block: each of its parts is tested by itself.
     n_parts = max(1, (columns[1] - columns[0] + 1) // BLOCK_CELLS)
     is_seen, is_hidden = True, True
     for part in range(n_parts):
@@ -194,11 +194,11 @@ def _bounds(
     """Bound a quantity over some columns of a block, by its values at three of them.
 
     Args:
-        nodes: of `span_block`.
+        nodes: from `span_block`.
         k: which quantity of the nodes.
-        starts: weights of the nodes of a row at the first column; those of the others likewise.
-        middles: at the middle one.
-        ends: at the last one.
+        starts: weights of the nodes of a row at the first column.
+        middles: weights at the middle column.
+        ends: weights at the last column.
     """
     least, most = math.inf, -math.inf
     for layer in range(2):
@@ -232,7 +232,7 @@ def _bound_cloud(
 def look_at_hidden_block(
     relief: Relief, visible: TileVisibility, place: tuple[int, int, int, int, int, int]
 ) -> None:
-    """Fill in the cells of a block that the cloud hides; see `look_at_unoccluded_block`."""
+    """Set the cells of a block that the cloud hides; see `look_at_unoccluded_block`."""
     first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
     for i in range(n_rows):
         for j in range(n_columns):
@@ -244,20 +244,20 @@ def look_at_hidden_block(
 
 
 class BlockRoom(NamedTuple):
-    """The arrays of a tile that blocks fill, flat, and room for what is needed in between.
+    """The arrays of a tile that blocks fill, flat, and working memory.
 
     Attributes:
         heights: (cells of the wall,) float32 metres.
         u: (cells of the tile,) as in `TileVisibility`; v, mask and quality likewise.
-        bends: (3, N_TERMS) of `_fit_block`; along (3, 5) likewise.
+        bends: (3, N_TERMS) from `_fit_block`; along (3, 5) likewise.
         terms: (N_TERMS,) of one row.
         rises: (WIDE_BLOCKS * BLOCK_CELLS,) metres above the lower of the two depths, 0 where void.
         ramp: (WIDE_BLOCKS * BLOCK_CELLS,) 0, 1, 2, ...
         wall_columns: columns of the wall; tile_columns those of the tile.
         nodes: (2, 3, 3, 4) of `span_block`.
-        box: (4,) of `judge_block`.
-        lanes: (5, BLOCK_CELLS) of `visibility_kernels.project_row`.
-        rays: (FINE_CELLS * FINE_CELLS, N_LANES) of `ray_kernels.follow_rays`.
+        box: (4,) from `judge_block`.
+        lanes: (5, BLOCK_CELLS) for `visibility_kernels.project_row`.
+        rays: (FINE_CELLS * FINE_CELLS, N_LANES) for `ray_kernels.follow_rays`.
     """
 
     heights: NDArray[np.float32]
@@ -280,7 +280,7 @@ class BlockRoom(NamedTuple):
 
 @compiled
 def room_for_blocks(relief: Relief, visible: TileVisibility) -> BlockRoom:
-    """Return the room that `look_at_unoccluded_block` needs for the blocks of a tile."""
+    """Return the working memory that `look_at_unoccluded_block` needs for the blocks of a tile."""
     return BlockRoom(
         relief.depth.reshape(relief.depth.size),
         visible.u.reshape(visible.u.size),
@@ -309,23 +309,22 @@ def look_at_unoccluded_block(
     block: tuple[tuple[int, int], tuple[int, int]],
     depths: tuple[float, float],
 ) -> int:
-    """Fill in the cells of a block that a photo surely sees where they are known.
+    """Set the known cells of a block that a photo certainly sees.
 
-    Places and quality follow parabolas over the block and are linear in depth: the projection
-    itself would take several times as long. Each loop writes one array and has no branches: the
-    processor then takes eight cells at once. Handing rows to functions of their own would take
-    longer.
+    Positions and quality follow parabolas over the block and are linear in depth: the projection
+    itself would take several times as long. Each loop writes one array and has no branches, so that
+    eight cells are processed at once. Passing rows to functions of their own would take longer.
 
     Args:
-        view: the camera before the wall.
-        room: filled in part.
+        view: the camera in front of the wall.
+        room: partly filled.
         place: first row and column on the wall of the part of the block that is in the tile, its
             rows and columns, and first row and column in the tile.
         block: first and last row, and first and last column, of the whole block.
-        depths: those of the nodes.
+        depths: the depths of the nodes.
 
     Returns:
-        How many of the cells are known.
+        The number of known cells.
     """
     first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
     rows, columns = block
@@ -343,7 +342,7 @@ def look_at_unoccluded_block(
         y = (first_row + i - rows[0]) * per_row
         for k in range(N_TERMS):
             terms[k] = bends[0, k] + y * (bends[1, k] + y * bends[2, k])
-        # Unsigned places: they cannot be counted from the end, which would keep loops scalar.
+        # Unsigned indices: they cannot be negative, which would keep loops scalar.
         on_wall = np.uintp((first_row + i) * room.wall_columns + first_column)
         in_tile = np.uintp((tile_row + i) * room.tile_columns + tile_column)
         for j in range(n_columns):
@@ -375,7 +374,7 @@ def look_at_unoccluded_block(
 
 @kernel_part
 def _fade(view: WallView, room: BlockRoom, place: tuple[int, int, int, int, int, int]) -> None:
-    """Let the quality of the cells of a block fall off at the border of the photo."""
+    """Decrease the quality of the cells of a block towards the border of the photo."""
     us, vs, quality = room.u, room.v, room.quality
     _, _, n_rows, n_columns, tile_row, tile_column = place
     width, height = np.float32(view.camera[21]), np.float32(view.camera[22])
@@ -396,16 +395,16 @@ def _fit_block(
     bends: NDArray[np.float64],
     along: NDArray[np.float64],
 ) -> None:
-    """Set the parabolas down a block of what describes its rows.
+    """Set the parabolas down a block of the terms that describe its rows.
 
     Args:
-        nodes: of `span_block`.
-        per_column: one over the distance of the first and last column.
-        per_depth: one over the distance of the two depths.
-        bends: (3, N_TERMS) set: level, slope and bend down the block of five terms each for u, v
-            and quality: level, slope and bend along the row, and level and slope of what a metre of
-            depth adds.
-        along: (3, 5) room for what is needed in between.
+        nodes: from `span_block`.
+        per_column: reciprocal of the distance of the first and last column.
+        per_depth: reciprocal of the distance of the two depths.
+        bends: (3, N_TERMS) output: level, slope and bend down the block of five terms each for u, v
+            and quality: level, slope and bend along the row, and level and slope of the change per
+            metre of depth.
+        along: (3, 5) working memory.
     """
     for k in range(3):
         for r in range(3):

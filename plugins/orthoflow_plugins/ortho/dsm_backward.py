@@ -1,4 +1,4 @@
-"""`ortho.dsm-backward`: every cell of a wall looks up its colour in the photos that see it."""
+"""`ortho.dsm-backward`: every cell of a wall takes its colour from the photos that see it."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ VISIBILITY_OFF: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class PaintedTiles(PaintedPhotos):
-    """What the photos paint, and how they see the tiles that they paint.
+    """Statistics of the photos on the tiles that they paint.
 
     Attributes:
         n_cells: (n,) int64 painted cells of each tile.
-        photo_gsd_m: (n,) float64 size of a photo pixel, square to the ray.
+        photo_gsd_m: (n,) float64 size of a photo pixel, perpendicular to the ray.
         obliquity_deg: (n,) float64 between the ray and the wall's normal.
     """
 
@@ -58,16 +58,16 @@ class PaintedTiles(PaintedPhotos):
 
 
 class DsmBackward(Method):
-    """Project each cell of a wall into the photos and take the colour that is there.
+    """Project each cell of a wall into the photos and take the colour there.
 
-    A cell with a depth is a point in the world; the photo's distorted camera says where it lies in
-    the photo. It is painted unless something hides it: the wall's own relief (the ray to the
-    camera is followed over the raster), or points of the cloud that stand before the slab the
-    raster was made of (a depth buffer in the photo; single points are taken for outliers). Where
-    the photo is finer than the wall, colours are averaged over what a cell covers.
+    A cell with a depth is a point in the world; the photo's camera with distortion gives its
+    position in the photo. It is painted unless something hides it: the wall's own relief (the ray
+    to the camera is followed over the raster), or points of the cloud in front of the slab of the
+    raster (a depth buffer in the photo; single points are taken for outliers). Where the photo is
+    finer than the wall, colours are averaged over the cell.
 
-    The quality of a cell is the number of photo pixels it covers: the cosine of incidence times
-    the square of cell size over photo GSD, falling to 0 at the border of the photo.
+    The quality of a cell is the number of photo pixels that it covers: the cosine of incidence
+    times the square of cell size over photo GSD, decreasing to 0 at the border of the photo.
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
@@ -88,7 +88,7 @@ class DsmBackward(Method):
     )
 
     class Params(VisibilityParams):
-        """How colours are taken, and when a cell counts as seen."""
+        """How colours are sampled, and when a cell counts as seen."""
 
         resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
             default="bilinear",
@@ -115,14 +115,14 @@ class DsmBackward(Method):
     Out = LayersOfPhotos
 
     def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
-        """Project the photos onto all walls, and put their layers in order."""
+        """Project the photos onto all walls, and sort their layers."""
         painted = self._painted(inputs, params, ctx)
         out = layers_of_photos(inputs, painted, ctx)
         _report(ctx, count_shown(inputs.walls, out.layers), painted)
         return out
 
     def _painted(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> PaintedTiles:
-        """Take photo by photo, and lay each onto every wall it sees."""
+        """Project photo by photo onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
@@ -134,7 +134,7 @@ class DsmBackward(Method):
         surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
-        # Of all photos, whichever are painted: which points are outliers hangs on all cameras.
+        # For all photos, whichever are painted: which points are outliers depends on all cameras.
         viewers = [camera.viewing() for _, camera in oriented]
         occluders = occluders_of(inputs, viewers, params, ctx, method=self.id) if hides else None
         seconds["occluders_s"] += ctx.clock_s() - started
@@ -148,11 +148,11 @@ class DsmBackward(Method):
             buffer = depth_buffer_of(occluders, viewer, photo)
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
-            footprints += _lay(opened, surfaces, stack, params, threads=ctx.cores)
+            footprints += _project(opened, surfaces, stack, params, threads=ctx.cores)
             seconds["decoding_s"] += decoded - started
             seconds["occluders_s"] += looked - decoded
             seconds["painting_s"] += ctx.clock_s() - looked
-            # The next photo is decoded without this one in memory.
+            # The next photo is decoded after this one is released.
             del pixels, buffer, opened
         return PaintedTiles(
             layers=tuple(stack.painted),
@@ -164,7 +164,7 @@ class DsmBackward(Method):
         )
 
 
-def _lay(
+def _project(
     photo: OpenedPhoto,
     surfaces: Sequence[Surface],
     stack: LayerStack,
@@ -172,7 +172,7 @@ def _lay(
     *,
     threads: int,
 ) -> list[CellFootprint]:
-    """Lay a photo onto all walls; give how it sees the tiles that it paints."""
+    """Project a photo onto all walls; return statistics of the tiles that it paints."""
     footprints: list[CellFootprint] = []
     with stack.painting_from(photo.name):
         for index, surface in enumerate(surfaces):
@@ -197,11 +197,11 @@ def _painting(
     *,
     threads: int,
 ) -> Painting | None:
-    """Lay a photo onto one wall; None where its camera stands behind it."""
+    """Project a photo onto one wall; None if its camera is behind it."""
     from orthoflow_plugins.ortho.painting import PaintRule, paint
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
-    # The nearest pixel is another one a hundredth of a pixel farther on.
+    # The nearest pixel changes within a hundredth of a pixel.
     is_exact = params.resampling == "nearest"
     view = view_of(photo.viewer, surface, params, is_exact=is_exact)
     if not is_before(view, surface):
@@ -217,7 +217,7 @@ def _painting(
 
 
 def _layer(painting: Painting, source: str, surface: Surface, wall: int) -> Layer | None:
-    """The layer of a painting; None where nothing was painted."""
+    """Return the layer of a painting; None if nothing was painted."""
     is_bare = not holds_cells(painting.mask, LayerMask.PAINTED)
     if is_bare or painting.rgb is None or painting.quality is None:
         return None
@@ -245,7 +245,7 @@ def _report(ctx: StepContext, counts: CellCounts, painted: PaintedTiles) -> None
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
-    """The value below which half of the weight lies."""
+    """Return the value below which half of the weight lies."""
     order = np.argsort(values, kind="stable")
     totals = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

@@ -1,4 +1,4 @@
-"""`ortho.dsm-forward`: every pixel of a photo is thrown onto the wall that it shows."""
+"""`ortho.dsm-forward`: every pixel of a photo is projected onto the wall that it shows."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.forward_kernels import Catch
     from orthoflow_plugins.ortho.surfaces import Surface
 
-# Larger layers are coloured in bands of so many cells: some 600 MB.
+# Larger layers are coloured in bands of this many cells: about 600 MB.
 _BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
-    """Follow the ray of each pixel to where it first meets the surface, and paint that cell.
+    """Follow the ray of each pixel to its first intersection with the surface, and paint that cell.
 
-    Pixels that meet the same cell compete, the one that meets it nearest to the centre wins and
-    is painted untouched: nothing is interpolated. What stands before the slab of the raster hides
-    the wall as in `ortho.dsm-backward`. A photo that is coarser than the wall leaves cells between
-    its pixels; narrow gaps take the colour of the nearest painted cell and are marked as filled.
+    Of the pixels that hit the same cell, the one closest to its centre is used unchanged: nothing
+    is interpolated. Objects in front of the slab of the raster hide the wall as in
+    `ortho.dsm-backward`. A photo that is coarser than the wall leaves cells between its pixels;
+    narrow gaps take the colour of the nearest painted cell and are marked as filled.
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
@@ -72,7 +72,7 @@ class DsmForward(Method):
     )
 
     class Params(VisibilityParams):
-        """When a pixel counts, and which gaps between pixels are filled."""
+        """When a pixel is used, and which gaps between pixels are filled."""
 
         fill_gap_cells: int = Field(
             default=1,
@@ -86,20 +86,20 @@ class DsmForward(Method):
     Out = LayersOfPhotos
 
     def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
-        """Project the photos onto all walls, and put their layers in order."""
+        """Project the photos onto all walls, and sort their layers."""
         painted = self._painted(inputs, params, ctx)
         out = layers_of_photos(inputs, painted, ctx)
         _report(ctx, count_shown(inputs.walls, out.layers), painted)
         return out
 
     def _painted(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> PaintedPhotos:
-        """Take photo by photo, and throw each onto every wall it sees."""
+        """Project photo by photo onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         level = level_of_all([photo for photo, _ in oriented], ctx)
-        # Of all photos, whichever are thrown: which points are outliers hangs on all cameras.
+        # For all photos, whichever are projected: which points are outliers depends on all cameras.
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
@@ -128,15 +128,15 @@ class DsmForward(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Thrown:
-    """A photo whose pixels were thrown onto a wall.
+    """A photo whose pixels were projected onto a wall.
 
     Attributes:
         photo: the photo.
         surface: the wall.
-        catch: which pixel each cell took.
-        border_px: quality falls to 0 over this distance from the image border.
-        gap_cells: how wide gaps are filled.
-        threads: how many threads work.
+        catch: the pixel that each cell took.
+        border_px: quality decreases to 0 over this distance from the image border.
+        gap_cells: width of gaps that are filled.
+        threads: number of threads.
     """
 
     photo: OpenedPhoto
@@ -156,7 +156,7 @@ def _layer(
     *,
     threads: int,
 ) -> Layer | None:
-    """Throw a photo onto one wall; None where no pixel meets it."""
+    """Project a photo onto one wall; None if no pixel hits it."""
     from orthoflow_plugins.ortho.forward_kernels import throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
@@ -187,7 +187,7 @@ def _layer(
         gap_cells=params.fill_gap_cells,
         threads=threads,
     )
-    # Whether a gap is narrow hangs on cells two discs away, and its colour on those one farther.
+    # Whether a gap is narrow depends on cells two discs away, and its colour on those one farther.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         _lay_band(thrown, band, layer)
@@ -197,7 +197,7 @@ def _layer(
 def _empty_catch(shape: tuple[int, int], allocate: Allocate) -> Catch:
     from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch
 
-    # Kernels know plain arrays only, not mapped files.
+    # Kernels accept plain arrays only, not mapped files.
     catch = Catch(
         pixel=np.asarray(allocate("pixel", shape, np.int32), np.int32).view(np.ndarray),
         square=np.asarray(allocate("square", shape, np.float32), np.float32).view(np.ndarray),
@@ -235,7 +235,7 @@ def _lay_band(thrown: _Thrown, band: Band, layer: Layer) -> None:
                 2, axis=1
             ),
             depth_m=depth_m.reshape(-1),
-            # A gap takes what is painted about it, whatever surface it is of.
+            # A gap takes the colours painted around it, of whatever surface.
             layer_m=np.inf,
         ),
         reach_cells=thrown.gap_cells,
@@ -253,13 +253,13 @@ def _lay_band(thrown: _Thrown, band: Band, layer: Layer) -> None:
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
-    """Rays (n, m, 3) of every sixteenth pixel: columns, rows, metres of height per metre."""
+    """Return rays (n, m, 3) of every sixteenth pixel: columns, rows, metres of height per metre."""
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame
     counts = (viewer.height // RAY_STEP_PX + 2, viewer.width // RAY_STEP_PX + 2)
     rows, columns = np.indices(counts) * float(RAY_STEP_PX)
-    # The last row and column lie outside the image, where a lens model may fold back.
+    # The last row and column are outside the image, where a lens model may fold back.
     places = np.column_stack(
         [np.minimum(columns.ravel(), viewer.width), np.minimum(rows.ravel(), viewer.height)]
     )
@@ -271,7 +271,7 @@ def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]
 
 
 def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np.float64]:
-    """Move the rays at the image's border on to where the lattice has its last place."""
+    """Extrapolate the rays at the image's border to the last position of the lattice."""
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     moved = np.moveaxis(rays.copy(), axis, 0)
@@ -286,7 +286,7 @@ def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np
 def _seen(
     viewer: ViewingCamera, surface: Surface, rows: slice, *, border_px: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which cells of some rows lie in the photo, and how many of its pixels each covers."""
+    """Report which cells of some rows are in the photo, and how many of its pixels each covers."""
     frame, depth = surface.frame, surface.relief.depth[rows]
     seen = np.zeros(depth.shape, dtype=np.bool_)
     quality = np.zeros(depth.shape, dtype=np.float32)

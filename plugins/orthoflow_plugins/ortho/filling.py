@@ -1,4 +1,4 @@
-"""Gaps between painted cells: which may be filled, with what colour, and a picture of it.
+"""Gaps between painted cells: which may be filled, their colours, and a picture of them.
 
 After skarlatos2012, section 3; the picture is the pair of its Figure 5.
 """
@@ -19,11 +19,11 @@ Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 VoidLimits = tuple[int, int, int]
 
 _WINDOWS: Final = (3, 5, 7)
-# Around a painted cell beside a gap it is asked where in its cell its point lies.
+# Radius around a gap within which the positions of points in painted cells are needed.
 _BESIDE_CELLS: Final = 2
-# Fronts of OpenCV go on through gap after gap; what is farther does not show in 8 bits.
+# OpenCV's fronts continue through successive gaps; more distant influence is below 8 bits.
 _FRONT_CELLS: Final = 64
-# Of the picture: side of the part that is shown, how much larger it is, and what void is.
+# The picture: side of the part that is shown, its magnification, and the colour of void cells.
 _SIDE_CELLS: Final = 240
 _ZOOM: Final = 3
 _GUTTER_PX: Final = 12
@@ -32,13 +32,13 @@ _VOID_RGB: Final = (255, 0, 255)
 
 @dataclass(frozen=True, kw_only=True)
 class Painted:
-    """Where a raster is painted, flat over its cells.
+    """The painted cells of a raster, flat over its cells.
 
     Attributes:
-        places: (cells, 2) float32, where what paints a cell lies to the right of and below its
-            centre, in cells; NaN where nothing does.
-        depth_m: (cells,) float32, of the surface; NaN where it is not known.
-        layer_m: depths that differ by more are of different surfaces.
+        places: (cells, 2) float32, position of the painting point right of and below the cell's
+            centre, in cells; NaN without one.
+        depth_m: (cells,) float32, of the surface; NaN if unknown.
+        layer_m: depths that differ by more belong to different surfaces.
     """
 
     places: NDArray[np.float32]
@@ -47,7 +47,7 @@ class Painted:
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
-    """How many rows away a cell may lie that decides how a gap is filled."""
+    """Return how many rows away a cell may influence how a gap is filled."""
     if inpainting == "none":
         return 0
     reach = max(_WINDOWS) // 2 + math.ceil(radius_px) + 1 + _BESIDE_CELLS
@@ -55,12 +55,12 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
-    """Void cells with few void cells around them.
+    """Return void cells with few void cells around them.
 
     The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, the cell
-    itself included; all three counts must not exceed their limit. Cells outside the image count
-    as void: nothing is known there, so that the rim of an image is filled more reluctantly than
-    its inside and never extrapolated. The rule is applied once.
+    itself included; all three counts must be within their limit. Cells outside the image count as
+    void, because nothing is known there; so the border of an image is filled less readily than its
+    interior and never extrapolated. The rule is applied once.
 
     Args:
         is_void: (rows, cols).
@@ -76,7 +76,7 @@ def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.
 
 
 def void_counts(is_void: NDArray[np.bool_], window: int) -> NDArray[np.uint8]:
-    """Void cells (rows, cols) in the square window around each cell; outside counts as void."""
+    """Count void cells (rows, cols) in the window around each cell; outside counts as void."""
     import cv2
 
     reach = window // 2
@@ -95,13 +95,13 @@ def inpainted(
     method: Inpainting,
     radius_px: float,
 ) -> NDArray[np.uint8]:
-    """Paint the fillable cells by OpenCV with colours that come from painted cells only.
+    """Paint the fillable cells with OpenCV, from the colours of painted cells only.
 
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.
         is_void: (rows, cols) cells without a colour.
         is_fillable: (rows, cols) the void cells to paint.
-        method: of `cv2.inpaint`.
+        method: method of `cv2.inpaint`.
         radius_px: neighbourhood from which a cell takes its colour.
 
     Returns:
@@ -112,9 +112,9 @@ def inpainted(
     painted = np.where(is_void[..., np.newaxis], np.uint8(0), rgb)
     if is_void.all() or not is_fillable.any():
         return painted
-    # cv2.inpaint takes every cell outside its mask for known, so that the black of large voids
-    # would creep into the gaps beside them. Void cells lend the colour of their nearest painted
-    # cell while it runs.
+    # cv2.inpaint treats every cell outside its mask as known, so the black of large voids would
+    # bleed into the gaps next to them. Void cells have the colour of their nearest painted cell
+    # while it runs.
     _, labels = cv2.distanceTransformWithLabels(
         is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -136,14 +136,14 @@ def painted_between(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Paint gaps in place with what lies between the painted cells about them.
+    """Paint gaps in place by interpolation between the painted cells around them.
 
     Args:
         gaps: (n,) flat indices of cells that are not painted.
         rgb: (rows, cols, 3) colours of 8 or 16 bits, written in the gaps.
         painted: which cells are painted.
-        reach_cells: gaps without a painted cell so near stay as they are.
-        threads: how many threads work.
+        reach_cells: gaps without a painted cell within this distance are unchanged.
+        threads: number of threads.
 
     Returns:
         (rows, cols) which gaps were painted.
@@ -160,14 +160,14 @@ def painted_between(
 
 
 def filling_preview(layer: Layer) -> bytes:
-    """PNG of the part of a layer where most was filled: left before, right after, enlarged."""
+    """Return a PNG of the part of a layer with most filling: left before, right after, enlarged."""
     import cv2
 
     filled = np.zeros((1, 1), dtype=np.uint8) if layer.filled is None else layer.filled
     part = _busiest_part(np.broadcast_to(filled, layer.mask.shape))
     is_shown, after = layer.mask[part] == LayerMask.PAINTED, eight_bits(layer.rgb[part]).copy()
     after[~is_shown] = _VOID_RGB
-    # What was filled was void before, and the rest is as it was.
+    # Filled cells were void before; all others are unchanged.
     before = after.copy()
     if layer.filled is not None:
         before[layer.filled[part] > 0] = _VOID_RGB
@@ -178,7 +178,7 @@ def filling_preview(layer: Layer) -> bytes:
 
 
 def _busiest_part(filled: NDArray[np.uint8]) -> tuple[slice, slice]:
-    """The tile of `_SIDE_CELLS` with the most filled cells; the first one among equals."""
+    """Return the tile of `_SIDE_CELLS` with the most filled cells; the first among equals."""
     rows, columns = filled.shape
     tiles = [
         (slice(row, row + _SIDE_CELLS), slice(column, column + _SIDE_CELLS))

@@ -1,4 +1,4 @@
-"""Compiled pass that throws the pixels of a photo onto the surface of a wall."""
+"""Compiled pass that projects the pixels of a photo onto the surface of a wall."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow_plugins.ortho.views import Relief, WallView
 
-# Pixels between two exact rays; in between they are interpolated. With lenses of a metre's focal
-# length in pixels or more the error is below a hundredth of a pixel.
+# Pixels between two exact rays, which are interpolated. With lenses of a thousand pixels focal
+# length or more the error is below a hundredth of a pixel.
 RAY_STEP_PX: Final = 16
 NO_PIXEL: Final = -1
 _NEAREST_M: Final = 0.05
@@ -35,21 +35,21 @@ class Catch(NamedTuple):
 def throw_pixels(
     view: WallView, relief: Relief, buffer: DepthBuffer, rays: NDArray[np.float64], catch: Catch
 ) -> int:
-    """Follow the ray of each pixel to where it first meets the surface, and offer it to that cell.
+    """Follow the ray of each pixel to its first intersection, and offer the pixel to that cell.
 
-    The cell takes the pixel that meets the surface nearest to its centre; among equals the first.
-    A ray that passes the edge of a step meets the side of it, which no cell shows.
+    The cell takes the pixel that hits the surface closest to its centre; among equals the first. A
+    ray past the edge of a step hits the side of it, which no cell shows.
 
     Args:
-        view: the camera before the wall.
-        relief: the surface; without a known cell nothing is thrown.
-        buffer: what else stands before the camera.
+        view: the camera in front of the wall.
+        relief: the surface; without a known cell nothing is projected.
+        buffer: depth buffer of other objects.
         rays: (n, m, 3) directions at the pixel positions `RAY_STEP_PX` * (row, column), columns,
             rows and metres of height per metre along the optical axis.
         catch: updated.
 
     Returns:
-        How many pixels met the surface.
+        The number of pixels that hit the surface.
     """
     rows, columns = relief.depth.shape
     width, height = int(view.camera[21]), int(view.camera[22])
@@ -106,15 +106,15 @@ def throw_pixels(
 def _first_meeting(
     view: WallView, relief: Relief, dc: float, dr: float, dn: float, lowest: float
 ) -> float:
-    """Distance along the axis at which a ray meets the surface, -1 where it meets none.
+    """Return the distance along the axis at which a ray hits the surface, -1 without a hit.
 
-    The ray is followed from cell to cell, each a level patch, from the highest surface down to
-    the lowest. A ray that enters a cell below its surface has met a side: by little, that is the
-    noise of the depths or a slope, and the patch counts as met; by more, it is an edge.
+    The ray is followed from cell to cell, each a level patch, from the highest surface down to the
+    lowest. A ray that enters a cell below its surface has hit a side: a small difference is due to
+    noise of the depths or a slope, and the patch counts as hit; a larger one is an edge.
     """
     rows, columns = relief.depth.shape
     begin = max(_NEAREST_M, (view.height_m - relief.highest_m) / -dn)
-    # A little farther than the lowest cell, for what arithmetic loses.
+    # Slightly farther than the lowest cell, to allow for rounding.
     end = (view.height_m - lowest + view.tolerance_m) / -dn
     t = begin
     u, v = view.column + 0.5 + t * dc, view.row + 0.5 + t * dr
@@ -130,7 +130,7 @@ def _first_meeting(
         if 0 <= column < columns and 0 <= row < rows:
             depth = float(relief.depth[row, column])
             height = view.height_m + t * dn
-            # Void is not a number, and nothing is below it.
+            # Void is NaN, and no comparison with it is true.
             if view.height_m + leaves * dn <= depth:
                 if height >= depth:
                     return t + (height - depth) / -dn

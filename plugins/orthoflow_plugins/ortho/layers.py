@@ -1,4 +1,4 @@
-"""The layers that photos make on walls: collected while they are painted, and joined."""
+"""The layers of photos on walls: collected during painting, and joined."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class CellCounts:
     """Cells of all walls by what photos show of them.
 
     Attributes:
-        n_surface: with a depth.
-        n_painted: painted by some photo.
-        n_hidden: hidden from some photo, and painted by none.
+        n_surface: cells with a depth.
+        n_painted: cells painted by some photo.
+        n_hidden: cells hidden from some photo, and painted by none.
     """
 
     n_surface: int
@@ -47,7 +47,7 @@ class CellCounts:
 
 @dataclass(frozen=True, kw_only=True)
 class ReachedWall:
-    """What photos reach of a wall on which they paint nothing.
+    """The visibility of a wall on which the photos paint nothing.
 
     Attributes:
         wall: its index.
@@ -60,12 +60,12 @@ class ReachedWall:
 
 @dataclass(frozen=True, kw_only=True)
 class PaintedPhotos:
-    """What the photos paint.
+    """The result of painting all photos.
 
     Attributes:
         layers: photo by photo.
         reached: walls on which none of them paints.
-        seconds: what took how long.
+        seconds: duration of each part.
     """
 
     layers: tuple[Layer, ...]
@@ -77,25 +77,25 @@ class LayerStack:
     """Layers of walls, added photo by photo.
 
     Attributes:
-        painted: layers of photos, as they were added.
+        painted: layers of photos, in the order of addition.
     """
 
     def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
         self._names = tuple(wall.name for wall in walls.walls)
         self._ctx = ctx
-        # What photos reach of walls that none has painted so far.
+        # Visibility of walls that no photo has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
 
     @property
     def reached(self) -> tuple[ReachedWall, ...]:
-        """What photos reach of walls on which none paints."""
+        """Return the visibility of walls on which none paints."""
         return tuple(
             ReachedWall(wall=wall, mask=mask) for wall, mask in sorted(self._reached.items())
         )
 
     def allocator(self, wall: int) -> Allocate:
-        """Return what gives the arrays of the next layer; a large one lies in files."""
+        """Return a function that allocates the arrays of the next layer; a large one in files."""
         prefix = f"{wall}.{len(self.painted)}"
 
         def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
@@ -104,7 +104,7 @@ class LayerStack:
         return allocate
 
     def scratch(self, wall: int) -> Allocate:
-        """Give what gives arrays, in files, that are done with before the next layer of a wall."""
+        """Return a function that allocates arrays in files, reused for the next layer of a wall."""
 
         def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
             return self._ctx.allocate("layers", f"{wall}.scratch.{name}", shape, dtype)
@@ -113,7 +113,7 @@ class LayerStack:
 
     @contextmanager
     def painting_from(self, source: str) -> Iterator[None]:
-        """Log which walls a photo painted once it was laid onto all of them."""
+        """Log which walls a photo painted once it was projected onto all of them."""
         n_before = len(self.painted)
         yield
         names = [self._names[layer.wall] for layer in self.painted[n_before:]]
@@ -125,11 +125,11 @@ class LayerStack:
         self.painted.append(layer)
 
     def note_reached(self, wall: int, mask: NDArray[np.uint8]) -> None:
-        """Note what a photo reaches of a wall on which it paints nothing.
+        """Record the visibility of a wall on which a photo paints nothing.
 
         Args:
             wall: its index.
-            mask: (rows, cols) `LayerMask`; the next layer's may lie in the same file.
+            mask: (rows, cols) `LayerMask`; the next layer's may be in the same file.
         """
         if any(layer.wall == wall for layer in self.painted):
             return
@@ -142,7 +142,7 @@ class LayerStack:
 
 
 def joined_layers(walls: Walls, photos: PaintedPhotos, ctx: StepContext) -> Layers:
-    """Order the layers of all photos by wall, and add an empty one for each unpainted wall.
+    """Sort the layers of all photos by wall, and add an empty one for each unpainted wall.
 
     Raises:
         MethodError: no photo paints any wall.
@@ -184,7 +184,7 @@ def count_shown(walls: Walls, layers: Layers) -> CellCounts:
 def _bare_layer(
     wall: Wall, place: int, reached: Sequence[NDArray[np.uint8]], level: Level, ctx: StepContext
 ) -> Layer:
-    """The layer of a wall that no photo paints, as parts of the photos reach it."""
+    """Return the layer of a wall that no photo paints, from what parts of the photos reach it."""
     shape = wall.frame.shape
     new = partial(ctx.allocate, "layers")
     mask = np.asarray(new(f"{place}.bare.mask", shape, np.uint8), np.uint8)
@@ -207,6 +207,6 @@ def _bare_layer(
 
 
 def _add_hidden(other: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Mark what is hidden from another photo, too, in a mask."""
+    """Mark cells that are hidden from another photo, too."""
     for rows in row_bands(mask.shape):
         mask[rows][other[rows] == LayerMask.OCCLUDED] = LayerMask.OCCLUDED

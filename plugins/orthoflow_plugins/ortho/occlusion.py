@@ -1,4 +1,4 @@
-"""What stands free between photos and walls, told from the whole cloud."""
+"""Objects between photos and walls, from the whole cloud."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def occluders_of(
     *,
     method: str,
 ) -> Occluders | None:
-    """Find what stands free before the walls; None, with a warning, where no cloud is wired.
+    """Find objects in front of the walls; None, with a warning, without a cloud.
 
     Raises:
         ProductError: the cloud has fewer than three points.
@@ -56,7 +56,7 @@ def occluders_of(
 def depth_buffer_of(
     occluders: Occluders | None, viewer: ViewingCamera, photo: Photo
 ) -> DepthBuffer:
-    """Look at what stands free through a photo's camera; None for nothing but what is masked."""
+    """Render objects through a photo's camera; None if only the mask hides anything."""
     free = nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
     return before_masks(free, photo)
 
@@ -69,11 +69,11 @@ def find_occluders(
     n_least: int,
     threads: int,
 ) -> Occluders:
-    """Count the points between cameras and walls, to know outliers and the gaps between points.
+    """Count the points between cameras and walls, to detect outliers and estimate point spacing.
 
     Args:
         cloud: the whole cloud.
-        walls: nothing beyond the box about walls and cameras can hide a wall.
+        walls: nothing outside the box around walls and cameras can hide a wall.
         cameras: all of them.
         n_least: see `Occluders`.
         threads: see `Occluders`.

@@ -1,4 +1,4 @@
-"""One photo laid onto one wall, tile by tile: which cells it sees, and their colours."""
+"""One photo projected onto one wall, tile by tile: the cells it sees, and their colours."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from orthoflow_plugins.ortho.views import OCCLUDED, TileVisibility, WallView
 from orthoflow_plugins.ortho.visibility_kernels import look_at_cells
 
 TILE_CELLS: Final = 512
-# What is packed of a photo for a tile stays below 80 MB; cv2.remap takes sides below 32767.
+# The packed part of a photo for a tile stays below 80 MB; cv2.remap takes sides below 32767.
 _CROP_MOST_PX: Final = 3_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaintRule:
-    """Which of the cells that a photo sees are painted, and how colours are taken.
+    """Which of the cells that a photo sees are painted, and how colours are sampled.
 
     Attributes:
-        resampling: how colours between pixels are made.
-        is_filtered: average over what a cell covers where the photo is finer than the wall.
-        erosion_cells: cells so near to a hidden one are not painted.
+        resampling: interpolation of colours between pixels.
+        is_filtered: average over a cell where the photo is finer than the wall.
+        erosion_cells: cells this close to a hidden one are not painted.
     """
 
     resampling: Resampling
@@ -42,13 +42,13 @@ class PaintRule:
 
 @dataclass(kw_only=True)
 class Painting:
-    """What a photo painted on a wall.
+    """The result of painting a photo on a wall.
 
     Attributes:
         mask: (rows, cols) uint8 `LayerMask`.
         rgb: (rows, cols, 3) in the photo's bits, None when nothing was painted.
         quality: (rows, cols) float32, None when nothing was painted.
-        footprints: of the tiles that were painted, by their first cell.
+        footprints: of the painted tiles, by their first cell.
     """
 
     mask: NDArray[np.uint8]
@@ -67,17 +67,17 @@ def paint(
     allocate: Allocate,
     threads: int,
 ) -> Painting:
-    """Lay a photo onto a wall.
+    """Project a photo onto a wall.
 
     Args:
-        photo: (height, width, 3), 8 or 16 bits; so is what is painted.
-        view: its camera before the wall.
+        photo: (height, width, 3), 8 or 16 bits, which the result has, too.
+        view: its camera in front of the wall.
         surface: the wall.
-        buffer: what else stands before the camera.
+        buffer: depth buffer of other objects.
         rule: how.
-        allocate: gives the arrays of a layer, zeroed: the mask, and the others once something is
+        allocate: returns the arrays of a layer, zeroed: the mask, and the others once something is
             painted.
-        threads: how many tiles are painted at once; it does not show in the result.
+        threads: number of tiles painted at once; it does not change the result.
     """
     brush = _Brush(photo, view, surface, buffer, rule, allocate)
     rows, columns = surface.frame.shape
@@ -91,7 +91,7 @@ def paint(
 
 
 class _Brush:
-    """Paints the tiles of one painting, several at once."""
+    """Paints the tiles of one layer, several at once."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class _Brush:
         self.painting.footprints[tile[0].start, tile[1].start] = footprint
 
     def _look(self, tile: tuple[slice, slice]) -> tuple[TileVisibility, tuple[slice, slice]]:
-        """See a tile and so much around it as hides cells of it; say where in that the tile is."""
+        """Determine the visibility of a tile with its margin; return the tile's position in it."""
         reach = self._rule.erosion_cells
         reach += 1 if reach else 0  # what is a patch shows one cell farther out
         first = [max(0, part.start - reach) for part in tile]
@@ -155,7 +155,7 @@ class _Brush:
         return visible, (rows, columns)
 
     def _near_hidden(self, visible: TileVisibility) -> NDArray[np.uint8]:
-        """Not 0 where a cell is too near to a hidden patch; empty where none is."""
+        """Return non-zero where a cell is too close to a hidden patch; empty if none is."""
         if self._rule.erosion_cells:
             is_hidden = visible.mask == OCCLUDED
             if is_hidden.any():
@@ -183,20 +183,20 @@ class _Brush:
                 painting.quality = np.asarray(
                     self._allocate("quality", shape, np.float32), np.float32
                 )
-            # Kernels know plain arrays only, not mapped files.
+            # Kernels accept plain arrays only, not mapped files.
             rgb, quality = painting.rgb.view(np.ndarray), painting.quality.view(np.ndarray)
             return Canvas(mask=painting.mask, quality=quality, rgb=rgb)
 
 
 def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.uint8]:
-    """Cells within a reach of hidden patches of 2 x 2 cells or more.
+    """Return cells within a reach of hidden patches of 2 x 2 cells or more.
 
-    A single hidden cell is one whose own depth is wrong; its neighbours are none the worse.
+    A single hidden cell has a wrong depth of its own; its neighbours are unaffected.
     """
     import cv2
 
     lowest = cv2.erode(is_hidden.view(np.uint8), np.ones((2, 2), dtype=np.uint8), anchor=(0, 0))
-    # The patches again from their upper left cells, and what is around them, in one.
+    # The patches from their upper left cells, and their surroundings, in one dilation.
     window = np.ones((2 * reach + 2,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2), dtype=np.uint8)
 

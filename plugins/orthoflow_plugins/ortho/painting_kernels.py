@@ -1,10 +1,10 @@
-"""Compiled passes that paint a tile: its colours sampled from the photo, and its handing over.
+"""Compiled passes that paint a tile: colours sampled from the photo, and written to the layer.
 
-Bilinear sampling takes three channels at once, in whole numbers. The channels of a pixel stand 21
-bits apart in one 64-bit number. Weights in 64ths of a pixel along both axes multiply to 12 bits,
-and 8 + 12 bits do not run over into the next channel: four products and three sums give three
-colours, the same ones on every machine. `cv2.remap` takes twice as long. Channels of 16 bits do
-not fit into one number; they are mixed one by one, by weights that are not rounded.
+Bilinear sampling takes three channels at once, in integers. The channels of a pixel are 21 bits
+apart in one 64-bit number. Weights in 64ths of a pixel along both axes multiply to 12 bits, and 8 +
+12 bits do not overflow into the next channel: four products and three sums give three colours, the
+same ones on every machine. `cv2.remap` takes twice as long. Channels of 16 bits do not fit into one
+number; they are mixed one by one, by weights that are not rounded.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from orthoflow.geometry.levels import Colours
 from orthoflow_plugins.ortho.views import OCCLUDED, PAINTED, TileVisibility
 
 _STEPS: Final = 64
-# Places of the channels in a packed pixel.
+# Bit positions of the channels in a packed pixel.
 _GREEN, _BLUE = np.uint64(21), np.uint64(42)
 _WEIGHT_BITS: Final = np.uint64(12)
-# Half of what a weighted sum is divided by, for each channel: colours are rounded, not cut off.
+# Half of the divisor of a weighted sum, for each channel, so that colours are rounded.
 _HALF: Final = np.uint64((1 << 11) | (1 << 32) | (1 << 53))
-# Twenty bits tell views apart well enough, and pack to half the size.
+# Twenty bits resolve views well enough, and compress to half the size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
-# Cells that are looked at together: where all are painted, none has to be made bare.
+# Cells processed together: if all are painted, none has to be cleared.
 _RUN: Final = 32
 
 
 @compiled
 def pack_pixels(photo: NDArray[np.uint8], packed: NDArray[np.uint64]) -> None:
-    """Pack the channels of each pixel; the last column and the last row are there twice.
+    """Pack the channels of each pixel; the last column and the last row are repeated.
 
     Args:
         photo: (rows, cols, 3).
@@ -49,11 +49,11 @@ def pack_pixels(photo: NDArray[np.uint8], packed: NDArray[np.uint64]) -> None:
 
 
 class Patch(NamedTuple):
-    """Cells of a larger array, which stays whole: rows of a part of it would be slower to read.
+    """A range of cells of a larger array, which is passed whole: rows of a view are slower.
 
     Attributes:
         row: the first one; column likewise.
-        n_rows: how many; n_columns likewise.
+        n_rows: number of rows; n_columns likewise.
     """
 
     row: int
@@ -70,13 +70,13 @@ def sample_bilinear(
     patch: Patch,
     colours: NDArray[np.uint8],
 ) -> None:
-    """Set the colours at places of a photo, which goes on beyond its border as it ends there.
+    """Set the colours at positions of a photo, whose border is extended.
 
     Args:
-        packed: of `pack_pixels`.
-        places: u and v (rows, cols) in pixels, numbers everywhere.
+        packed: from `pack_pixels`.
+        places: u and v (rows, cols) in pixels, finite everywhere.
         corner: u and v of the centre of the first pixel.
-        patch: which of the places.
+        patch: range of positions.
         colours: (rows, cols, 3) of the patch, overwritten.
     """
     us, vs = places[0].reshape(places[0].size), places[1].reshape(places[1].size)
@@ -88,7 +88,7 @@ def sample_bilinear(
     for row in range(patch.n_rows):
         first = np.uintp((patch.row + row) * places[0].shape[1] + patch.column)
         into = colours[row]
-        # Each of these loops writes one array, and the processor takes eight cells at once.
+        # Each of these loops writes one array, and eight cells are processed at once.
         for j in range(patch.n_columns):
             across = min(max(us[first + np.uintp(j)] - first_u, zero), last_u)
             down = min(max(vs[first + np.uintp(j)] - first_v, zero), last_v)
@@ -104,7 +104,7 @@ def sample_bilinear(
             lower = upper + np.uintp(width)
             right = np.uint64(np.uint32(shares[j]) & np.uint32(255))
             below = np.uint64(np.uint32(shares[j]) >> np.uint32(8))
-            # One product each: that differences run under does no harm, for the sums do not.
+            # One product each: negative differences wrap around, but the sums do not.
             above_sum = pixels[upper] * whole
             above_sum += (pixels[upper + np.uintp(1)] - pixels[upper]) * right
             below_sum = pixels[lower] * whole
@@ -164,13 +164,13 @@ def hand_over(
     canvas: Canvas,
     tile: tuple[slice, slice],
 ) -> None:
-    """Write mask and quality of a tile, and take the colours of cells that are not painted.
+    """Write mask and quality of a tile, and clear the colours of cells that are not painted.
 
     Args:
-        visible: of the tile and what is around it.
-        is_near: of the same shape, not 0 where a cell is too near to a hidden patch; or empty.
+        visible: of the tile with its margin.
+        is_near: of the same shape, non-zero where a cell is too close to a hidden patch; or empty.
         inner: row and column of `visible` where the tile begins.
-        canvas: changed where the tile is.
+        canvas: changed in the tile.
         tile: rows and columns of it.
     """
     rows, columns = tile
@@ -202,7 +202,7 @@ def hand_over(
 
 @kernel_part
 def _take_colours(canvas: Canvas, tile: tuple[slice, slice]) -> None:
-    """Make the cells of a tile black that are not painted."""
+    """Make the unpainted cells of a tile black."""
     rows, columns = tile
     masks, rgb = canvas.mask.reshape(canvas.mask.size), canvas.rgb.reshape(canvas.rgb.size)
     painted = np.uint8(PAINTED)

@@ -1,4 +1,4 @@
-"""What methods that lay photos onto walls take: ports, what counts as seen, photos with cameras."""
+"""Common parts of methods that project photos: ports, visibility, photos with cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _PLAIN_BITS: Final = 8
-# Of the cosine between a photo's top and up, beyond which it was held upright, or turned over.
+# Cosine between a photo's top and up, beyond which it was held upright, or upside down.
 _UPRIGHT: Final = 0.5
 UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
@@ -96,13 +96,13 @@ class VisibilityParams(MethodParams):
 
 @dataclass(frozen=True, kw_only=True)
 class OpenedPhoto:
-    """A photo ready to be laid onto walls.
+    """A photo prepared for projection onto walls.
 
     Attributes:
         name: of the photo.
-        pixels: (height, width, 3) uint8, or uint16 where a photo of the block is deep.
+        pixels: (height, width, 3) uint8, or uint16 if a photo of the block is deep.
         viewer: its camera.
-        buffer: what stands free before the camera.
+        buffer: depth buffer of objects in front of the camera.
     """
 
     name: str
@@ -112,7 +112,7 @@ class OpenedPhoto:
 
 
 def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tuple[Photo, Camera]]:
-    """The photos that have a pose, with it.
+    """The photos that have a pose, with their cameras.
 
     Raises:
         MethodError: there is none, there are no walls, or a camera has no photo.
@@ -136,12 +136,12 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
 def warn_of_heads(
     up: NDArray[np.float64], oriented: Sequence[tuple[Photo, Camera]], ctx: StepContext
 ) -> None:
-    """Say so when most photos were taken with their tops down: rather, the scan's up is down.
+    """Warn if most photos were taken upside down, which suggests that the scan's up is down.
 
     Args:
-        up: (3,) unit vector that the scan calls up.
+        up: (3,) unit vector of the scan's up direction.
         oriented: the photos and their poses.
-        ctx: of the step.
+        ctx: context of the step.
     """
     # Rows of a photo count downwards.
     tops = [-camera.viewing().rotation[1] @ up for _, camera in oriented]
@@ -156,7 +156,7 @@ def warn_of_heads(
 def layers_of_photos(
     inputs: PhotosOnWalls, painted: PaintedPhotos, ctx: StepContext
 ) -> LayersOfPhotos:
-    """Put the layers of all photos in order, with the profile of their colours."""
+    """Sort the layers of all photos, with the profile of their colours."""
     oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
     warn_of_heads(inputs.walls.up, oriented, ctx)
     profile = shared_profile([photo for photo, _ in oriented], ctx)
@@ -165,9 +165,9 @@ def layers_of_photos(
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
-    """State in which bits photos are laid onto walls: 16 where any of them has more than 8.
+    """Return the number of bits in which photos are projected: 16 if any has more than 8.
 
-    The others are taken times 257 then, so that white stays white and nothing is lost.
+    The others are then multiplied by 257, so that white stays white and nothing is lost.
     """
     plain = [photo.name for photo in photos if (stated_bits(photo.encoded) or 0) <= _PLAIN_BITS]
     if len(plain) == len(photos):
@@ -197,7 +197,7 @@ def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
 
 
 def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:
-    """The ICC profile that all photos have; None where they have none, or not the same."""
+    """Return the ICC profile that all photos have; None without one, or if they differ."""
     profiles = {icc_profile(photo.encoded) for photo in photos}
     if len(profiles) > 1:
         ctx.report(MIXED_PROFILES, n=len(profiles))

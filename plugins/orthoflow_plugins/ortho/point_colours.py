@@ -1,7 +1,7 @@
-"""The colour of a cell from the points that lie on its topmost surface.
+"""The colour of a cell from the points on its topmost surface.
 
-skarlatos2012 takes the topmost point and proposes for the future to weigh points by their distance
-to the centre of the cell; the other rules are that proposal, and two that average.
+skarlatos2012 takes the topmost point and proposes as future work to weight points by their distance
+from the centre of the cell; the other rules are that proposal, and two averages.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 Colouring = Literal["topmost", "centre", "gaussian", "median"]
 
-# Standard deviation of the Gauss in cells: a point in the corner of its cell counts a seventh.
+# Sigma of the Gaussian in cells: a point in the corner of its cell has a weight of a seventh.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
-# The median sorts so many points at once.
+# Number of points that the median sorts at once.
 _POINTS_AT_ONCE: Final = 1 << 24
 
 
@@ -36,9 +36,9 @@ class ColourRule:
     Attributes:
         colouring: `topmost` point; the one nearest the `centre` on the topmost surface; `gaussian`
             weighted mean of that surface; `median` of its highest points.
-        layer_m: points so far below the topmost one still lie on its surface.
-        n_top: how many points the median takes at most.
-        threads: how many threads work.
+        layer_m: points at most this far below the topmost one are on its surface.
+        n_top: maximum number of points for the median.
+        threads: number of threads.
     """
 
     colouring: Colouring
@@ -54,7 +54,7 @@ class Painters:
     Attributes:
         cloud: all points.
         values: (n, 3) uint8 their colours, or (n, 1) their greys.
-        is_left_out: (n,) points without a colour; None where all have one.
+        is_left_out: (n,) points without a colour; None if all have one.
     """
 
     cloud: PointCloud
@@ -62,7 +62,7 @@ class Painters:
     is_left_out: NDArray[np.bool_] | None = None
 
     def entries(self, slab: Slab, *, threads: int, rows: slice | None = None) -> Iterator[Entries]:
-        """Return those inside a slab, chunk by chunk (`entries_inside`)."""
+        """Yield the points inside a slab, chunk by chunk (`entries_inside`)."""
         from orthoflow.geometry.rastering import entries_inside
 
         return entries_inside(
@@ -77,11 +77,11 @@ class CellColours:
     Attributes:
         rgb: (cells, 3) uint8, 0 where void.
         has_point: (cells,).
-        distance_cells: (cells,) from the centre to the point that stands for the cell: the
+        distance_cells: (cells,) distance from the centre of the point that represents the cell: the
             coloured one, or the topmost one of those averaged; infinite where void.
-        places: (cells, 2) float32, where the coloured point lies to the right of and below the
-            centre, in cells, 0 where several are averaged; NaN where void.
-        depth_m: (cells,) float32, of the point that stands for the cell; NaN where void.
+        places: (cells, 2) float32, position of the coloured point right of and below the centre, in
+            cells, 0 if several are averaged; NaN where void.
+        depth_m: (cells,) float32, of the point that represents the cell; NaN where void.
     """
 
     rgb: NDArray[np.uint8]
@@ -96,7 +96,7 @@ def colours_of(painters: Painters, slab: Slab, rule: ColourRule) -> CellColours:
 
     Args:
         painters: the points.
-        slab: the wall, and which points count.
+        slab: the wall, and the depths of its points.
         rule: how.
     """
     from orthoflow.geometry.raster_kernels import NO_POINT
@@ -117,7 +117,7 @@ def colours_of(painters: Painters, slab: Slab, rule: ColourRule) -> CellColours:
         rgb[has_point] = _weighted_means(painters, slab, floors_m, rule)[has_point]
     elif rule.colouring == "median":
         for cells in _in_parts(winners["n_points"]):
-            _lay_medians(rgb, cells, painters, slab, floors_m, rule)
+            _set_medians(rgb, cells, painters, slab, floors_m, rule)
     else:
         rgb[:] = values_of_winners(winners, painters.values, 0, threads=rule.threads)
     places = places_of_winners(cloud, slab, winners, threads=rule.threads)
@@ -135,7 +135,7 @@ def colours_of(painters: Painters, slab: Slab, rule: ColourRule) -> CellColours:
 def _most_central(
     painters: Painters, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
 ) -> NDArray[np.void]:
-    """The points on the topmost surface that lie nearest to the centres of their cells."""
+    """Return the points on the topmost surface that are nearest to the centres of their cells."""
     from orthoflow.geometry.raster_kernels import keep_nearest
     from orthoflow.geometry.rastering import empty_winners, share_cells
 
@@ -166,7 +166,7 @@ def _on_top(
     threads: int,
     wanted: slice | None = None,
 ) -> Iterator[_TopPoints]:
-    """Return the points on the topmost surface, of all cells or of those that are wanted."""
+    """Yield the points on the topmost surface, of all cells or of the requested ones."""
     width = slab.frame.width
     wanted = wanted or slice(0, slab.n_cells)
     rows = slice(wanted.start // width, -(-wanted.stop // width))
@@ -184,7 +184,7 @@ def _on_top(
 
 
 def _slots(entries: Entries) -> NDArray[np.int64]:
-    """Slots of a chunk that hold a point."""
+    """Return slots of a chunk that hold a point."""
     from orthoflow.geometry.raster_kernels import BLOCK
 
     is_used = np.arange(BLOCK) < entries.n_inside[:, np.newaxis]
@@ -210,7 +210,7 @@ def _weighted_means(
 
 
 def _in_parts(n_points: NDArray[np.uint32]) -> Iterator[slice]:
-    """Cut cells into parts with at most so many points each, or one cell."""
+    """Cut cells into parts with a limited number of points each, or one cell."""
     totals = np.cumsum(n_points, dtype=np.int64)
     first = n_before = 0
     while first < n_points.size:
@@ -220,7 +220,7 @@ def _in_parts(n_points: NDArray[np.uint32]) -> Iterator[slice]:
         first, n_before = end, int(totals[end - 1])
 
 
-def _lay_medians(
+def _set_medians(
     rgb: NDArray[np.uint8],
     wanted: slice,
     painters: Painters,
@@ -228,7 +228,7 @@ def _lay_medians(
     floors_m: NDArray[np.float32],
     rule: ColourRule,
 ) -> None:
-    """Write the median colour, channel by channel, of the highest points of cells into `rgb`."""
+    """Set `rgb` of cells to the median colour, channel by channel, of their highest points."""
     chunks = list(_on_top(painters, slab, floors_m, threads=rule.threads, wanted=wanted))
     if not chunks:
         return

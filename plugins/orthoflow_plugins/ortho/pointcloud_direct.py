@@ -34,14 +34,14 @@ from orthoflow_plugins.ortho.filling import (
 )
 from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, Painters, colours_of
 
-# Larger walls are painted in bands of so many cells: some 600 MB.
+# Larger walls are painted in bands of this many cells: about 600 MB.
 _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
-# Pure black points are told of from this share on; of real colours hardly any is.
+# Pure black points are reported from this share on; real colours have hardly any.
 _BLACK_WORTH_WORDS: Final = 0.001
-# Files with black points have some that are almost black, too.
+# Files with black points also have some that are almost black.
 _ALMOST_BLACK_GREY: Final = 10
-# Of clouds with more black points black is a colour.
+# In clouds with more black points black is a colour.
 _MOST_SPECKS: Final = 0.1
 
 SPECKS: Final = DiagnosticSpec(
@@ -70,7 +70,7 @@ BLACK_POINTS: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class _Projection:
-    """A wall before its gaps are filled: colours, and where each winner lies in its cell."""
+    """A wall before its gaps are filled: colours, and the position of each winner in its cell."""
 
     rgb: NDArray[np.uint8]
     is_void: NDArray[np.bool_]
@@ -79,11 +79,11 @@ class _Projection:
 
 
 class PointcloudDirect(Method):
-    """Paint each cell of a wall with the colour of the topmost point in it; fill small gaps.
+    """Paint each cell of a wall with the colour of its topmost point; fill small gaps.
 
-    Of the points inside the wall's buffer the one with the largest depth wins, ties go to the
+    Of the points inside the wall's buffer the one with the largest depth is used, ties go to the
     point nearer the centre of the cell, then to the lower index; `colouring` has other rules. Gaps
-    are void cells with few void cells around them; what is filled is marked as filled.
+    are void cells with few void cells around them; filled cells are marked as filled.
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
@@ -186,7 +186,7 @@ class PointcloudDirect(Method):
                 projected = ctx.clock_s()
                 _fill(projection, layers[-1], band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
-                # The next band is projected without this one in memory.
+                # The next band is projected after this one is released.
                 del projection
             n_filled = _n_filled(layers[-1])
             if n_filled > most_filled:
@@ -205,7 +205,7 @@ class PointcloudDirect(Method):
 
 
 def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepContext) -> Painters:
-    """The points with their colours, or their intensity as grey."""
+    """Return the points with their colours, or their intensity as grey."""
     if cloud.rgb is not None:
         rgb = np.asarray(cloud.rgb)
         return Painters(cloud=cloud, values=rgb, is_left_out=_left_out(cloud, rgb, params, ctx))
@@ -235,7 +235,7 @@ def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
 def _left_out(
     cloud: PointCloud, rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Find the points (n,) without a colour, or too dark to have one; None where there are none.
+    """Find the points (n,) without a colour, or too dark to have one; None if there are none.
 
     They paint no cell, and keep their depth. Black points that are painted are reported.
     """
@@ -336,8 +336,8 @@ def _fill(
             radius_px=params.inpaint_radius_px,
         )
     shown = ~is_void | is_filled
-    # 1 at the centre of the cell, 0.5 in its corner: how well the point stands for the cell. A
-    # filled cell is worth less than any painted one.
+    # 1 at the centre of the cell, 0.5 in its corner: how well the point represents the cell. A
+    # filled cell has a lower quality than any painted one.
     quality = np.where(is_void, np.float32(0.0), 1.0 - projection.distance_cells / np.sqrt(2.0))
     quality[is_filled] = 0.25
     inner = band.inner
@@ -363,7 +363,7 @@ def _require_paint(layers: list[Layer]) -> None:
 def _report(
     ctx: StepContext, layers: list[Layer], names: Sequence[str], seconds: NDArray[np.float64]
 ) -> None:
-    """Report how much is painted, filled and void, and of each wall what would fill more."""
+    """Report how much is painted, filled and void, and what would fill more of each wall."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     n_filled = sum(_n_filled(layer) for layer in layers)

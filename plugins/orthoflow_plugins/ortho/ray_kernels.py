@@ -1,7 +1,7 @@
-"""Compiled passes that follow rays from cells of a wall to the camera, over the wall's own relief.
+"""Compiled passes that follow rays from cells of a wall to the camera, over the wall's relief.
 
-Here arrays come one by one: to take one out of a tuple costs as much as some steps along a ray,
-and two threads that do it wait for each other.
+Arrays are separate arguments: accessing one in a tuple costs as much as some steps along a ray, and
+two threads that do it wait for each other.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from orthoflow_plugins.ortho.views import (
     WallView,
 )
 
-# What `follow_rays` knows of each ray, a column each.
+# The data of each ray in `follow_rays`, a column each.
 ROW: Final = 0
 COLUMN: Final = 1
 IS_HIDDEN: Final = 2
 _AT, _MOVE, _PLACE, _STEP, _BESIDE = 3, 4, 5, 6, 7
 _LEVEL, _CLIMB, _N_STEPS = 8, 9, 10
 N_LANES: Final = 11
-# Places and heights along a ray are whole numbers: no step has to be rounded.
+# Positions and heights along a ray are integers: no step has to be rounded.
 _BITS: Final = 32
 _UNIT: Final = 1 << _BITS
 _PART: Final = _UNIT - 1
@@ -55,7 +55,7 @@ class Eye(NamedTuple):
 
 @kernel_part
 def eye_of(view: WallView, relief: Relief) -> Eye:
-    """Return the camera of a photo as rays need it."""
+    """Return the camera of a photo in the form that rays need."""
     return Eye(view.row, view.column, view.height_m, view.tolerance_m, 1.0 / relief.step_m)
 
 
@@ -70,10 +70,10 @@ def highest_in_the_way(
 ) -> float:
     """Bound the height up to which rays from the cells of a block must be followed.
 
-    On its way to the camera the block takes the rays along, and shrinks. At any place it touches no
-    more than the window of 2 x 2 blocks that begins where its corner is; between two samples, half
-    a block apart, that window moves by one row or column of blocks at most, or by both, one after
-    the other. No ray is lower than the one from the lowest cell.
+    On the way to the camera the block moves along the rays, and shrinks. At any position it touches
+    no more than the window of 2 x 2 blocks that begins at its corner; between two samples, half a
+    block apart, that window moves by one row or column of blocks at most, or by both, one after the
+    other. No ray is lower than the one from the lowest cell.
 
     Args:
         eye: the camera.
@@ -82,7 +82,7 @@ def highest_in_the_way(
         bottom: the lowest depth of the block.
         side: of a block, in cells.
         block: its row and column among the blocks.
-        highest_m: nothing that counts is higher.
+        highest_m: maximum height of all that can hide.
     """
     top = NOTHING_M
     if not bottom < eye.height_m:
@@ -112,9 +112,9 @@ def highest_in_the_way(
 
 @kernel_part
 def _first_block(corner: float, direction: float) -> int:
-    """First row or column of the two that a block touches, from where its upper left corner is.
+    """Return the first of the two rows or columns that a block touches, from its upper left corner.
 
-    A block that touches a single one looks at the next one too, in the direction it moves.
+    A block that touches a single one tests the next one too, in the direction in which it moves.
     """
     return math.floor(corner) if direction > 0.0 else math.ceil(corner) - 1
 
@@ -143,16 +143,17 @@ def follow_rays(
 ) -> None:
     """Follow the rays from some cells to the camera, one row or column at a time, up to a height.
 
-    First all are described, which goes fast for many at once, then one after the other is followed.
+    First all are set up, which is fast for many at once, then they are followed one after the
+    other.
 
     Args:
         eye: the camera.
         depths: (rows, cols) of the `Relief`.
         occluding: of the `Relief`.
-        top: nothing in the way is higher, metres.
-        n_rays: how many.
+        top: maximum height of all that can hide, metres.
+        n_rays: number of rays.
         rays: (at least n_rays, N_LANES) with rows and columns of the cells in its columns `ROW` and
-            `COLUMN`; `IS_HIDDEN` is set to 1 or 0, the others are used.
+            `COLUMN`; `IS_HIDDEN` is set to 1 or 0, the others are overwritten.
     """
     columns = depths.shape[1]
     for i in range(n_rays):
@@ -160,7 +161,7 @@ def follow_rays(
         row, column = rays[j, ROW], rays[j, COLUMN]
         depth = float(depths[np.uintp(row), np.uintp(column)])
         down, across = eye.row - row, eye.column - column
-        # Steps are whole rows or columns; beside them the ray moves by a part of a cell.
+        # Steps are whole rows or columns; across them the ray moves by a fraction of a cell.
         if abs(down) >= abs(across):
             along, aside, here, beside = down, across, row, column
             n_here, n_beside, stride, beside_stride = depths.shape[0], columns, columns, 1
@@ -178,7 +179,7 @@ def follow_rays(
         rays[j, _PLACE] = here * stride
         rays[j, _STEP] = stride if along > 0.0 else -stride
         rays[j, _BESIDE] = beside_stride
-        # Where no step is taken, the climb may be more than fits, and is not looked at.
+        # Without steps, the climb may overflow, and is not used.
         rays[j, _LEVEL] = int(height * eye.steps_per_m * _UNIT)
         rays[j, _CLIMB] = int(rise * eye.steps_per_m * _UNIT)
         rays[j, _N_STEPS] = n_steps
@@ -192,7 +193,7 @@ def follow_rays(
             at += move
             place += step
             level += climb
-            # The surface is linear between the two cells beside the ray, which may be one.
+            # The surface is linear between the two cells beside the ray, which may be the same.
             share = at & _PART
             first = place + (at >> _BITS) * stride
             second = first + (stride if share else 0)
@@ -205,7 +206,7 @@ def follow_rays(
 
 @kernel_part
 def _steps_inside(beside: int, n_beside: int, move: int) -> int:
-    """How many steps a ray takes before it leaves the raster at its side."""
+    """Return how many steps a ray takes before it leaves the raster at its side."""
     if move > 0:
         return ((n_beside - 1 - beside) << _BITS) // move
     return (beside << _BITS) // -move if move < 0 else n_beside
@@ -221,22 +222,22 @@ def hide_low_cells(
     top: float,
     rays: NDArray[np.int64],
 ) -> int:
-    """Follow the rays of those cells of a painted block that lie low enough to be hidden.
+    """Follow the rays of those cells of a painted block that are low enough to be hidden.
 
-    Small blocks within it are asked first: most of them are free.
+    Small blocks within it are tested first: most of them are free.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         relief: the wall.
-        mask: of the tile's `TileVisibility`, changed where cells are hidden.
+        mask: of the tile's `TileVisibility`, changed for hidden cells.
         corner: row and column of the tile's first cell.
         area: first row and column of the block's cells in the tile, and the row and column after
             its last ones, on the wall.
         top: height up to which rays from the block have to be followed.
-        rays: (cells of a small block, N_LANES) used.
+        rays: (cells of a small block, N_LANES) working memory.
 
     Returns:
-        How many cells are hidden.
+        The number of hidden cells.
     """
     eye = eye_of(view, relief)
     depths, occluding = relief.depth, relief.occluding

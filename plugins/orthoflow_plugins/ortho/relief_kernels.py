@@ -23,8 +23,8 @@ def bound_blocks(
 
     Args:
         depth: (rows, cols) metres, NaN where void.
-        bottoms: (blocks, blocks) set, infinite in a void block.
-        crests: (blocks, blocks) set, minus infinity in a void one.
+        bottoms: (blocks, blocks) output, infinite in a void block.
+        crests: (blocks, blocks) output, minus infinity in a void one.
         first: first row of blocks.
         end: the row of blocks after the last one.
     """
@@ -34,7 +34,7 @@ def bound_blocks(
         low[:], high[:] = np.inf, -np.inf
         for row in range(block * FINE_CELLS, min(depth.shape[0], (block + 1) * FINE_CELLS)):
             heights = depth[row]
-            # What is compared with NaN is false: void changes nothing.
+            # Comparisons with NaN are false: void changes nothing.
             for j in range(columns):
                 low[j] = min(low[j], heights[j])
             for j in range(columns):
@@ -56,26 +56,28 @@ def make_occluding(
     first: int,
     end: int,
 ) -> None:
-    """Make of a surface what of it hides other cells: without spikes, and with edges in full.
+    """Compute the surface that hides other cells: without spikes, and with full edges.
 
-    Voids of one cell are closed, then what is higher than all 2 x 2 cells it is in is taken away:
-    a single outlier in front of a wall would cast a long shadow, which nothing real casts. Where
-    an edge lies in its cell is not known, and the cell's own points lie on either side of it or
-    between; so beside a step of more than `edge_m` the lower cell counts as high as the higher.
+    Voids of one cell are closed, then cells higher than all 2 x 2 patches that contain them are
+    lowered: a single outlier in front of a wall would cast a long shadow, which no real object
+    casts. The position of an edge within its cell is unknown, and the cell's own points are on
+    either side of it or between; so next to a step of more than `edge_m` the lower cell counts as
+    high as the higher.
 
     Args:
         depth: (rows, cols) metres, NaN where void.
         step_m: unit of `occluding`.
-        edge_m: what makes an edge.
-        occluding: (rows, cols) set in some rows, `NOTHING` where void.
-        tops: (blocks, blocks) set in some rows of blocks of `FINE_CELLS` to the highest of them in
-            metres, `NOTHING_M` where all is void.
+        edge_m: minimum height of an edge.
+        occluding: (rows, cols) output in some rows, `NOTHING` where void.
+        tops: (blocks, blocks) output in some rows of blocks of `FINE_CELLS`: the highest of them in
+            metres, `NOTHING_M` if all is void.
         first: first row of blocks.
         end: the row of blocks after the last one.
     """
     rows, columns = depth.shape
     first_row, end_row = first * FINE_CELLS, min(rows, end * FINE_CELLS)
-    # Of the rows above, here and below, what the next row needs; with a cell more on both sides.
+    # Of the rows above, here and below, what the next row needs; with an additional cell on both
+    # sides.
     closed = np.empty((2, columns + 2), dtype=np.float32)
     lowest = np.empty((2, columns + 2), dtype=np.float32)
     known = np.empty((2, columns + 2), dtype=np.float32)
@@ -86,7 +88,7 @@ def make_occluding(
     _close(depth, max(begin, 0), known, closed[begin % 2])
     # A row needs those above and below it of `opened`, and a row of that itself and the one above
     # of `lowest`, a row of which needs itself and the next of `closed`. Above the first row and
-    # below the last one the surface goes on as it ends.
+    # below the last one the surface is extended.
     for row in range(begin, end_row + 1):
         now, other = row % 2, (row + 1) % 2
         if row < rows:
@@ -108,7 +110,7 @@ def make_occluding(
 
 @kernel_part
 def _bound(high: NDArray[np.float32], tops: NDArray[np.float32]) -> None:
-    """Set (blocks,) the highest of each block of cells (cols,)."""
+    """Set (blocks,) to the highest of each block of cells (cols,)."""
     for k in range(tops.size):
         top = high[k * FINE_CELLS]
         for j in range(k * FINE_CELLS, min(high.size, (k + 1) * FINE_CELLS)):
@@ -126,13 +128,13 @@ def _widen(
     room: NDArray[np.float32],
     occluding: NDArray[np.int16],
 ) -> None:
-    """Set a row to the highest of 3 x 3 cells where these lie an edge higher.
+    """Set a row to the highest of 3 x 3 cells where these are higher by an edge.
 
     Args:
         above: (cols + 2,) of the row above; the ends are not used.
         here: likewise.
         below: likewise, of the row below.
-        edge_m: what makes a step.
+        edge_m: minimum height of a step.
         step_m: unit of `occluding`.
         room: (2, cols + 2), of which the second row is set.
         occluding: set.
@@ -159,13 +161,13 @@ def _widen(
 def _close(
     depth: NDArray[np.float32], row: int, known: NDArray[np.float32], closed: NDArray[np.float32]
 ) -> None:
-    """Set (cols + 2,) a row in which void cells are as high as the highest of their neighbours.
+    """Set (cols + 2,) to a row in which void cells are as high as the highest of their neighbours.
 
     Args:
         depth: (rows, cols).
         row: which.
-        known: (2, cols + 2) room.
-        closed: set; its ends repeat the first and the last cell.
+        known: (2, cols + 2) working memory.
+        closed: output; its ends repeat the first and the last cell.
     """
     rows, columns = depth.shape
     nothing = np.float32(NOTHING_M)

@@ -24,9 +24,9 @@ from orthoflow_plugins.ortho.views import TileVisibility, WallView
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
-# Lanczos reaches 4 pixels; more is cut off so that a tile's result does not depend on its crop.
+# Lanczos reaches 4 pixels; it is limited so that a tile's result does not depend on its crop.
 _REACH_PX: Final = 5
-# Below this a filter changes nothing that 8 bits could show, or 16.
+# A weaker filter changes less than the resolution of 8 or 16 bits.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
 
@@ -38,7 +38,7 @@ class CellFootprint:
     Attributes:
         pixels_across: photo pixels (u) that one cell covers.
         pixels_down: photo pixels (v) that one cell covers.
-        photo_gsd_m: size of a photo pixel, square to the ray.
+        photo_gsd_m: size of a photo pixel, perpendicular to the ray.
         obliquity_deg: angle between the ray and the wall's normal.
         n_cells: painted cells.
     """
@@ -63,7 +63,7 @@ def footprint_of(view: WallView, visible: TileVisibility) -> CellFootprint:
     lift = view.height_m - depth
     aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
     return CellFootprint(
-        # Not a number beyond the lens model, where a neighbour of a painted cell may lie.
+        # NaN beyond the lens model, where a neighbour of a painted cell may be.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
@@ -85,23 +85,22 @@ def sample(
     is_filtered: bool,
     into: Colours,
 ) -> Colours:
-    """Colours (rows, cols, 3) of a tile's cells; those of cells that are not painted mean nothing.
+    """Return colours (rows, cols, 3) of a tile's cells; those of unpainted cells are undefined.
 
     Args:
         photo: (height, width, 3), 8 or 16 bits.
-        visible: where the cells of the tile and those around it are in the photo; its places are
-            used up.
+        visible: positions in the photo of the cells of the tile and its margin; overwritten.
         inner: rows and columns of `visible` that are the tile's.
-        footprint: how many pixels a cell covers.
-        resampling: `nearest` gives the pixel's own colour and filters nothing.
-        is_filtered: average over what a cell covers where the photo is finer than the wall.
-        into: (rows, cols, 3), as deep, where to write the colours, which are given back.
+        footprint: number of pixels that a cell covers.
+        resampling: `nearest` takes the pixel's own colour without a filter.
+        is_filtered: average over a cell where the photo is finer than the wall.
+        into: (rows, cols, 3), of the same depth, output, which is returned.
     """
     import cv2
 
     if resampling == "nearest":
         crop, corner = _crop(photo, visible, reach=0)
-        # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
+        # Whole positions: the pixel that contains a position, so that OpenCV rounds nothing.
         u, v = (np.floor(places, out=places) for places in (visible.u[inner], visible.v[inner]))
         return _remapped(crop, u, v, corner, resampling, into)
     sigmas = [
@@ -142,7 +141,7 @@ def _remapped(
     resampling: Resampling,
     into: Colours,
 ) -> Colours:
-    """Colours at places counted from a corner; the places are used up."""
+    """Return colours at positions relative to a corner; the positions are overwritten."""
     import cv2
 
     flags = {
@@ -159,7 +158,7 @@ def _remapped(
 def _crop(
     photo: Colours, visible: TileVisibility, *, reach: int
 ) -> tuple[Colours, tuple[np.float32, np.float32]]:
-    """The part of a photo that a tile needs, and its first column and row."""
+    """Return the part of a photo that a tile needs, and its first column and row."""
     u_least, u_most, v_least, v_most = (math.floor(value) for value in visible.summary[:4])
     first_column, first_row = max(0, u_least - reach), max(0, v_least - reach)
     crop = photo[first_row : v_most + reach + 1, first_column : u_most + reach + 1]

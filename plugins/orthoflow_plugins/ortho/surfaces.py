@@ -1,4 +1,4 @@
-"""Walls as photos look at them: what of a surface hides what, and cameras in its axes."""
+"""Walls as photos see them: which parts of a surface hide others, and cameras in its axes."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
 from orthoflow_plugins.ortho.relief_kernels import bound_blocks, make_occluding
 from orthoflow_plugins.ortho.views import BLOCK_CELLS, FINE_CELLS, NOTHING_M, Relief, WallView
 
-# Of walls with more cells lies in files what is looked up while photos are laid.
+# Lookup tables of walls with more cells are kept in files.
 _IN_MEMORY_MOST: Final = 1 << 26
-# Heights fit into 16 bits with room for rounding.
+# Heights fit into 16 bits with a margin for rounding.
 _STEPS: Final = 32_000
-# Cells so much lower than one beside them, in cells, lie at an edge: steeper than 79 degrees.
+# Cells this much lower than a neighbour, in cells, are at an edge: steeper than 79 degrees.
 _EDGE_CELLS: Final = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """A wall as it is looked at.
+    """A wall prepared for visibility tests.
 
     Attributes:
         frame: where the cells lie.
-        relief: their depths, and what they hide.
-        front_m: up to this depth the relief holds all points there are.
+        relief: their depths, and which of them hide others.
+        front_m: up to this depth the relief holds all points.
         tolerance_m: how far a surface must be above a ray to hide it.
     """
 
@@ -49,7 +49,7 @@ class Surface:
 def surfaces_of(
     walls: Walls, params: VisibilityParams, ctx: StepContext, *, hides: bool = True
 ) -> list[Surface]:
-    """Give each wall as the surface that rays meet; with `hides` false its relief hides nothing."""
+    """Each wall as the surface that rays hit; with `hides` false its relief hides nothing."""
 
     def prepared(index: int, wall: Wall) -> Relief:
         if not hides:
@@ -71,7 +71,7 @@ def surfaces_of(
 def _allocated(
     ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
 ) -> NDArray[np.generic]:
-    """What is prepared of a wall, in a file for a large one."""
+    """Prepare a wall, in a file if it is large."""
     if math.prod(shape) <= _IN_MEMORY_MOST:
         return np.empty(shape, dtype=dtype)
     return ctx.allocate("relief", f"{wall}.{name}", shape, dtype)
@@ -80,7 +80,7 @@ def _allocated(
 def view_of(
     camera: ViewingCamera, surface: Surface, params: VisibilityParams, *, is_exact: bool = False
 ) -> WallView:
-    """Return a camera in the axes of a wall; survey coordinates lose nothing on the way.
+    """Return a camera in the axes of a wall, without loss of precision at survey coordinates.
 
     Args:
         camera: of the photo.
@@ -109,17 +109,17 @@ def view_of(
 
 
 def is_before(view: WallView, surface: Surface) -> bool:
-    """Whether a camera stands before any of a wall; from behind it shows nothing."""
+    """Whether a camera is in front of any of a wall; from behind nothing is seen."""
     return view.height_m > float(surface.relief.bottoms.min())
 
 
 def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> Relief:
-    """Prepare a wall for looking at it from anywhere.
+    """Prepare a wall for views from anywhere.
 
     Args:
         wall: its depths.
-        threads: how many threads work.
-        allocate: gives the array of the heights that hide, two bytes per cell; None for memory.
+        threads: number of threads.
+        allocate: returns the array of the heights that hide, two bytes per cell; None for memory.
     """
     relief = transparent_relief_of(wall, threads=threads)
     step_m = max(1e-6, _largest_m(relief) / _STEPS)
@@ -129,7 +129,7 @@ def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> 
     edge_m = _EDGE_CELLS * wall.frame.gsd_m
     task = partial(make_occluding, relief.depth, step_m, edge_m, occluding, fine_tops)
     in_parts(task, fine_tops.shape[0], threads=threads)
-    # Kernels are compiled once, for arrays that cannot be written to.
+    # Kernels are compiled once, for read-only arrays.
     occluding.flags.writeable = False
     tops = _coarse(fine_tops, np.maximum)
     return relief._replace(
@@ -142,7 +142,7 @@ def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> 
 
 
 def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:
-    """Prepare a wall that hides nothing of itself; takes no memory per cell."""
+    """Prepare a wall that hides nothing of itself; it takes no memory per cell."""
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
     depth.flags.writeable = False
     shape = tuple(-(-side // FINE_CELLS) for side in depth.shape)
@@ -166,20 +166,20 @@ def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:
 
 
 def _largest_m(relief: Relief) -> float:
-    """How far the surface is from its plane at most; 0 without any."""
+    """Return the maximum distance of the surface from its plane; 0 without a surface."""
     bounds = np.concatenate([relief.bottoms.ravel(), relief.crests.ravel()])
     return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
 
 
 def _coarse(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
-    """The extreme of each large block, from those of the small ones in it."""
+    """Return the extreme of each large block, from its small ones."""
     for _ in range(2):
         fine = _reduced_rows(fine, reduce).T
     return np.ascontiguousarray(fine)
 
 
 def _reduced_rows(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
-    """The extreme of as many rows each as lie in a large block; the last may be fewer."""
+    """Return the extreme of the rows in each large block; the last may have fewer."""
     per_block = BLOCK_CELLS // FINE_CELLS
     coarse = fine[::per_block].copy()
     for k in range(1, per_block):
@@ -189,7 +189,7 @@ def _reduced_rows(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.flo
 
 
 def _highest_of_four(tops: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The highest in each window of 2 x 2 blocks, from those that begin before the first one on."""
+    """Return the highest in each window of 2 x 2 blocks, beginning before the first block."""
     padded = np.pad(tops, 1, constant_values=NOTHING_M)
     pairs = np.maximum(padded[:-1], padded[1:])
     return np.maximum(pairs[:, :-1], pairs[:, 1:])

@@ -1,4 +1,4 @@
-"""A wall before a photo's camera, and what the photo sees of it, as kernels take them: tuples."""
+"""A wall in front of a photo's camera, and what the photo sees of it, as tuples for kernels."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Side of the square blocks of cells that share one bound on how high rays have to be followed.
+# Side of the square blocks of cells that share one bound on the height up to which rays are
+# followed.
 BLOCK_CELLS: Final = 32
-# Side of the small blocks that are asked where a large one is not free; a part of a large one.
+# Side of the small blocks that are tested if a large one is not free; a part of a large one.
 FINE_CELLS: Final = 8
-# Void cells in `Relief.occluding`: they hide nothing, nor do mixtures with them.
+# Void cells in `Relief.occluding`: they hide nothing, nor do interpolations with them.
 NOTHING: Final = np.int16(-32768)
 NOTHING_M: Final = -1.0e6
 
@@ -23,7 +24,7 @@ NO_SURFACE: Final = 3
 
 
 class WallView(NamedTuple):
-    """A photo's camera before a wall, in the wall's axes.
+    """A photo's camera in front of a wall, in the wall's axes.
 
     Attributes:
         camera: (25,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
@@ -32,11 +33,11 @@ class WallView(NamedTuple):
             the first cell. row likewise.
         height_m: projection centre above the plane.
         gsd_m: side of a cell.
-        front_m: up to this depth the raster itself tells what hides what; only points before it
-            are looked up in the depth buffer.
+        front_m: up to this depth the raster itself decides what is hidden; only points in front of
+            it are in the depth buffer.
         tolerance_m: how far a surface must be above a ray to hide it.
         cosine_least: cells seen at a smaller cosine of incidence count as hidden.
-        border_px: quality falls to 0 over this distance from the image border.
+        border_px: quality decreases to 0 over this distance from the image border.
         is_exact: project every cell by itself.
     """
 
@@ -53,13 +54,13 @@ class WallView(NamedTuple):
 
 
 class Relief(NamedTuple):
-    """The surface of a wall, and what of it hides other cells.
+    """The surface of a wall, and which parts of it hide other cells.
 
     Attributes:
         depth: (rows, cols) float32 metres, NaN where void.
         occluding: (rows * cols,) int16 the same without spikes, in steps of `step_m`, `NOTHING`
-            where void; half the memory of float32, and far finer than what counts as hidden.
-            Empty where the surface hides nothing.
+            where void; half the memory of float32, and far finer than the tolerance. Empty if the
+            surface hides nothing.
         step_m: of `occluding`.
         tops: (blocks + 1, blocks + 1) float32, the highest `occluding` in the window of 2 x 2
             blocks that begins one row and one column before, metres.
@@ -68,7 +69,7 @@ class Relief(NamedTuple):
             one.
         fine_tops: (fine blocks + 1, fine blocks + 1) as `tops`, for blocks of `FINE_CELLS`.
         fine_bottoms: (fine blocks, fine blocks) as `bottoms`, for blocks of `FINE_CELLS`.
-        highest_m: the highest `occluding` of all; `NOTHING_M` and no ray is followed.
+        highest_m: the highest `occluding` of all; with `NOTHING_M` no ray is followed.
     """
 
     depth: NDArray[np.float32]
@@ -86,14 +87,14 @@ class TileVisibility(NamedTuple):
     """What a photo sees of a tile of cells, filled by `look_at_cells`.
 
     Attributes:
-        u: (rows, cols) float32 photo pixels, first centre at 0.5, a number everywhere, but a place
+        u: (rows, cols) float32 photo pixels, first centre at 0.5, finite everywhere, but a position
             only where painted. v likewise.
         mask: (rows, cols) uint8 states.
-        quality: (rows, cols) float32 photo pixels per cell times the falling off at the border;
-            it counts only where painted.
+        quality: (rows, cols) float32 photo pixels per cell times the decrease at the border;
+            defined only where painted.
         summary: (8,) float64 over painted cells: bounds of u and of v (smallest, largest each),
-            their number, sums of columns, rows and depths (where a whole block is seen, those of
-            its middle).
+            their number, sums of columns, rows and depths (if a whole block is seen, those of its
+            middle).
     """
 
     u: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Compiled passes that tell which cells of a wall a photo sees, and where in the photo they are."""
+"""Compiled passes that determine which cells of a wall a photo sees, and their photo positions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from orthoflow_plugins.ortho.views import (
     WallView,
 )
 
-# Two depths that stand for a level block lie so far apart.
+# Distance of the two depths that represent a level block.
 _LEAST_SPAN_M: Final = 1e-3
 
 
@@ -58,19 +58,19 @@ class RowVisibility(NamedTuple):
 def project_row(
     view: WallView, relief: Relief, row: int, first_column: int, lanes: NDArray[np.float64]
 ) -> None:
-    """Project some cells of a row; nothing here branches, so several go at once.
+    """Project some cells of a row without branches, so that several are processed at once.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         relief: the wall.
         row: of the cells.
         first_column: of the first cell.
-        lanes: (5, n) filled with u (-1 where the camera cannot see), v, depth along the axis where
-            the ray leaves the slab that the raster describes, cosine of incidence, and photo
-            pixels per cell.
+        lanes: (5, n) output: u (-1 where the camera cannot see), v, depth along the axis where the
+            ray leaves the slab that the raster describes, cosine of incidence, and photo pixels per
+            cell.
     """
-    # The formula of `camera_kernels.project_point`, which branches: without branches, and with the
-    # camera in variables of its own, it takes a third of the time. A test holds the two together.
+    # The formula of `camera_kernels.project_point`, which has branches: without branches, and with
+    # the camera in local variables, it takes a third of the time. A test compares the two.
     camera, gsd_m = view.camera, view.gsd_m
     xu, xv, xn, tx = camera[0], camera[1], camera[2], camera[9]
     yu, yv, yn, ty = camera[3], camera[4], camera[5], camera[10]
@@ -111,16 +111,16 @@ def look_at_cells(
     first_row: int,
     first_column: int,
 ) -> None:
-    """Project the cells of a tile into a photo and tell which of them it sees.
+    """Project the cells of a tile into a photo and determine which of them it sees.
 
-    Blocks that the photo sees as a whole go fast; in the others every cell is asked and projected
+    Blocks that the photo sees entirely are fast; in the others every cell is tested and projected
     by itself.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         relief: the whole wall.
-        buffer: what else stands before the camera.
-        visible: filled; its shape is the tile's.
+        buffer: depth buffer of other objects.
+        visible: output; its shape is the tile's.
         first_row: row of the wall where the tile begins.
         first_column: column likewise.
     """
@@ -159,22 +159,23 @@ def look_at_blocks(
     tile: tuple[int, int, int, int],
     blocks: tuple[int, int, int],
 ) -> bool:
-    """Fill in blocks beside each other, if the photo surely sees all of them, or none.
+    """Fill adjacent blocks if the photo certainly sees all of them, or none.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         relief: the wall.
-        buffer: what else stands before the camera.
-        visible: of the tile, filled in part.
-        room: of `room_for_blocks`.
+        buffer: depth buffer of other objects.
+        visible: of the tile, partly filled.
+        room: from `room_for_blocks`.
         tile: its first row and column, and the row and column after its last ones.
         blocks: row of the blocks, column of the first one, and the column after the last one.
 
     Returns:
-        Whether they are filled in.
+        Whether they were filled.
     """
     block_row, first, end = blocks
-    # Whole blocks count, whatever part of them is in the tile: tiles must not show.
+    # Whole blocks are tested, whatever part of them is in the tile: results must not depend on
+    # tiles.
     rows = (block_row * BLOCK_CELLS, min(relief.depth.shape[0], (block_row + 1) * BLOCK_CELLS) - 1)
     columns = (first * BLOCK_CELLS, min(relief.depth.shape[1], end * BLOCK_CELLS) - 1)
     bottom, crest = math.inf, -math.inf
@@ -215,7 +216,7 @@ def look_at_blocks(
 def _place_in_tile(
     tile: tuple[int, int, int, int], rows: tuple[int, int], columns: tuple[int, int]
 ) -> tuple[int, int, int, int, int, int]:
-    """Give the `place` of `look_at_unoccluded_block` for blocks with such first and last cells."""
+    """The `place` of `look_at_unoccluded_block` for blocks with these first and last cells."""
     begin, finish = max(tile[0], rows[0]), min(tile[2], rows[1] + 1)
     start, end = max(tile[1], columns[0]), min(tile[3], columns[1] + 1)
     return (begin, start, finish - begin, end - start, begin - tile[0], start - tile[1])
@@ -232,7 +233,7 @@ def _highest(view: WallView, relief: Relief, block: tuple[int, int]) -> float:
 def _cells_in_tile(
     tile: tuple[int, int, int, int], block: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """Give the first row and column of a block's cells in a tile, and those after the last ones."""
+    """First row and column of a block's cells in a tile, and those after the last ones."""
     begin, start = block[0] * BLOCK_CELLS, block[1] * BLOCK_CELLS
     return (
         max(tile[0], begin),
@@ -252,7 +253,7 @@ def _ask_each_cell(
     tile: tuple[int, int, int, int],
     block: tuple[int, int],
 ) -> None:
-    """Project the cells of a block one by one, and ask for each whether the photo sees it."""
+    """Project the cells of a block one by one, and test for each whether the photo sees it."""
     top = _highest(view, relief, block)
     begin, start, finish, end = _cells_in_tile(tile, block)
     for row in range(begin, finish):
@@ -282,12 +283,12 @@ def look_at_row(
     into: RowVisibility,
     summary: NDArray[np.float64],
 ) -> None:
-    """Ask for each cell of a row whether the photo sees it.
+    """Test for each cell of a row whether the photo sees it.
 
     Args:
-        view: the camera before the wall.
+        view: the camera in front of the wall.
         relief: the wall.
-        buffer: what else stands before the camera.
+        buffer: depth buffer of other objects.
         place: row of the cells, column of the first one, and the height up to which rays have to
             be followed.
         room: its lanes are those of `project_row`.
@@ -298,7 +299,7 @@ def look_at_row(
     row, first_column, top = place
     width, image_height = view.camera[21], view.camera[22]
     per_pixel, per_border = 1.0 / buffer.reduction, 1.0 / view.border_px
-    # What stands in a tuple is taken out once: each time costs as much as a projection.
+    # Values in a tuple are read once: each access costs as much as a projection.
     depths, nearest, lanes, rays = relief.depth[row], buffer.nearest, room.lanes, room.rays
     cosine_least, tolerance_m = view.cosine_least, view.tolerance_m
     n_low = 0

@@ -364,8 +364,8 @@ def _log_cuts(
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - margin_m
             if cut_m > frame.gsd_m:
-                tell = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
-                tell(
+                notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
+                notify(
                     f"{planes.names[index]}: what adjoins it at its {side} runs askew, and its "
                     f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
                     "plane are left out there, more of what stands out of it; margin_m adds them"

@@ -76,7 +76,7 @@ class Net:
         )
 
 
-def lay_net(
+def interpolate_net(
     cloud: PointCloud, slab: Slab, vertices: Vertices, allocate: Allocate = in_memory
 ) -> Net:
     """Interpolate values at all cell centres linearly in the triangles.
@@ -93,7 +93,7 @@ def lay_net(
         MethodError: the points form no triangle.
     """
     shape, n_cells = slab.frame.shape, slab.n_cells
-    n_vertices, n_told = n_vertices_of(vertices), 0
+    n_vertices, n_set = n_vertices_of(vertices), 0
     intensity = rgb = None
     if cloud.intensity is not None:
         intensity = np.asarray(allocate("net_intensity", (n_cells,), np.float32), np.float32)
@@ -106,11 +106,11 @@ def lay_net(
     )
     surface = _Surface(cloud=cloud, slab=slab, vertices=vertices, net=net)
     if n_vertices <= VERTICES_MOST:
-        n_told = surface.lay(_Window(0, 0, *shape))
+        n_set = surface.interpolate(_Window(0, 0, *shape))
     else:
         for tile in _tiles(shape):
-            n_told += surface.lay_tile(tile)
-    if not n_told:
+            n_set += surface.interpolate_tile(tile)
+    if not n_set:
         raise MethodError(
             "surface tin needs points that span triangles about the cells of each wall, and the "
             f"{n_vertices} cells with points of this one do not: take another surface"
@@ -162,30 +162,30 @@ class _Surface:
     vertices: Vertices
     net: Net
 
-    def lay(self, window: _Window) -> int:
+    def interpolate(self, window: _Window) -> int:
         """Triangulate a whole wall; return the number of cells with a triangle."""
         triangles = self._triangles(window)
         return sum(
             self._set(rows, columns, triangles, np.inf).size for rows, columns in _cells_of(window)
         )
 
-    def lay_tile(self, tile: _Window) -> int:
+    def interpolate_tile(self, tile: _Window) -> int:
         """Triangulate one tile of a large wall; return the number of cells with a triangle."""
-        shape, n_told = self.slab.frame.shape, 0
+        shape, n_set = self.slab.frame.shape, 0
         near = self._triangles(tile.widened(_SPAN_CELLS, shape))
         wide = []
         for rows, columns in _cells_of(tile):
-            told = self._set(rows, columns, near, _SPAN_CELLS)
-            is_told = np.zeros(rows.size, dtype=np.bool_)
-            is_told[told] = True
-            wide.append(np.stack([rows[~is_told], columns[~is_told]]))
-            n_told += told.size
+            found_here = self._set(rows, columns, near, _SPAN_CELLS)
+            is_set = np.zeros(rows.size, dtype=np.bool_)
+            is_set[found_here] = True
+            wide.append(np.stack([rows[~is_set], columns[~is_set]]))
+            n_set += found_here.size
         rows, columns = np.concatenate(wide, axis=1)
         if rows.size:
             around = tile.widened(SPAN_MOST_CELLS, shape)
             far = self._triangles(around, rim_only=True)
-            n_told += self._set(rows, columns, far, SPAN_MOST_CELLS).size
-        return n_told
+            n_set += self._set(rows, columns, far, SPAN_MOST_CELLS).size
+        return n_set
 
     def _triangles(self, window: _Window, *, rim_only: bool = False) -> _Triangles | None:
         """Return the triangulation of the points of a window; None if there are too few.
@@ -241,7 +241,7 @@ class _Surface:
         n_channels = 1 + (self.net.intensity is not None) + 3 * (self.net.rgb is not None)
         found = np.full((rows.size, n_channels), np.nan, dtype=np.float32)
         if triangles is not None:
-            triangles.tell(rows, columns, span_cells, found)
+            triangles.interpolate(rows, columns, span_cells, found)
         cells = rows * self.slab.frame.width + columns
         self.net.depth_m[cells] = found[:, 0]
         if self.net.intensity is not None:
@@ -278,7 +278,7 @@ class _Triangles:
     values: NDArray[np.float64]
     others: cKDTree | None
 
-    def tell(
+    def interpolate(
         self,
         rows: NDArray[np.int64],
         columns: NDArray[np.int64],

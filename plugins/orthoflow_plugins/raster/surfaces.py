@@ -26,7 +26,7 @@ from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud
 from orthoflow_plugins.raster import surface_kernels as kernels
 from orthoflow_plugins.raster.depth_filters import denoised, without_specks
-from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, lay_net
+from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, interpolate_net
 from orthoflow_plugins.raster.rules import SurfaceRule
 
 # Temporary arrays are limited to this many cells.
@@ -139,7 +139,7 @@ def _surface_of_winners(
     )
     if rule.surface != "tin":
         return surface
-    return _spanned(surface, net or lay_net(cloud, slab, _vertices(winners, slab)))
+    return _spanned(surface, net or interpolate_net(cloud, slab, _vertices(winners, slab)))
 
 
 def _contest(

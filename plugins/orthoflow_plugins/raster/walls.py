@@ -160,7 +160,7 @@ def _rastered_in_bands(
 
 def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate) -> Net:
     """Triangulate a large wall: its vertices are found band by band, and are kept in files."""
-    from orthoflow_plugins.raster.nets import Vertices, lay_net
+    from orthoflow_plugins.raster.nets import Vertices, interpolate_net
     from orthoflow_plugins.raster.surfaces import vertices_of
 
     shape = slab.frame.shape
@@ -172,7 +172,7 @@ def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: All
         found = vertices_of(cloud, slab.over(band.rows), rule.surface)
         vertices.point[band.rows] = found.point
         vertices.depth_m[band.rows] = found.depth_m
-    return lay_net(cloud, slab, vertices, allocate)
+    return interpolate_net(cloud, slab, vertices, allocate)
 
 
 def _in_files(raster: _Raster, allocate: Allocate) -> _Raster:

@@ -13,7 +13,7 @@ from orthoflow_plugins.mosaic import joining as module
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
     Choice,
-    SeamWish,
+    SeamOptions,
     best_views,
     preferences,
     without_islands,
@@ -89,7 +89,7 @@ def test_ranks_become_states_of_the_orthoimage() -> None:
     mask, source = module.joined(
         LAYERS[:3],
         LAYERS[3:],
-        SeamWish(rule="best-view"),
+        SeamOptions(rule="best-view"),
         wall=None,
         balance=None,
         allocate=in_memory,
@@ -102,10 +102,10 @@ def test_ranks_become_states_of_the_orthoimage() -> None:
 
 @pytest.mark.parametrize("rule", ["best-view", "voronoi", "priority"])
 def test_preferences_are_the_same_row_by_row(rule: str) -> None:
-    wish = SeamWish(rule=rule, priority=("3.jpg", "1.jpg"))  # type: ignore[arg-type]
+    options = SeamOptions(rule=rule, priority=("3.jpg", "1.jpg"))  # type: ignore[arg-type]
     whole = slice(0, SHAPE[0])
-    every = [preference(whole) for preference in preferences(LAYERS, wish)]
-    for preference, values in zip(preferences(LAYERS, wish), every, strict=True):
+    every = [preference(whole) for preference in preferences(LAYERS, options)]
+    for preference, values in zip(preferences(LAYERS, options), every, strict=True):
         np.testing.assert_array_equal(preference(slice(5, 9)), values[5:9])
     for one, values in zip(LAYERS, every, strict=True):
         if rule == "best-view":
@@ -120,10 +120,10 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
 
 
 def test_photos_in_the_given_order_go_before_all_qualities() -> None:
-    wish = SeamWish(rule="priority", priority=("3.jpg", "1.jpg"))
+    options = SeamOptions(rule="priority", priority=("3.jpg", "1.jpg"))
     found = {
         one.source: preference(slice(0, SHAPE[0]))
-        for one, preference in zip(LAYERS, preferences(LAYERS, wish), strict=True)
+        for one, preference in zip(LAYERS, preferences(LAYERS, options), strict=True)
     }
     assert found["3.jpg"].min() > found["1.jpg"].max()
     assert found["1.jpg"].min() > max(found["2.jpg"].max(), found["4.jpg"].max())
@@ -213,11 +213,11 @@ def test_bands_decide_islands_as_the_whole_does(
     monkeypatch: pytest.MonkeyPatch, cells_min: int
 ) -> None:
     layers = [layer(30 + k, painted=0.8, has_filled=False) for k in range(3)]
-    wish = SeamWish(rule="best-view", island_cells_min=cells_min)
+    options = SeamOptions(rule="best-view", island_cells_min=cells_min)
     given = {"wall": None, "balance": None, "allocate": in_memory}
-    mask, source = module.joined(layers, [], wish, **given)  # type: ignore[arg-type]
+    mask, source = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
     monkeypatch.setattr(module, "_BAND_CELLS", SHAPE[1])
-    banded = module.joined(layers, [], wish, **given)  # type: ignore[arg-type]
+    banded = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
     np.testing.assert_array_equal(banded[0], mask)
     np.testing.assert_array_equal(banded[1], source)
     if cells_min == 1:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import nets
-from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, lay_net
+from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, interpolate_net
 from scipy.spatial import Delaunay
 
 from orthoflow.errors import MethodError
@@ -55,7 +55,7 @@ def wall() -> tuple[PointCloud, Slab, Vertices]:
 
 @pytest.fixture(scope="module")
 def whole(wall: tuple[PointCloud, Slab, Vertices]) -> Net:
-    return lay_net(*wall)
+    return interpolate_net(*wall)
 
 
 def in_tiles(wall: tuple[PointCloud, Slab, Vertices], tile_cells: int) -> Net:
@@ -64,7 +64,7 @@ def in_tiles(wall: tuple[PointCloud, Slab, Vertices], tile_cells: int) -> Net:
         patch.setattr(nets, "_TILE_CELLS", tile_cells)
         patch.setattr(nets, "_SPAN_CELLS", 40)
         patch.setattr(nets, "SPAN_MOST_CELLS", SPAN_MOST)
-        return lay_net(*wall)
+        return interpolate_net(*wall)
 
 
 @pytest.fixture(scope="module")
@@ -132,4 +132,4 @@ def test_a_large_wall_whose_points_lie_on_a_line_has_no_net(
     vertices = Vertices(point=point, depth_m=np.zeros((40, 60), dtype=np.float32))
     slab = slab_of(known)
     with pytest.raises(MethodError, match="points that span triangles"):
-        lay_net(cloud, slab, vertices)
+        interpolate_net(cloud, slab, vertices)
