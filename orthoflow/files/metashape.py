@@ -89,20 +89,22 @@ def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
         for component in chunk.findall("components/component")
     }
     whole = _Similarity(chunk.find("transform"), path)
-    site = _site(chunk.findtext("reference", ""), path)
+    # Of a chunk that nothing places, the system is only the one that new chunks have.
+    is_placed = any(world.is_placed for world in (whole, *worlds.values()))
+    site = _site(chunk.findtext("reference", ""), path) if is_placed else None
     elements = [*chunk.findall("cameras/camera"), *chunk.findall("cameras/group/camera")]
     masters = {element.get("id", ""): element for element in elements}
-    is_off = chunk.get("enabled", "true") in _OFF
+    is_off = chunk.get("enabled", "true").lower() in _OFF
     for element in elements:
         world = worlds.get(element.get("component_id", ""), whole)
-        if is_off or element.get("enabled", "true") in _OFF:
+        if is_off or element.get("enabled", "true").lower() in _OFF:
             what = "chunk" if is_off else "camera"
             name = photo_path(element.get("label", ""))
             yield GivenCamera(name=name, reason=f"its {what} is disabled in Metashape")
             continue
         sensor = sensors.get(element.get("sensor_id", ""))
         given = _camera(element, masters, sensor, world, path)
-        if site is not None and given.rotation is not None:
+        if site is not None and world.is_placed and given.rotation is not None:
             given = site(given)
         is_panorama = sensor is not None and sensor.is_panorama
         yield from given.panorama_faces() if is_panorama else [given]
@@ -172,6 +174,9 @@ class _Similarity:
 
     def __init__(self, transform: ET.Element | None, path: Path) -> None:
         self.rotation, self.shift, self.scale = np.eye(3), np.zeros(3), 1.0
+        self.is_placed = transform is not None and bool(
+            transform.findtext("translation", "").strip()
+        )
         if transform is None:
             return
         rotation, shift, scale = (
@@ -211,10 +216,8 @@ class _Sensor:
         if location:
             whose = f"sensor {self.label}"
             self.location = np.array(_some(location, 3, path, "location", whose))
-        self.has_rolling_shutter = element.findtext("rolling_shutter", "0").strip() not in (
-            *("", "0"),
-            *_OFF,
-        )
+        shutter = element.findtext("rolling_shutter", "").strip().lower()
+        self.has_rolling_shutter = shutter not in ("", "none", "disabled", *_OFF)
 
     def _lens(self, element: ET.Element, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
         kind = element.get("type", "frame")

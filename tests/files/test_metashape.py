@@ -301,6 +301,10 @@ def test_a_rolling_shutter_is_named_with_its_size(tmp_path: Path) -> None:
     (given,) = read(tmp_path, document(cameras=camera))
     assert given.rotation is not None
     assert re.search(r"rolling shutter.* by up to 2\.5 pixels", given.note)
+    for model, is_named in (("disabled", False), ("regularized", True), ("full", True)):
+        sensor = SENSOR.replace("</sensor>", f"<rolling_shutter>{model}</rolling_shutter></sensor>")
+        (given,) = read(tmp_path, document(sensors=sensor, cameras=posed("a.jpg")))
+        assert ("has a rolling shutter" in given.note) is is_named
 
 
 UTM = (
@@ -351,14 +355,23 @@ def test_a_georeferenced_chunk_leads_into_its_coordinate_system(tmp_path: Path) 
 def test_coordinate_systems_that_no_scan_is_in_are_refused(
     tmp_path: Path, wkt: str, message: str
 ) -> None:
-    text = document(cameras=posed("a.jpg"))
+    placed = "<transform><translation>4147216.5 614626.7 4790649.3</translation></transform>"
+    text = document(cameras=posed("a.jpg"), chunk=placed)
     text = text.replace("</chunk>", f"<reference>{escape(wkt)}</reference></chunk>")
     with pytest.raises(InputError, match=message):
         read(tmp_path, text)
 
 
-def test_a_local_coordinate_system_is_taken_as_it_is(tmp_path: Path) -> None:
-    wkt = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
+@pytest.mark.parametrize(
+    "wkt",
+    [
+        'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]',
+        # That of a new chunk, which nothing placed in it.
+        pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL"),
+    ],
+    ids=["local", "not-placed"],
+)
+def test_coordinates_of_a_chunk_alone_are_taken_as_they_are(tmp_path: Path, wkt: str) -> None:
     text = document(cameras=posed("nadir/102MEDIA/0003.jpg"))
     text = text.replace("</chunk>", f"<reference>{escape(wkt)}</reference></chunk>")
     (given,) = read(tmp_path, text)

@@ -142,7 +142,7 @@ def _ply_files(folder: Path) -> None:
     scan_files.write_ply(
         folder / "faces_first.ply",
         _fields(),
-        before="element face 2\nproperty list uchar int vertex_indices",
+        before="element strip 2\nproperty list uchar int vertex_indices",
         before_data=b"\x01\0\0\0\0\x02\0\0\0\0\0\0\0\0",
     )
 

@@ -300,7 +300,7 @@ KNOWN: Final = {
             *_XYZ,
             data=b"\xff" * 12,
         ),
-        words="element face has a list of -1 entries",
+        words="its data holds 12 bytes, its header states 4000000003 values",
     ),
     "PLY with a property of brackets": Known(
         target="PLY",
