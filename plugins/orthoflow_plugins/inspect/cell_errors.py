@@ -11,20 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
 from orthoflow.geometry.levels import REC_601, eight_bits
-from orthoflow.geometry.robust import NMAD_FACTOR
+from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
 from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.image_quality import n_shown as n_shown_of
 from orthoflow_plugins.inspect.image_quality import shown
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
-from orthoflow_plugins.inspect.spreads import Spread
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
@@ -36,6 +34,9 @@ _STEP_BAND_CELLS: Final = 2
 _GROSS_GREY: Final = 40.0
 # Whole patches of 32 cells, and blocks large enough that little is lost at their border.
 BLOCK_CELLS: Final = 96
+# Errors kept of all walls together, 32 bytes each: the standard error of a median of so many is a
+# two-thousandth of their spread.
+_KEPT_ERRORS: Final = 1 << 23
 # Multiples of these, modulo 1, fill a square most evenly (Roberts 2018, the R2 sequence).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
 _NAMES_BESIDE_TRACED: Final = {
@@ -69,10 +70,12 @@ class SamplingRule:
     Attributes:
         colour_share: share of blocks whose colours are compared.
         lattice_step: visibility is tested in every row and column of this step.
+        error_step: errors of depths and of traced cells are kept in steps of this.
     """
 
     colour_share: float
     lattice_step: int
+    error_step: int
 
 
 def sampling_rule(
@@ -84,6 +87,7 @@ def sampling_rule(
     return SamplingRule(
         colour_share=min(1.0, colour_cells_most / max(1, n_shown)),
         lattice_step=max(1, math.ceil(math.sqrt(n_cells / seen_cells_most))),
+        error_step=max(1, n_cells // _KEPT_ERRORS),
     )
 
 
@@ -178,6 +182,7 @@ def wall_errors(
     true: TrueOrthoimage,
     chosen: Sampling,
     inner: slice = slice(None),
+    error_step: int = 1,
 ) -> WallErrors:
     """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
 
@@ -188,7 +193,8 @@ def wall_errors(
         wall: the wall.
         true: the truth.
         chosen: cells whose colour is compared, and those whose visibility is tested.
-        inner: rows to report; the others surround them. A multiple of patches.
+        inner: rows that are compared; the others surround them. A multiple of patches.
+        error_step: depth errors are kept in steps of this.
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
@@ -209,9 +215,9 @@ def wall_errors(
     measured = np.isfinite(depth)
     compares = np.isfinite(square)
     samples = WallSamples(
-        depth_m=depth[measured & ~steps],
-        sigma_m=sigma_m[measured & ~steps].astype(np.float64),
-        step_depth_m=depth[measured & steps],
+        depth_m=depth[measured & ~steps][::error_step],
+        sigma_m=sigma_m[measured & ~steps][::error_step].astype(np.float64),
+        step_depth_m=depth[measured & steps][::error_step],
         colour=square[compares & painted & ~steps],
         filled_colour=square[compares & filled & ~steps],
         step_colour=square[compares & painted & steps],
@@ -227,32 +233,6 @@ def wall_errors(
         n_ghost=_count(gross & behind),
     )
     return WallErrors(samples=samples, patches=patches, depth_m=depth, grey=np.sqrt(square))
-
-
-def pooled(samples: Sequence[WallSamples], allocate: Allocate = in_memory) -> WallSamples:
-    """Combine the errors of several walls, or of parts of one.
-
-    Args:
-        samples: the errors of each.
-        allocate: returns arrays for the errors of large walls, by name.
-    """
-
-    def joined(name: str) -> NDArray[np.float64]:
-        parts = [np.asarray(getattr(item, name)) for item in samples]
-        total = sum(len(part) for part in parts)
-        if total <= IN_MEMORY_CELLS:
-            return np.concatenate(parts)
-        shape = (total, *parts[0].shape[1:])
-        whole = np.asarray(allocate(name, shape, np.float64), np.float64)
-        return np.concatenate(parts, out=whole)
-
-    def added(name: str) -> int:
-        return sum(int(getattr(item, name)) for item in samples)
-
-    whole: dict[str, Any] = {}
-    for name, value in vars(samples[0]).items():
-        whole[name] = added(name) if isinstance(value, int) else joined(name)
-    return WallSamples(**whole)
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -347,24 +327,19 @@ def _count(mask: NDArray[np.bool_]) -> int:
 def _depth_numbers(samples: WallSamples) -> list[_Number]:
     if samples.depth_m.size == 0:
         return []
-    errors = Spread(samples.depth_m, 1e3)
-    middle = errors.median()
+    errors_mm = 1e3 * samples.depth_m
+    middle = float(np.median(errors_mm))
     numbers = [
         ("depth_median_mm", middle, "mm"),
-        ("depth_nmad_mm", errors.median_deviation(middle), "mm"),
-        ("depth_rmse_mm", errors.rms(), "mm"),
+        ("depth_nmad_mm", median_deviation(errors_mm, middle), "mm"),
+        ("depth_rmse_mm", rms(errors_mm), "mm"),
     ]
-    n_stated = n_inside = 0
-    for first in range(0, len(samples.depth_m), IN_MEMORY_CELLS):
-        part = slice(first, first + IN_MEMORY_CELLS)
-        depth_m, sigma_m = samples.depth_m[part], samples.sigma_m[part]
-        stated = sigma_m > 0.0
-        n_stated += _count(stated)
-        n_inside += _count(np.abs(depth_m[stated]) <= 3.0 * sigma_m[stated])
-    if n_stated:
-        numbers.append(("depth_within_3sigma", n_inside / n_stated, "1"))
+    stated = samples.sigma_m > 0.0
+    if stated.any():
+        is_inside = np.abs(samples.depth_m[stated]) <= 3.0 * samples.sigma_m[stated]
+        numbers.append(("depth_within_3sigma", float(is_inside.mean()), "1"))
     if samples.step_depth_m.size:
-        numbers.append(("depth_step_rmse_mm", 1e3 * Spread(samples.step_depth_m).rms(), "mm"))
+        numbers.append(("depth_step_rmse_mm", 1e3 * rms(samples.step_depth_m), "mm"))
     return numbers
 
 
@@ -375,9 +350,7 @@ def _colour_numbers(samples: WallSamples) -> list[_Number]:
         ("step_colour_rmse_grey", samples.step_colour),
     )
     return [
-        (name, float(np.sqrt(Spread(squares).mean())), "grey")
-        for name, squares in named
-        if squares.size
+        (name, float(np.sqrt(squares.mean())), "grey") for name, squares in named if squares.size
     ]
 
 

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Finding
 from orthoflow.sdk import MetricSpec, StepContext
+
+_Samples = TypeVar("_Samples")
 
 _AXES: Final = ("x", "y")
 # Maximum share of the points that may be outliers.
@@ -246,6 +248,15 @@ def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[Metri
         )
         for spec in specs
     )
+
+
+def pooled(samples: Sequence[_Samples]) -> _Samples:
+    """Put samples of several walls, or of parts of one, together: arrays joined, counts added."""
+    together: dict[str, Any] = {}
+    for name, value in vars(samples[0]).items():
+        parts = [getattr(item, name) for item in samples]
+        together[name] = sum(parts) if isinstance(value, int) else np.concatenate(parts)
+    return type(samples[0])(**together)
 
 
 def rms(values: ArrayLike) -> float:

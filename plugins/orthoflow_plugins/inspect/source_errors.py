@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -10,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
+from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
+from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
-from orthoflow_plugins.inspect.spreads import Spread, in_file
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
@@ -50,15 +49,62 @@ class SourceErrors:
     n_seen_painted: int
     expected_m: NDArray[np.float32] | None = None
 
-    def kept(self, name: str, allocate: Allocate) -> SourceErrors:
-        """Return the same with its arrays in files."""
-        return replace(
-            self,
-            displacement_m=in_file(self.displacement_m, f"{name}.displacement_m", allocate),
-            traced=in_file(self.traced, f"{name}.traced", allocate),
-            steps=in_file(self.steps, f"{name}.steps", allocate),
-            ghosts=in_file(self.ghosts, f"{name}.ghosts", allocate),
+    def samples(self, error_step: int = 1) -> SourceSamples:
+        """Return the errors as numbers.
+
+        Args:
+            error_step: displacements are kept in steps of this.
+        """
+        known = self.traced & np.isfinite(self.displacement_m).all(axis=2)
+        counted = known & ~self.ghosts
+        length_m = np.linalg.norm(self.displacement_m, axis=2)
+        is_far = self.traced & ~(length_m <= _FAR_CELLS * self.frame.gsd_m)
+        sigmas = np.empty(0)
+        if self.expected_m is not None:
+            stated = counted & ~self.steps & np.isfinite(self.expected_m)
+            sigmas = np.abs(self.displacement_m[stated]) / self.expected_m[stated][:, None]
+        return SourceSamples(
+            away_m=self.displacement_m[counted & ~self.steps][::error_step],
+            step_m=self.displacement_m[counted & self.steps][::error_step],
+            n_traced=_count(self.traced),
+            n_far=_count(is_far),
+            n_ghosts=_count(self.ghosts),
+            n_stated=sigmas.size,
+            n_within_1_sigma=_count(sigmas <= 1.0),
+            n_within_2_sigma=_count(sigmas <= 2.0),
+            n_seen_by_both=self.n_seen_by_both,
+            n_seen_painted=self.n_seen_painted,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceSamples:
+    """Errors of traced cells as numbers, of a wall or of several put together.
+
+    Attributes:
+        away_m: (n, 2) displacements along u and v of cells that show no free-standing object, away
+            from true depth steps.
+        step_m: (m, 2) the same within 2 cells of a true depth step.
+        n_traced: cells that an oriented photo painted.
+        n_far: those whose colour is of a place more than 3 cells away, or of nothing.
+        n_ghosts: those whose pixel looks at a free-standing object.
+        n_stated: coordinates away from steps whose error the orthoimage states.
+        n_within_1_sigma: those whose error is at most that.
+        n_within_2_sigma: those whose error is at most twice that.
+        n_seen_by_both: see `SourceErrors`.
+        n_seen_painted: likewise.
+    """
+
+    away_m: NDArray[np.float64]
+    step_m: NDArray[np.float64]
+    n_traced: int
+    n_far: int
+    n_ghosts: int
+    n_stated: int
+    n_within_1_sigma: int
+    n_within_2_sigma: int
+    n_seen_by_both: int
+    n_seen_painted: int
 
 
 def trace_sources(
@@ -115,111 +161,49 @@ def trace_sources(
         traced=traced,
         steps=depth_step_band(true.depth_m),
         ghosts=ghosts,
-        n_seen_by_both=int(np.count_nonzero(both)),
-        n_seen_painted=int(np.count_nonzero(both & (image.mask == OrthoMask.PAINTED))),
+        n_seen_by_both=_count(both),
+        n_seen_painted=_count(both & (image.mask == OrthoMask.PAINTED)),
         expected_m=image.error_m,
     )
 
 
-def source_findings(
-    errors: Sequence[SourceErrors], wall: int, allocate: Allocate = in_memory
-) -> list[Finding]:
-    """Compute statistics of one wall, or of several (wall -1); none without photos.
+def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
+    """Sum up one wall, or several together (wall -1); nothing when no photo painted anything.
 
     Displacements are of all painted cells that show no free-standing object; those within 2 cells
     of true depth steps are separate.
 
     Args:
-        errors: of walls, or of parts of them.
-        wall: index in the findings.
-        allocate: returns arrays for the displacements of many cells, by name.
+        samples: of the wall, or of all.
+        wall: of the findings.
     """
-    errors = [item for item in errors if item.traced.any()]
-    if not errors:
+    if not samples.n_traced:
         return []
-    n_traced = sum(int(np.count_nonzero(item.traced)) for item in errors)
-    away = _gathered(errors, allocate, at_steps=False)
-    steps = _gathered(errors, allocate, at_steps=True)
-    numbers = [("n_traced", float(n_traced), "1")]
-    for axis, name in enumerate(("u", "v")):
+    numbers = [("n_traced", float(samples.n_traced), "1")]
+    for name, away, step in zip("uv", 1e3 * samples.away_m.T, 1e3 * samples.step_m.T, strict=True):
         if len(away):
-            spread = Spread(away[:, axis], 1e3)
             numbers += [
-                (f"rmse_{name}_mm", spread.rms(), "mm"),
-                (f"mean_{name}_mm", spread.mean(), "mm"),
-                (f"nmad_{name}_mm", spread.median_deviation(), "mm"),
-                (f"p99_{name}_mm", spread.percentile_of_size(99.0), "mm"),
+                (f"rmse_{name}_mm", rms(away), "mm"),
+                (f"mean_{name}_mm", float(away.mean()), "mm"),
+                (f"nmad_{name}_mm", median_deviation(away), "mm"),
+                (f"p99_{name}_mm", float(np.percentile(np.abs(away), 99.0)), "mm"),
             ]
-        if len(steps):
-            numbers.append((f"step_rmse_{name}_mm", Spread(steps[:, axis], 1e3).rms(), "mm"))
-    n_far = sum(int(np.count_nonzero(_is_far(item))) for item in errors)
-    n_ghosts = sum(int(np.count_nonzero(item.ghosts)) for item in errors)
+        if len(step):
+            numbers.append((f"step_rmse_{name}_mm", rms(step), "mm"))
     numbers += [
-        ("far_source_share", n_far / n_traced, "1"),
-        ("ghost_share", n_ghosts / n_traced, "1"),
-        ("n_ghost_cells", float(n_ghosts), "1"),
+        ("far_source_share", samples.n_far / samples.n_traced, "1"),
+        ("ghost_share", samples.n_ghosts / samples.n_traced, "1"),
+        ("n_ghost_cells", float(samples.n_ghosts), "1"),
     ]
-    numbers += _shares_within(errors)
-    n_both = sum(item.n_seen_by_both for item in errors)
-    if n_both:
-        n_painted = sum(item.n_seen_painted for item in errors)
-        numbers.append(("completeness_seen_by_both", n_painted / n_both, "1"))
+    if samples.n_stated:
+        numbers += [
+            ("within_1_sigma_share", samples.n_within_1_sigma / samples.n_stated, "1"),
+            ("within_2_sigma_share", samples.n_within_2_sigma / samples.n_stated, "1"),
+        ]
+    if samples.n_seen_by_both:
+        share = samples.n_seen_painted / samples.n_seen_by_both
+        numbers.append(("completeness_seen_by_both", share, "1"))
     return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
-
-
-def _shares_within(errors: Sequence[SourceErrors]) -> list[tuple[str, float, str]]:
-    """Return shares of coordinates with errors within once and twice the stated one."""
-    counts = np.zeros(3)
-    for item in errors:
-        if item.expected_m is None:
-            continue
-        chosen = item.traced & ~item.steps & ~item.ghosts & np.isfinite(item.expected_m)
-        chosen &= np.isfinite(item.displacement_m).all(axis=2)
-        sigmas = np.abs(item.displacement_m[chosen]) / item.expected_m[chosen][:, None]
-        counts += [sigmas.size, (sigmas <= 1.0).sum(), (sigmas <= 2.0).sum()]
-    if not counts[0]:
-        return []
-    return [
-        ("within_1_sigma_share", float(counts[1] / counts[0]), "1"),
-        ("within_2_sigma_share", float(counts[2] / counts[0]), "1"),
-    ]
-
-
-def counted_once(bands: Sequence[SourceErrors]) -> tuple[SourceErrors, ...]:
-    """Return the bands that photos painted as representative of their wall; none without any."""
-    traced = [bool(item.traced.any()) for item in bands]
-    if not any(traced):
-        return ()
-    n_both = sum(item.n_seen_by_both for item in bands)
-    n_painted = sum(item.n_seen_painted for item in bands)
-    first = traced.index(True)
-    return tuple(
-        replace(
-            item,
-            n_seen_by_both=n_both if place == first else 0,
-            n_seen_painted=n_painted if place == first else 0,
-        )
-        for place, item in enumerate(bands)
-    )
-
-
-def _gathered(
-    errors: Sequence[SourceErrors], allocate: Allocate, *, at_steps: bool
-) -> NDArray[np.float64]:
-    """Return displacements (n, 2) of cells at true depth steps, or away from them."""
-
-    def of(item: SourceErrors) -> NDArray[np.float64]:
-        return _of(item, item.traced & (item.steps if at_steps else ~item.steps))
-
-    if sum(item.traced.size for item in errors) <= IN_MEMORY_CELLS:
-        return np.concatenate([of(item) for item in errors])
-    counts = [len(of(item)) for item in errors]
-    name = "steps" if at_steps else "away"
-    whole = np.asarray(allocate(name, (sum(counts), 2), np.float64), np.float64)
-    ends = np.cumsum(counts)
-    for item, count, end in zip(errors, counts, ends, strict=True):
-        whole[end - count : end] = of(item)
-    return whole
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
@@ -244,14 +228,5 @@ def _seen_by_photos(
     return mask
 
 
-def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return displacements (n, 2) of the chosen cells, without ghosts and pixels without target."""
-    values = errors.displacement_m[chosen & ~errors.ghosts]
-    return values[np.isfinite(values).all(axis=1)]
-
-
-def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:
-    """Report cells whose colour comes from more than 3 cells away, or from nothing."""
-    length = np.linalg.norm(errors.displacement_m, axis=2)
-    far: NDArray[np.bool_] = errors.traced & ~(length <= _FAR_CELLS * errors.frame.gsd_m)
-    return far
+def _count(mask: NDArray[np.bool_]) -> int:
+    return int(np.count_nonzero(mask))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, Band
+from orthoflow.geometry.bands import Band, count_cells
 from orthoflow.geometry.scenes import Viewers
 from orthoflow.products import (
     Cameras,
@@ -20,9 +20,11 @@ from orthoflow.products import (
     JsonValue,
     Orthoimage,
     Orthoimages,
+    OrthoMask,
     Planes,
     PointLabels,
     Truth,
+    Wall,
     Walls,
 )
 from orthoflow.sdk import (
@@ -38,10 +40,8 @@ from orthoflow_plugins.inspect.cell_errors import (
     BLOCK_CELLS,
     Sampling,
     SamplingRule,
-    WallErrors,
     WallSamples,
     depth_step_band,
-    pooled,
     sample_findings,
     sampling,
     sampling_rule,
@@ -55,7 +55,7 @@ from orthoflow_plugins.inspect.figures import (
     depth_error_map,
     displacement_map,
 )
-from orthoflow_plugins.inspect.findings import IMAGE_QUALITY, of_walls, report
+from orthoflow_plugins.inspect.findings import IMAGE_QUALITY, of_walls, pooled, report
 from orthoflow_plugins.inspect.image_quality import quality_findings
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
@@ -74,12 +74,10 @@ from orthoflow_plugins.inspect.plane_errors import (
     worst_plane_findings,
 )
 from orthoflow_plugins.inspect.source_errors import (
-    SourceErrors,
-    counted_once,
+    SourceSamples,
     source_findings,
     trace_sources,
 )
-from orthoflow_plugins.inspect.spreads import in_file
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
@@ -199,12 +197,13 @@ class InspectTruth(Method):
     """Compare with the truth of a simulated scene, cell by cell and patch by patch.
 
     The true orthoimage is rendered on each wall's own frame: the first surface within the buffer,
-    seen perpendicularly to the wall. Depths and colours are compared away from true depth steps; a
-    band of 2 cells at the steps is reported separately. Displacements come from patches of 32 x 32
-    painted cells, matched to the truth by least squares. Metrics without prefix are of the first
-    wall; those with `all_` are of all walls together. On large walls, colours and patches are
-    compared in whole blocks of 96 x 96 cells, and visibility is tested on a lattice, both spread
-    evenly; depths, and displacements derived from cameras, are compared in every cell.
+    seen square to the wall. Depths and colours are compared away from true depth steps; a band of
+    2 cells at the steps is reported apart. Displacements come from patches of 32 x 32 painted
+    cells, matched to the truth by least squares. Metrics without prefix are of the first wall;
+    those with `all_` are of all walls together. Of large walls, colours and patches are compared
+    in whole blocks of 96 x 96 cells, and who sees a cell is asked on a lattice, both spread evenly;
+    depths and displacements that follow from cameras are compared in every cell. Statistics
+    of more than eight million errors are those of an evenly spread sample.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
     every cell that a photo painted is exact: its point on the found surface is projected with the
@@ -404,15 +403,10 @@ class InspectTruth(Method):
             verdict = judge.verdict_on(image)
             verdicts.append(verdict)
             findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
-            findings += verdict.findings(image.wall, ctx)
+            findings += _findings([verdict], image.wall)
+            findings += verdict.quality
             _draw(image, verdict, ctx)
-        sources = [band for item in verdicts for band in item.sources]
-        findings += sample_findings(
-            pooled([item.samples for item in verdicts], in_files(ctx, "all")),
-            -1,
-            sources_are_traced=bool(sources),
-        )
-        findings += source_findings(sources, -1, in_files(ctx, "all"))
+        findings += _findings(verdicts, -1)
         findings += worst_plane_findings(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
@@ -437,28 +431,33 @@ class _Verdict:
 
     Attributes:
         samples: the errors as numbers.
+        sources: those of traced cells; None where no photo painted.
         patches: where displacements were measured.
-        depth_m: measured - true depth of every `step`th row and column, for the picture.
+        depth_m: measured - true depth in every `_draw_step`-th row and column, for the picture.
         grey: root mean square colour error, likewise.
-        step: see `depth_m`; 1 unless the wall is large.
-        sources: of bands of the wall, from the top; empty if no photo painted.
-        quality: metrics that every orthoimage has.
+        length_m: displacements of traced cells, likewise.
+        cells: (n, 2) row and column of some traced cells.
+        cell_shift_m: (n, 2) their displacements along u and v.
+        quality: findings that every orthoimage has.
     """
 
     samples: WallSamples
+    sources: SourceSamples | None
     patches: PatchShifts
     depth_m: NDArray[np.float64]
     grey: NDArray[np.float64]
-    step: int
-    sources: tuple[SourceErrors, ...]
+    length_m: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    cell_shift_m: NDArray[np.float64]
     quality: tuple[Finding, ...]
 
-    def findings(self, wall: int, ctx: StepContext) -> list[Finding]:
-        """Return the wall's metrics."""
-        is_traced = bool(self.sources)
-        numbers = sample_findings(self.samples, wall, sources_are_traced=is_traced)
-        numbers += self.quality
-        return numbers + source_findings(self.sources, wall, in_files(ctx, f"{wall}.sources"))
+
+def _findings(verdicts: Sequence[_Verdict], wall: int) -> list[Finding]:
+    """Numbers of one wall, or of several together (wall -1)."""
+    sources = [item.sources for item in verdicts if item.sources is not None]
+    samples = pooled([item.samples for item in verdicts])
+    findings = sample_findings(samples, wall, sources_are_traced=bool(sources))
+    return findings + (source_findings(pooled(sources), wall) if sources else [])
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
@@ -511,65 +510,63 @@ class _Judge:
     ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall, a large one in bands of whole blocks with a margin of one block."""
-        inputs = self.inputs
+        """Compare one wall, a large one in bands of whole blocks with a block about them."""
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
-        step = max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
-        errors: list[WallErrors] = []
-        sources: list[SourceErrors] = []
-        for band in _bands(image):
-            part, surface = rows_of(image, band.around), rows_of(wall, band.around)
-            chosen = sampling(part, self.rule, band.around.start)
-            true = self._true_orthoimage(part, chosen)
-            found = wall_errors(part, surface, true, chosen, band.inner)
-            errors.append(self._kept(found, image, band, step))
-            if inputs.cameras is not None and self.views is not None:
-                traced = trace_sources(
-                    rows_of(part, band.inner),
-                    rows_of(surface, band.inner),
-                    rows_of(true, band.inner),
-                    chosen.lattice[band.inner],
-                    inputs.cameras,
-                    inputs.truth,
-                    self.views,
-                )
-                # Steps at the edge of a band depend on what is beyond it.
-                traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
-                name = f"{image.wall}.{band.rows.start}"
-                sources.append(traced.kept(name, self._files) if _is_large(image) else traced)
-        allocate = in_files(self.ctx, f"{image.wall}.cells")
+        bands = [self._of_band(image, wall, band) for band in _bands(image)]
+        sources = [band.sources for band in bands if band.sources is not None]
+        together = pooled(sources) if sources else None
         return _Verdict(
-            samples=pooled([item.samples for item in errors], allocate),
-            patches=PatchShifts.joined([item.patches for item in errors]),
-            depth_m=np.concatenate([item.depth_m for item in errors]),
-            grey=np.concatenate([item.grey for item in errors]),
-            step=step,
-            sources=counted_once(sources),
-            quality=tuple(quality_findings(image, wall, inputs.cameras)),
+            samples=pooled([band.samples for band in bands]),
+            sources=together if together is not None and together.n_traced else None,
+            patches=PatchShifts.joined([band.patches for band in bands]),
+            depth_m=np.concatenate([band.depth_m for band in bands]),
+            grey=np.concatenate([band.grey for band in bands]),
+            length_m=np.concatenate([band.length_m for band in bands]),
+            cells=np.concatenate([band.cells for band in bands]),
+            cell_shift_m=np.concatenate([band.cell_shift_m for band in bands]),
+            quality=tuple(quality_findings(image, wall, self.inputs.cameras)),
         )
 
-    def _kept(self, errors: WallErrors, image: Orthoimage, band: Band, step: int) -> WallErrors:
-        """What is kept of a band: positions in the wall, every nth cell to draw, and files."""
-        first = -band.rows.start % step
-        patches, samples = errors.patches, errors.samples
+    def _of_band(self, image: Orthoimage, wall: Wall, band: Band) -> _Verdict:
+        """Compare some rows of a wall; what is kept of them does not grow with the wall."""
+        part, surface = rows_of(image, band.around), rows_of(wall, band.around)
+        chosen = sampling(part, self.rule, band.around.start)
+        true = self._true_orthoimage(part, chosen)
+        errors = wall_errors(part, surface, true, chosen, band.inner, self.rule.error_step)
+        step = _draw_step(image)
+        drawn = (slice(-band.rows.start % step, None, step), slice(None, None, step))
         above = np.array([0.0, band.rows.start])
-        if _is_large(image):
-            name = f"{image.wall}.{band.rows.start}"
-            samples = replace(
-                samples,
-                depth_m=in_file(samples.depth_m, f"{name}.depth_m", self._files),
-                sigma_m=in_file(samples.sigma_m, f"{name}.sigma_m", self._files),
+        sources = None
+        cells, shift_m, length_m = np.empty((0, 2), np.int64), np.empty((0, 2)), np.empty((0, 0))
+        if self.inputs.cameras is not None and self.views is not None:
+            traced = trace_sources(
+                rows_of(part, band.inner),
+                rows_of(surface, band.inner),
+                rows_of(true, band.inner),
+                chosen.lattice[band.inner],
+                self.inputs.cameras,
+                self.inputs.truth,
+                self.views,
             )
-        return WallErrors(
-            samples=samples,
-            patches=replace(patches, centre=patches.centre + above),
-            depth_m=errors.depth_m[first::step, ::step].copy(),
-            grey=errors.grey[first::step, ::step].copy(),
+            # Steps at the border of a band depend on what is beyond it.
+            traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
+            sources = traced.samples(self.rule.error_step)
+            length_m = np.linalg.norm(traced.displacement_m[drawn], axis=2)
+            is_known = np.isfinite(traced.displacement_m).all(axis=2)
+            n_painted = count_cells(image.mask, OrthoMask.PAINTED)
+            cells = np.argwhere(is_known)[:: max(1, n_painted // _TRACED_POINTS)]
+            shift_m = traced.displacement_m[cells[:, 0], cells[:, 1]]
+        return _Verdict(
+            samples=errors.samples,
+            sources=sources,
+            patches=replace(errors.patches, centre=errors.patches.centre + above),
+            depth_m=errors.depth_m[drawn],
+            grey=errors.grey[drawn],
+            length_m=length_m,
+            cells=cells + np.array([band.rows.start, 0]),
+            cell_shift_m=shift_m,
+            quality=(),
         )
-
-    @property
-    def _files(self) -> Allocate:
-        return in_files(self.ctx, "bands")
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
         from orthoflow.geometry.scene_views import Rendering, render
@@ -608,19 +605,10 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
         f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels. Bright "
         "outlines are displaced edges, bright areas wrong paint or light of another photo.",
     )
-    if verdict.sources:
-        length_m = np.concatenate(
-            [
-                np.linalg.norm(
-                    item.displacement_m[-row % verdict.step :: verdict.step, :: verdict.step],
-                    axis=2,
-                )
-                for row, item in _by_first_row(verdict.sources)
-            ]
-        )
+    if verdict.sources is not None:
         ctx.figure(
             f"wall_{image.number}_displacement",
-            displacement_map(length_m / image.frame.gsd_m),
+            displacement_map(verdict.length_m / image.frame.gsd_m),
             f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
             f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm. Dark is good; a "
             "bright area with a sharp border is a photo oriented worse than its neighbours.",
@@ -637,17 +625,11 @@ def _inspection(
     """Combine the displacements of all patches and of a few thousand painted cells."""
     walls, points, shifts, kinds = [], [], [], []
     for image, item in zip(orthoimages.images, verdicts, strict=True):
-        places, shift = item.patches.centre, item.samples.shift_m
-        kind = np.zeros(len(places), dtype=np.uint8)
-        if item.sources:
-            cells, traced = _traced_cells(item.sources)
-            places = np.concatenate([places, cells[:, ::-1] + 0.5])
-            shift = np.concatenate([shift, traced])
-            kind = np.append(kind, np.ones(len(cells), dtype=np.uint8))
+        places = np.concatenate([item.patches.centre, item.cells[:, ::-1] + 0.5])
         walls.append(np.full(len(places), image.wall, dtype=np.int32))
         points.append(image.frame.world_from_wall(places))
-        shifts.append(shift)
-        kinds.append(kind)
+        shifts.append(np.concatenate([item.samples.shift_m, item.cell_shift_m]))
+        kinds.append(np.repeat([0, 1], [len(item.patches), len(item.cells)]))
     if poses:
         details["poses"] = pose_details(poses)
     return Inspection(
@@ -661,28 +643,9 @@ def _inspection(
     )
 
 
-def _by_first_row(sources: Sequence[SourceErrors]) -> Iterator[tuple[int, SourceErrors]]:
-    """Yield bands of a wall, each with the number of the wall's rows above it."""
-    first = 0
-    for item in sources:
-        yield first, item
-        first += len(item.traced)
-
-
-def _traced_cells(
-    sources: Sequence[SourceErrors],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return every nth traced cell (n, 2) = (row, column) of a wall, and its displacement."""
-    known = [np.isfinite(item.displacement_m).all(axis=2) for item in sources]
-    counts = [int(np.count_nonzero(mask)) for mask in known]
-    step, n_before = max(1, sum(counts) // _TRACED_POINTS), 0
-    cells, shifts = [], []
-    for (row, item), mask, count in zip(_by_first_row(sources), known, counts, strict=True):
-        chosen = np.argwhere(mask)[-n_before % step :: step]
-        cells.append(chosen + np.array([row, 0]))
-        shifts.append(item.displacement_m[chosen[:, 0], chosen[:, 1]])
-        n_before += count
-    return np.concatenate(cells), np.concatenate(shifts)
+def _draw_step(image: Orthoimage) -> int:
+    """Return the step of the rows and columns that are drawn; 1 unless the wall is large."""
+    return max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
 
 
 def _is_large(image: Orthoimage) -> bool:

@@ -16,12 +16,12 @@ from orthoflow_plugins.inspect.cell_errors import (
     _inner,
     _shifts,
     depth_step_band,
-    pooled,
     sample_findings,
     sampling,
     sampling_rule,
     wall_errors,
 )
+from orthoflow_plugins.inspect.findings import pooled
 from scipy.ndimage import gaussian_filter
 
 from orthoflow.geometry import frame_over

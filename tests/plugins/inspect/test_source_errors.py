@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.inspect import source_errors as module
-from orthoflow_plugins.inspect.source_errors import SourceErrors, counted_once, source_findings
+from orthoflow_plugins.inspect.findings import pooled
+from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings
 
 from orthoflow.geometry.scenes import SurfaceRole
 from tests import samples
@@ -35,6 +36,12 @@ def source_errors() -> SourceErrors:
     )  # fmt: skip
 
 
+def numbers_of(*errors: SourceErrors) -> dict[str, float]:
+    """Findings of walls, or of bands of one, together."""
+    samples = pooled([item.samples() for item in errors])
+    return {item.name: item.value for item in source_findings(samples, 0)}
+
+
 def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
     errors = source_errors()
     cell_m = errors.frame.gsd_m
@@ -42,7 +49,7 @@ def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
     far.displacement_m[0, 0] = (0.0, 3.1 * cell_m)
     near = replace(errors, displacement_m=errors.displacement_m.copy())
     near.displacement_m[0, 0] = (0.0, 2.9 * cell_m)
-    found = {item.name: item for item in source_findings([errors], 4)}
+    found = {item.name: item for item in source_findings(errors.samples(), 4)}
     u = np.array([1.0, -2.0, 3.0, 4.0])
     v = np.array([0.0, 1.0, 0.0, -5.0])
     expected = {"n_traced": 9.0, "ghost_share": 2 / 9, "n_ghost_cells": 2.0}
@@ -61,10 +68,7 @@ def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
         assert found[name].unit == ("mm" if name.endswith("_mm") else "1")
         assert found[name].wall == 4
     assert found.keys() == expected.keys() | {"far_source_share"}
-    shares = [
-        {item.name: item.value for item in source_findings([some], 0)}["far_source_share"]
-        for some in (near, far)
-    ]
+    shares = [numbers_of(some)["far_source_share"] for some in (near, far)]
     # Of nine cells, one more is further away than three.
     assert shares[1] - shares[0] == pytest.approx(1.0 / 9.0)
     # What looks at nothing is far away too.
@@ -78,51 +82,45 @@ def test_shares_within_what_the_orthoimage_states_are_of_both_coordinates() -> N
     known = replace(errors, expected_m=stated)
     # Of 1, -2, 3, 4 mm along u and 0, 1, 0, -5 mm along v, five are within 2 mm and all but 5 mm
     # within 4 mm. Cells at steps, ghosts and those without a place do not count.
-    found = {item.name: item.value for item in source_findings([known], 0)}
+    found = numbers_of(known)
     assert found["within_1_sigma_share"] == pytest.approx(5 / 8)
     assert found["within_2_sigma_share"] == pytest.approx(7 / 8)
     stated[...] = np.nan
-    assert "within_1_sigma_share" not in {item.name for item in source_findings([known], 0)}
+    assert "within_1_sigma_share" not in numbers_of(known)
 
 
 def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out() -> None:
     errors = source_errors()
-    empty = replace(errors, traced=np.zeros((1, 10), dtype=np.bool_))
-    assert source_findings([empty], 0) == []
-    twice = {item.name: item.value for item in source_findings([errors, empty, errors], -1)}
-    once = {item.name: item.value for item in source_findings([errors], -1)}
-    doubled = {"n_traced", "n_ghost_cells"}
+    nothing = np.zeros((1, 10), dtype=np.bool_)
+    empty = replace(errors, traced=nothing, ghosts=nothing)
+    assert numbers_of(empty) == {}
+    twice, once = numbers_of(errors, empty, errors), numbers_of(errors)
     for name, value in once.items():
-        # Percentiles lie between other cells.
+        # Percentiles lie between other cells; what the empty band could show counts.
+        expected = {"n_traced": 2 * value, "n_ghost_cells": 2 * value}.get(name, value)
+        if name == "completeness_seen_by_both":
+            expected = 3 * errors.n_seen_painted / (3 * errors.n_seen_by_both)
         if not name.startswith("p99"):
-            assert twice[name] == pytest.approx((2.0 if name in doubled else 1.0) * value), name
+            assert twice[name] == pytest.approx(expected), name
 
 
-def test_bands_that_no_photo_painted_count_for_what_could_be_seen() -> None:
+def test_every_so_manyth_error_of_many_is_kept_and_all_are_counted() -> None:
     errors = source_errors()
-    bare = replace(
-        errors, traced=np.zeros((1, 10), dtype=np.bool_), n_seen_by_both=8, n_seen_painted=0
-    )
-    assert counted_once([bare, bare]) == ()
-    bands = counted_once([bare, errors, bare, errors])
-    assert [item.n_seen_by_both for item in bands] == [0, 16 + 2 * errors.n_seen_by_both, 0, 0]
-    assert [item.n_seen_painted for item in bands] == [0, 2 * errors.n_seen_painted, 0, 0]
-    (share,) = (
-        item.value for item in source_findings(bands, 0) if item.name == "completeness_seen_by_both"
-    )
-    assert share == errors.n_seen_painted / (8 + errors.n_seen_by_both)
+    all_of_them, some = errors.samples(), errors.samples(3)
+    np.testing.assert_array_equal(some.away_m, all_of_them.away_m[::3])
+    np.testing.assert_array_equal(some.step_m, all_of_them.step_m[::3])
+    assert (some.n_traced, some.n_far, some.n_ghosts) == (9, all_of_them.n_far, 2)
 
 
 def test_what_is_not_known_is_left_out() -> None:
     errors = source_errors()
     only_steps = replace(errors, steps=errors.traced, n_seen_by_both=0)
-    names = {item.name for item in source_findings([only_steps], 0)}
-    assert names == {
+    assert numbers_of(only_steps).keys() == {
         "n_traced", "step_rmse_u_mm", "step_rmse_v_mm", "far_source_share", "ghost_share",
         "n_ghost_cells",
     }  # fmt: skip
     no_steps = replace(errors, steps=np.zeros((1, 10), dtype=np.bool_))
-    assert "step_rmse_u_mm" not in {item.name for item in source_findings([no_steps], 0)}
+    assert "step_rmse_u_mm" not in numbers_of(no_steps)
 
 
 @pytest.mark.parametrize("rectangle", [-1, 0, 1])
@@ -167,22 +165,6 @@ def test_what_shows_an_object_is_a_ghost_whichever_of_the_scenes_surfaces_it_is(
     expected = where.gsd_m * np.array([[[0.5 - 0.75, 0.0], [1.5 - 0.75, 0.0]]])
     np.testing.assert_allclose(found.displacement_m, expected, atol=1e-9)
     assert (found.n_seen_by_both, found.n_seen_painted) == (1, 1)
-
-
-def test_cells_of_large_walls_are_gathered_in_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    errors = source_errors()
-    plain = source_findings([errors, errors], 1)
-    allocated = {}
-
-    def allocate(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
-        allocated[name] = np.full(shape, np.nan, dtype)
-        return allocated[name]
-
-    for most, n_allocated in ((20, 0), (19, 2)):
-        monkeypatch.setattr(module, "IN_MEMORY_CELLS", most)
-        assert source_findings([errors, errors], 1, allocate) == plain
-        assert len(allocated) == n_allocated
-    assert {name: len(values) for name, values in allocated.items()} == {"away": 8, "steps": 4}
 
 
 def test_cells_are_seen_that_any_photo_sees() -> None:

@@ -15,14 +15,12 @@ import rasterio
 from orthoflow_plugins.inspect import truth as module
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import report
-from orthoflow_plugins.inspect.patches import unrefined
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.simulate.room import SimulateRoom
 from rasterio.transform import Affine
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import encode_webp
 from orthoflow.files.sidecars import frame_json
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
@@ -30,6 +28,7 @@ from orthoflow.products import (
     Cameras,
     Finding,
     InputFiles,
+    Inspection,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -41,6 +40,7 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import StepContext
+from orthoflow.testing import photographed as ms
 from tests import inspect_scenes, samples, scenes
 from tests.inspecting import BUFFER_M, inspect
 
@@ -395,10 +395,8 @@ def test_every_wall_tells_its_displacement(tmp_path: Path) -> None:
     }
 
 
-def test_a_large_wall_takes_the_memory_of_a_band(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    times = 6
+def finer(times: int) -> dict[str, Any]:
+    """The scene of `truth_inputs` with each cell cut into cells of a `times`th of its side."""
     given = inspect_scenes.truth_inputs()
     (image,), (wall,) = given["orthoimages"].images, given["walls"].walls
     height, width = (times * size for size in image.frame.shape)
@@ -411,22 +409,75 @@ def test_a_large_wall_takes_the_memory_of_a_band(
         }
         return replace(raster, frame=frame, **arrays)
 
-    inputs = InspectTruth.In(
-        truth=given["truth"],
-        orthoimages=Orthoimages(images=(larger(image, "rgb", "mask", "source"),)),
-        walls=replace(given["walls"], walls=(larger(wall, "depth_m", "sigma_m", "count", "mask"),)),
+    return {
+        "truth": given["truth"],
+        "orthoimages": Orthoimages(images=(larger(image, "rgb", "mask", "source"),)),
+        "walls": replace(
+            given["walls"], walls=(larger(wall, "depth_m", "sigma_m", "count", "mask"),)
+        ),
+    }
+
+
+def test_bands_of_a_large_wall_give_what_the_whole_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    lens = {"width": 900, "height": 640, "fx": 1200.0, "fy": 1200.0, "cx": 450.0, "cy": 320.0}
+    true, found = (
+        ms.cameras(
+            ms.oriented(samples.camera(rotation, np.array([x, -1.9, 0.4]), **lens), name="photo")
+        )
+        for x in (0.6, 0.603)
     )
+    given = finer(3)
+    inputs = InspectTruth.In(
+        **given | {"truth": replace(given["truth"], cameras=true)}, cameras=found
+    )
+
+    def outcome(folder: str) -> tuple[dict[str, float], Inspection]:
+        (tmp_path / folder).mkdir()
+        context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path / folder)
+        inspection = InspectTruth().run(inputs, InspectTruth.Params(), context).inspection
+        return {metric.name: metric.value for metric in context.metrics}, inspection
+
+    whole, inspected = outcome("whole")
+    assert whole["mean_u_mm"] == pytest.approx(3.0, abs=0.3)
+    assert whole["n_traced"] > 30_000
+    monkeypatch.setattr(module, "_BAND_CELLS", 1000)
+    parts, in_bands = outcome("parts")
+    assert parts == {name: pytest.approx(value) for name, value in whole.items()}
+    assert inspected.kinds == ("patch", "painted cell")
+    for product in (inspected, in_bands):
+        # A camera believed 3 mm too far to the right paints what lies 3 mm to the left of a cell.
+        cells = product.kind == 1
+        assert 1000 < np.count_nonzero(cells) <= 5000
+        assert np.median(product.displacement_m[cells, 0]) == pytest.approx(3e-3, abs=1e-4)
+    patches = [product.points_world[product.kind == 0] for product in (inspected, in_bands)]
+    np.testing.assert_allclose(*patches)
+    # Of more errors than are kept every so manyth says the same.
+    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._KEPT_ERRORS", 4000)
+    some, _ = outcome("some")
+    assert some["n_traced"] == whole["n_traced"]
+    for name in ("rmse_u_mm", "nmad_v_mm", "depth_median_mm", "depth_rmse_mm"):
+        assert some[name] == pytest.approx(whole[name], rel=0.1), name
+
+
+def test_a_large_wall_takes_the_memory_of_a_band(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = InspectTruth.In(**finer(6))
+    assert inputs.orthoimages is not None
+    n_cells = inputs.orthoimages.images[0].mask.size
     params = InspectTruth.Params(colour_cells_most=20_000, supersample=1)
-    monkeypatch.setattr("orthoflow_plugins.inspect.truth._BAND_CELLS", 1000)
-    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors.IN_MEMORY_CELLS", 5000)
-    monkeypatch.setattr("orthoflow_plugins.inspect.spreads._AT_ONCE", 1 << 14)
+    monkeypatch.setattr(module, "_BAND_CELLS", 1000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._KEPT_ERRORS", 5000)
     monkeypatch.setattr("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 128)
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     tracemalloc.start()
     try:
         InspectTruth().run(inputs, params, context)
         # A band with its surroundings has half of the cells; the whole took 174 bytes each.
-        assert tracemalloc.get_traced_memory()[1] < 110 * width * height
+        assert tracemalloc.get_traced_memory()[1] < 110 * n_cells
     finally:
         tracemalloc.stop()
     metrics = {metric.name: metric.value for metric in context.metrics}
@@ -461,29 +512,6 @@ def test_painters_without_an_oriented_photo_of_their_name_are_told(tmp_path: Pat
     assert list(ctx.warnings) == []
 
 
-def sources(rows: int, columns: int) -> Any:
-    """Traced cells of a band whose displacement tells the cell; one in seven is not known."""
-    rng = np.random.default_rng(rows)
-    displacement = rng.normal(size=(rows, columns, 2))
-    displacement[rng.random((rows, columns)) < 1.0 / 7.0] = np.nan
-    return SimpleNamespace(
-        displacement_m=displacement, traced=np.isfinite(displacement).all(axis=2)
-    )
-
-
-def test_of_many_traced_cells_every_so_manyth_of_the_wall_is_kept() -> None:
-    bands = [sources(40, 101), sources(53, 101), sources(31, 101)]
-    whole = np.concatenate([item.displacement_m for item in bands])
-    expected = np.argwhere(np.isfinite(whole).all(axis=2))
-    step = len(expected) // 4000
-    assert step == 2
-    cells, shifts = module._traced_cells(bands)
-    np.testing.assert_array_equal(cells, expected[::step])
-    np.testing.assert_array_equal(shifts, whole[tuple(expected[::step].T)])
-    few, _ = module._traced_cells(bands[:1])
-    assert len(few) == np.count_nonzero(np.isfinite(bands[0].displacement_m[..., 0]))
-
-
 def test_bands_are_whole_blocks_with_a_block_about_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def bands_of(height: int, width: int) -> list[tuple[int, int, int, int]]:
         image: Any = SimpleNamespace(
@@ -498,69 +526,6 @@ def test_bands_are_whole_blocks_with_a_block_about_them(monkeypatch: pytest.Monk
     # Four blocks at once, of which one above and one below are about the band.
     assert bands_of(500, 50) == [(0, 192, 0, 288), (192, 384, 96, 480), (384, 500, 288, 500)]
     assert bands_of(200, 300) == [(0, 96, 0, 192), (96, 192, 0, 200), (192, 200, 96, 200)]
-
-
-def test_what_is_kept_of_a_band_lies_where_it_is_in_the_wall() -> None:
-    whole = np.arange(200.0 * 30).reshape(200, 30)
-    image: Any = SimpleNamespace(mask=np.zeros((200, 30)))
-    for first in (0, 96):
-        band: Any = SimpleNamespace(rows=slice(first, first + 96))
-        errors = module.WallErrors(
-            samples=SimpleNamespace(),  # type: ignore[arg-type]
-            patches=module.PatchShifts.joined(
-                [unrefined(np.array([[5.0, 6.5]]), np.array([[1.0, 2.0]]))]
-            ),
-            depth_m=whole[band.rows],
-            grey=-whole[band.rows],
-        )
-        kept = module._Judge._kept(SimpleNamespace(), errors, image, band, 5)  # type: ignore[arg-type]
-        assert kept.patches.centre.tolist() == [[5.0, 6.5 + first]]
-        rows = [row for row in range(0, 200, 5) if first <= row < first + 96]
-        np.testing.assert_array_equal(kept.depth_m, whole[rows, ::5])
-        np.testing.assert_array_equal(kept.grey, -whole[rows, ::5])
-
-
-def test_displacements_are_those_of_patches_and_of_the_middles_of_cells() -> None:
-    image = inspect_scenes.image_of(np.full((30, 40), 90.0))
-    traced = sources(6, 5)
-    verdict: Any = SimpleNamespace(
-        patches=SimpleNamespace(centre=np.array([[16.0, 17.0]])),
-        samples=SimpleNamespace(shift_m=np.array([[0.25, 0.5]])),
-        sources=(traced,),
-    )
-    found = module._inspection(Orthoimages(images=(image,)), [verdict], (), [], {})
-    rows, columns = np.nonzero(np.isfinite(traced.displacement_m[..., 0]))
-    places = np.vstack([[16.0, 17.0], np.column_stack([columns + 0.5, rows + 0.5])])
-    np.testing.assert_allclose(found.points_world, image.frame.world_from_wall(places))
-    np.testing.assert_array_equal(
-        found.displacement_m, np.vstack([[0.25, 0.5], traced.displacement_m[rows, columns]])
-    )
-    assert found.kind.tolist() == [0] + [1] * len(rows)
-    assert found.wall.tolist() == [0] * len(found.kind)
-    assert found.kinds == ("patch", "painted cell")
-
-
-def test_of_a_large_wall_every_so_manyth_displacement_is_drawn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = []
-    picture = encode_webp(np.zeros((1, 1, 3), dtype=np.uint8))
-
-    def draw(cells: Any) -> bytes:
-        drawn.append(cells)
-        return picture
-
-    monkeypatch.setattr(module, "displacement_map", draw)
-    for name in ("depth_error_map", "colour_error_map"):
-        monkeypatch.setattr(module, name, lambda _: picture)
-    image = inspect_scenes.image_of(np.full((30, 40), 90.0))
-    bands = (sources(10, 40), sources(10, 40), sources(10, 40))
-    verdict: Any = SimpleNamespace(depth_m=None, grey=None, step=3, sources=bands)
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    module._draw(image, verdict, ctx)
-    whole = np.concatenate([item.displacement_m for item in bands])
-    expected = np.hypot(whole[..., 0], whole[..., 1])[::3, ::3] / image.frame.gsd_m
-    np.testing.assert_allclose(drawn[0], expected)
 
 
 @pytest.mark.parametrize(
