@@ -38,7 +38,7 @@ def test_one_or_several_paths_are_a_tuple_of_texts() -> None:
 
 def test_arrays_and_paths_are_what_a_workflow_would_say() -> None:
     swept = {"sweep": np.array([0.25, 0.5]), "ranks": [np.int64(3)], "file": Path("a/b")}
-    assert module._spelt(module._said(swept, "set")) == (
+    assert module._spelt(module._as_json(swept, "set")) == (
         '{"sweep": [0.25, 0.5], "ranks": [3], "file": "a/b"}'
     )
 

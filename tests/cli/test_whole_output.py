@@ -13,7 +13,6 @@ from orthoflow_provenance.document import RecordedFile, RunRecord
 from pydantic import Field
 
 from orthoflow.cli import plugins as plugins_commands
-from orthoflow.cli import tables
 from orthoflow.cli.compare import _print, comparison_json
 from orthoflow.cli.export import _refuse_filled
 from orthoflow.cli.exports.choices import Choices
@@ -31,22 +30,6 @@ from tests.report_runs import cell, distance, metric, record
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return capsys.readouterr().out.splitlines()
-
-
-# --- tables ---
-
-
-def test_columns_are_as_wide_as_what_is_in_them(capsys: pytest.CaptureFixture[str]) -> None:
-    tables.echo_table(("a", "name", ""), [("long one", "b", "c"), ("", "d", "")])
-    assert printed(capsys) == ["a         name", "long one  b     c", "          d"]
-    tables.echo_table(("a", "b"), [])
-    assert printed(capsys) == []
-    tables.echo_json({"b": ["ä"], "a": 1})
-    assert printed(capsys) == ["{", '  "b": [', '    "ä"', "  ],", '  "a": 1', "}"]
-
-
-def test_counts_are_said_with_their_noun() -> None:
-    assert [tables.counted(n, "cell") for n in (0, 1, 2)] == ["0 cells", "1 cell", "2 cells"]
 
 
 # --- comparisons ---
