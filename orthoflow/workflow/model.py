@@ -255,7 +255,9 @@ _Metrics: TypeAlias = Annotated[
 class FileSection(BaseModel):
     """A mapping of the file whose keys the format fixes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
+    )
 
 
 class InputSection(FileSection):
