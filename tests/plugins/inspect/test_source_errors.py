@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import source_errors as module
 from orthoflow_plugins.inspect.findings import pooled
 from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings
 
-from orthoflow.geometry.scenes import SurfaceRole
-from tests import samples
 from tests.inspect_scenes import frame
 
 
@@ -121,74 +116,3 @@ def test_what_is_not_known_is_left_out() -> None:
     }  # fmt: skip
     no_steps = replace(errors, steps=np.zeros((1, 10), dtype=np.bool_))
     assert "step_rmse_u_mm" not in numbers_of(no_steps)
-
-
-@pytest.mark.parametrize("rectangle", [-1, 0, 1])
-def test_what_shows_an_object_is_a_ghost_whichever_of_the_scenes_surfaces_it_is(
-    monkeypatch: pytest.MonkeyPatch, rectangle: int
-) -> None:
-    where = frame(shape=(1, 2))
-    monkeypatch.setattr(module, "true_camera", lambda *_args: None)
-    monkeypatch.setattr(module, "_near_frame", lambda own, _truth: own)
-    monkeypatch.setattr(module, "depth_step_band", lambda depth_m: np.zeros(depth_m.shape, bool))
-    monkeypatch.setattr(
-        module, "_seen_by_photos", lambda true, asked, *_args: np.array([[True, False]]) & asked
-    )
-
-    def trace(_camera: object, pixels: np.ndarray) -> Any:
-        points = where.world_from_wall(np.tile([0.75, 0.5], (len(pixels), 1)), 0.0)
-        return SimpleNamespace(points=points, rectangle=np.full(len(pixels), rectangle))
-
-    camera = SimpleNamespace(
-        project=lambda points: np.zeros((len(points), 3)), shifted=lambda _origin: camera
-    )
-    cameras: Any = SimpleNamespace(
-        cameras=[SimpleNamespace(photo="a.jpg", status="ok", viewing=lambda: camera)]
-    )
-    role = np.array([SurfaceRole.OBJECT, SurfaceRole.OBJECT])
-    truth: Any = SimpleNamespace(scene=SimpleNamespace(role=role, origin=np.zeros(3)))
-    image = samples.orthoimage(
-        where, rgb=np.zeros((1, 2, 3), np.uint8), sources=("a.jpg", "unknown.jpg")
-    )
-    found = module.trace_sources(
-        image,
-        samples.wall(where),
-        SimpleNamespace(seen=np.ones((1, 2), bool), depth_m=np.zeros((1, 2))),  # type: ignore[arg-type]
-        np.ones((1, 2), dtype=np.bool_),
-        cameras,
-        truth,
-        SimpleNamespace(trace=trace),  # type: ignore[arg-type]
-    )
-    assert found.traced.all()
-    assert found.ghosts.all() == found.ghosts.any() == (rectangle >= 0)
-    # Cells less the place that is shown there.
-    expected = where.gsd_m * np.array([[[0.5 - 0.75, 0.0], [1.5 - 0.75, 0.0]]])
-    np.testing.assert_allclose(found.displacement_m, expected, atol=1e-9)
-    assert (found.n_seen_by_both, found.n_seen_painted) == (1, 1)
-
-
-def test_cells_are_seen_that_any_photo_sees() -> None:
-    where = frame(shape=(2, 3))
-    origin = np.array([5.0, -2.0, 1.0])
-    depth = np.full((2, 3), 0.25, dtype=np.float32)
-    asked = np.array([[True, True, False], [True, True, True]])
-    looked = []
-
-    def sees(column: int, points: np.ndarray) -> np.ndarray:
-        places = where.wall_from_world(points + origin)
-        np.testing.assert_allclose(places[:, 2], 0.25, atol=1e-6)
-        looked.append(len(points))
-        return np.asarray(np.floor(places[:, 0]) == column)
-
-    views: Any = SimpleNamespace(sees=sees)
-    true: Any = SimpleNamespace(frame=where, depth_m=depth)
-    photos = [SimpleNamespace(viewing=lambda at=at: at) for at in (0, 2)]
-    truth: Any = SimpleNamespace(
-        scene=SimpleNamespace(origin=origin), cameras=SimpleNamespace(cameras=photos)
-    )
-    seen = module._seen_by_photos(true, asked, truth, views)
-    assert seen.tolist() == [[True, False, False], [True, False, True]]
-    # Of the five cells the second photo is asked for those that the first does not see.
-    assert looked == [5, 3]
-    truth.cameras = None
-    assert not module._seen_by_photos(true, asked, truth, views).any()

@@ -6,7 +6,6 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -443,6 +442,17 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
     whole, inspected = outcome("whole")
     assert whole["mean_u_mm"] == pytest.approx(3.0, abs=0.3)
     assert whole["n_traced"] > 30_000
+    # What the photo shows of the chair in front of the wall is painted on the wall behind it.
+    image, wall = given["orthoimages"].images[0], given["walls"].walls[0]
+    painted = np.argwhere((image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m))
+    cells = image.frame.world_from_wall(painted[:, ::-1] + 0.5, wall.depth_m[tuple(painted.T)])
+    way = cells - np.array([0.603, -1.9, 0.4])
+    in_chair_plane = np.array([0.6, -1.9, 0.4]) + way * (1.5 / way[:, 1:2])
+    off = np.abs(in_chair_plane[:, [0, 2]] - np.array([0.88, 0.16]))
+    n_hidden = np.count_nonzero((off <= [0.08, 0.16]).all(axis=1))
+    assert n_hidden > 1000
+    assert whole["n_ghost_cells"] == pytest.approx(n_hidden, rel=0.02)
+    assert 0.5 < whole["completeness_seen_by_both"] < 1.0
     monkeypatch.setattr(module, "_BAND_CELLS", 1000)
     parts, in_bands = outcome("parts")
     assert parts == {name: pytest.approx(value) for name, value in whole.items()}
@@ -482,107 +492,3 @@ def test_a_large_wall_takes_the_memory_of_a_band(
         tracemalloc.stop()
     metrics = {metric.name: metric.value for metric in context.metrics}
     assert metrics["depth_median_mm"] == pytest.approx(1e3 * 2.0**-9, rel=1e-6)
-
-
-def test_painters_without_an_oriented_photo_of_their_name_are_told(tmp_path: Path) -> None:
-    def context() -> StepContext:
-        return StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-
-    images: Any = SimpleNamespace(
-        images=[
-            SimpleNamespace(sources=("a.jpg", "b.jpg")),
-            SimpleNamespace(sources=("b.jpg", "c.jpg", "d.jpg")),
-        ]
-    )
-    cameras: Any = SimpleNamespace(
-        cameras=[
-            SimpleNamespace(photo=photo, status=status)
-            for photo, status in (("a.jpg", "ok"), ("b.jpg", "refused"), ("d.jpg", "ok"))
-        ]
-    )
-    ctx = context()
-    module._warn_of_untraced(images, cameras, ctx)
-    (warning,) = ctx.warnings
-    assert "not traced where b.jpg, c.jpg painted" in warning
-    ctx = context()
-    module._warn_of_untraced(images, None, ctx)
-    images.images[1].sources = ("a.jpg",)
-    images.images[0].sources = ("d.jpg",)
-    module._warn_of_untraced(images, cameras, ctx)
-    assert list(ctx.warnings) == []
-
-
-def test_bands_are_whole_blocks_with_a_block_about_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    def bands_of(height: int, width: int) -> list[tuple[int, int, int, int]]:
-        image: Any = SimpleNamespace(
-            mask=np.broadcast_to(np.uint8(0), (height, width)),
-            frame=SimpleNamespace(shape=(height, width)),
-        )
-        found = [*module._bands(image)]
-        return [(b.rows.start, b.rows.stop, b.around.start, b.around.stop) for b in found]
-
-    monkeypatch.setattr(module, "_BAND_CELLS", 50 * 96 * 4)
-    assert bands_of(384, 50) == [(0, 384, 0, 384)]
-    # Four blocks at once, of which one above and one below are about the band.
-    assert bands_of(500, 50) == [(0, 192, 0, 288), (192, 384, 96, 480), (384, 500, 288, 500)]
-    assert bands_of(200, 300) == [(0, 96, 0, 192), (96, 192, 0, 200), (192, 200, 96, 200)]
-
-
-@pytest.mark.parametrize(
-    ("wired", "dropped", "missing"),
-    [
-        (("orthoimages",), "orthoimages", "walls"),
-        (("walls", "cameras"), "walls and cameras", "orthoimages"),
-        (("cameras",), "cameras", "orthoimages and walls"),
-    ],
-)
-def test_what_would_let_more_be_compared_is_told(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    wired: tuple[str, ...],
-    dropped: str,
-    missing: str,
-) -> None:
-    monkeypatch.setattr(module, "inspect_planes", lambda *_: None)
-    given = dict.fromkeys(("orthoimages", "walls", "cameras"))
-    inputs: Any = SimpleNamespace(
-        **(given | dict.fromkeys(wired, 1)), planes=1, labels=None, truth=None
-    )
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    module._inspect_planes(inputs, ctx)
-    (said,) = ctx.warnings
-    assert f"the truth: {dropped}, for want of {missing}; only" in said
-
-
-def test_who_sees_a_cell_is_asked_of_each_station_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    rendered_by: list[Any] = []
-    monkeypatch.setattr(
-        "orthoflow.geometry.scene_views.render", lambda *how: rendered_by.append(how)
-    )
-    given: Any = SimpleNamespace(
-        stations=np.array([[3.0, 1.0, 2.0], [0.0, 5.0, 1.0], [3.0, 1.0, 2.0]]),
-        planes=SimpleNamespace(up=np.array([0.0, 0.0, 1.0])),
-        lowest_elevation_deg=-60.0,
-        highest_elevation_deg=80.0,
-        scene="scene",
-    )
-    judge: Any = SimpleNamespace(
-        inputs=SimpleNamespace(truth=given),
-        walls=SimpleNamespace(slab=lambda wall: SimpleNamespace(front_m=0.1 + wall, behind_m=0.2)),
-        params=SimpleNamespace(supersample=5),
-        ctx=SimpleNamespace(cores=3),
-    )
-    chosen: Any = SimpleNamespace(
-        coloured=np.array([[True, False, False]]), lattice=np.array([[False, True, False]])
-    )
-    image: Any = SimpleNamespace(wall=2, frame="frame")
-    module._Judge._true_orthoimage(judge, image, chosen)
-    ((scene, frame, rendering),) = rendered_by
-    assert (scene, frame) == ("scene", "frame")
-    assert (rendering.buffer_front_m, rendering.buffer_behind_m) == (2.1, 0.2)
-    assert (rendering.supersample, rendering.cores) == (5, 3)
-    np.testing.assert_array_equal(rendering.coloured, chosen.coloured)
-    assert rendering.judged.tolist() == [[True, True, False]]
-    viewers = rendering.viewers
-    assert viewers.positions_world.tolist() == [[0.0, 5.0, 1.0], [3.0, 1.0, 2.0]]
-    assert (viewers.lowest_elevation_deg, viewers.highest_elevation_deg) == (-60.0, 80.0)
