@@ -38,7 +38,7 @@ gc.set_threshold(50_000, *gc.get_threshold()[1:])
 
 # For what numba compiles, set before anything imports it: in the private cache of the user, for the
 # tests and for the steps that they run.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba-of-tests")))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba")))
 
 # What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
