@@ -403,26 +403,46 @@ def read_raster(path: Path) -> RasterFile:
         InputError: the file is no GeoTIFF that GDAL can read, or its cells are not square and
             upright.
     """
+    with _opened(path) as dataset:
+        _check_size(path, dataset)
+        values = dataset.read()
+        return RasterFile(
+            values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
+            shown=dataset.dataset_mask() > 0,
+            gsd_m=_gsd_m(path, dataset.transform),
+            corner_m=(float(dataset.transform.c), float(dataset.transform.f)),
+            down=math.copysign(1.0, dataset.transform.e),
+            tags=dict(dataset.tags()),
+            crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
+            nodata=dataset.nodata,
+            overviews=tuple(dataset.overviews(1)),
+            layout=dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT", ""),
+        )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[DatasetReader]:
+    """Open a GeoTIFF whose header is believed."""
+    import rasterio
+
+    with _reading(path), rasterio.open(path, driver="GTiff") as dataset:
+        check_header(path, dataset)
+        yield dataset
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what GDAL raises while it reads a file into a sentence.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     import rasterio
     from rasterio.errors import RasterioError
 
     try:
-        with quiet(), rasterio.open(path, driver="GTiff") as dataset:
-            check_header(path, dataset)
-            _check_size(path, dataset)
-            values = dataset.read()
-            return RasterFile(
-                values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
-                shown=dataset.dataset_mask() > 0,
-                gsd_m=_gsd_m(path, dataset.transform),
-                corner_m=(float(dataset.transform.c), float(dataset.transform.f)),
-                down=math.copysign(1.0, dataset.transform.e),
-                tags=dict(dataset.tags()),
-                crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
-                nodata=dataset.nodata,
-                overviews=tuple(dataset.overviews(1)),
-                layout=dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT", ""),
-            )
+        with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+            yield
     except (RasterioError, OSError, UnicodeDecodeError) as error:
         # UnicodeDecodeError: GDAL's messages and tags hold bytes of the file.
         raise InputError(
@@ -452,7 +472,7 @@ class RasterParts:
         import rasterio
 
         self._path = path
-        with self._reading():
+        with _reading(self._path):
             self._dataset: DatasetReader = rasterio.open(path, driver="GTiff")
             check_header(path, self._dataset)
         self.shape: tuple[int, int] = (self._dataset.height, self._dataset.width)
@@ -491,26 +511,13 @@ class RasterParts:
         left, top, right, bottom = cells
         window = Window(left, top, right - left, bottom - top)
         average = Resampling.average
-        with self._reading():
+        with _reading(self._path):
             read = self._dataset.read(
                 window=window, out_shape=(self.bands, *shape), resampling=average
             )
             shown = self._dataset.dataset_mask(window=window, out_shape=shape)
         values = read[0] if self.bands == 1 else np.moveaxis(read, 0, 2)
         return values, shown > 0
-
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        import rasterio
-        from rasterio.errors import RasterioError
-
-        try:
-            with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
-                yield
-        except (RasterioError, OSError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"{self._path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
-            ) from error
 
 
 def check_header(path: Path, dataset: DatasetReader) -> None:
@@ -699,31 +706,23 @@ def place_of(path: Path) -> RasterPlace:
         InputError: the file is no GeoTIFF that GDAL can read, or says what no file of its size can
             hold.
     """
-    import rasterio
-    from rasterio.errors import RasterioError
     from rasterio.warp import transform
 
-    try:
-        with quiet(), rasterio.open(path, driver="GTiff") as dataset:
-            check_header(path, dataset)
-            epsg = dataset.crs.to_epsg() if dataset.crs else None
-            left, first, right, last = dataset.bounds
-            bottom, top = sorted((first, last))
-            outline: tuple[tuple[float, float], ...] = ()
-            if epsg is not None:
-                x, y = (left, right, right, left, left), (bottom, bottom, top, top, bottom)
-                lon, lat = transform(dataset.crs, "EPSG:4326", x, y)
-                outline = tuple(zip(lon, lat, strict=True))
-            return RasterPlace(
-                shape=(dataset.height, dataset.width),
-                transform=tuple(dataset.transform)[:6],
-                epsg=epsg,
-                wkt2=dataset.crs.to_wkt(version="WKT2_2019") if dataset.crs else "",
-                bounds=(left, bottom, right, top),
-                outline_lonlat=outline,
-                bands=tuple(dataset.dtypes),
-            )
-    except (RasterioError, OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
-        ) from error
+    with _opened(path) as dataset:
+        epsg = dataset.crs.to_epsg() if dataset.crs else None
+        left, first, right, last = dataset.bounds
+        bottom, top = sorted((first, last))
+        outline: tuple[tuple[float, float], ...] = ()
+        if epsg is not None:
+            x, y = (left, right, right, left, left), (bottom, bottom, top, top, bottom)
+            lon, lat = transform(dataset.crs, "EPSG:4326", x, y)
+            outline = tuple(zip(lon, lat, strict=True))
+        return RasterPlace(
+            shape=(dataset.height, dataset.width),
+            transform=tuple(dataset.transform)[:6],
+            epsg=epsg,
+            wkt2=dataset.crs.to_wkt(version="WKT2_2019") if dataset.crs else "",
+            bounds=(left, bottom, right, top),
+            outline_lonlat=outline,
+            bands=tuple(dataset.dtypes),
+        )

@@ -61,24 +61,6 @@ def test_a_file_that_names_another_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "count", "is_read"),
-    [
-        (1 << 14, 1 << 14, 4, True),
-        ((1 << 14) + 1, 1 << 14, 1, False),
-        (4, 4, 5, False),
-    ],
-)
-def test_so_many_cells_and_bands_are_read(
-    width: int, height: int, count: int, *, is_read: bool
-) -> None:
-    if is_read:
-        module._check_size(PATH, stated(width, height, count))
-    else:
-        with pytest.raises(InputError, match=f"{width} x {height} cells in {count} bands"):
-            module._check_size(PATH, stated(width, height, count))
-
-
-@pytest.mark.parametrize(
     ("side_m", "is_side"), [(0.9e-6, False), (1.1e-6, True), (0.9e6, True), (1.1e6, False)]
 )
 def test_cells_are_of_a_micrometre_to_a_thousand_kilometres(

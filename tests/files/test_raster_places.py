@@ -42,7 +42,7 @@ def test_a_raster_in_the_plane_of_its_wall_is_no_place_on_earth(tmp_path: Path) 
     write_raster(path, np.zeros((2, 3), np.float32), place=GridPlace(gsd_m=0.5), tags={})
     found = place_of(path)
     assert (found.epsg, found.outline_lonlat) == (None, ())
-    assert found.wkt2.startswith('ENGCRS["plane, metres"')
+    assert found.wkt2.startswith('ENGCRS["run 00000000-000000-000000 plane, metres"')
     assert (found.shape, found.bands) == ((2, 3), ("float32",))
     assert found.bounds == (0.0, -1.0, 1.5, 0.0)
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-from orthoflow.files import yaml_positions
 from orthoflow.files.yaml_positions import (
     Dialect,
     Listing,
@@ -363,15 +361,3 @@ def test_a_key_that_is_no_word_is_told_once_and_stands_as_one() -> None:
     (entry,) = document
     assert (entry.key, entry.is_text) == ("?", True)
     assert [words for *_, words in problems.found] == ["a key must be text, got a list or mapping"]
-
-
-def test_what_the_library_tells_without_a_place_is_told_of_the_first_letter() -> None:
-    told = yaml_positions._unreadable(
-        MarkedYAMLError("while composing", None, "odd  words", None), ""
-    )
-    assert (str(told), told.position) == (
-        "this is not YAML: while composing, odd words",
-        Position(line=1, column=1),
-    )
-    assert yaml_positions._reader_position("a\nb", YAMLError()) == Position(line=1, column=1)
-    assert yaml_positions._first_line(YAMLError()) == "YAMLError"

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read.reporting import report_quality, warn_of_up
 
-from orthoflow.geometry import cloud_quality
 from orthoflow.geometry.cloud_quality import CloudQuality, judge_quality
 from orthoflow.sdk import StepContext
 
@@ -52,27 +50,6 @@ def test_thickness_and_step_are_those_of_the_scan(noise_m: float, step_m: float)
     assert quality.scans_apart_m is None
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_of_a_large_cloud_a_part_says_as_much(monkeypatch: pytest.MonkeyPatch, axis: int) -> None:
-    # As large as two hundred million points, in the way of looking: slabs across the longest axis.
-    monkeypatch.setattr("orthoflow.geometry.cloud_quality._LOOKED_AT_MOST", 4000)
-    points = np.roll(wall(step_m=0.005, noise_m=0.002), axis, axis=1)
-    looked_at = 0
-    measured = cloud_quality._measured
-
-    def counted(points: NDArray[np.float64], *rest: Any) -> Any:
-        nonlocal looked_at
-        looked_at += len(points)
-        return measured(points, *rest)
-
-    monkeypatch.setattr("orthoflow.geometry.cloud_quality._measured", counted)
-    quality = judge_quality(offsets(points), None)
-    assert quality is not None
-    assert looked_at < 0.2 * len(points)
-    assert quality.sigma_m == pytest.approx(0.002, rel=0.15)
-    assert quality.scan_step_m == pytest.approx(0.005, rel=0.1)
-
-
 @pytest.mark.parametrize("apart_m", [0.0, 0.005])
 def test_scans_that_lie_apart_are_found(apart_m: float) -> None:
     one = wall(step_m=0.007, noise_m=0.002, seed=1)
@@ -106,22 +83,6 @@ def test_the_largest_pieces_are_a_metre_wide() -> None:
     assert thin is not None
     assert thin.side_m == 1.0
     assert thin.sigma_m == pytest.approx(0.01, rel=0.15)
-
-
-def test_pieces_of_thirty_points_are_looked_at_and_three_hundred_at_most() -> None:
-    rng = np.random.default_rng(6)
-    cubes = [(i, j, k) for i in range(10) for j in range(10) for k in range(7)]
-    counts = np.where(np.arange(len(cubes)) % 7 == 0, 29, 30)
-    counts[0] = 29
-    corners = np.repeat(np.array(cubes) * 1.0, counts, axis=0)
-    points = corners + rng.uniform(0.01, 0.99, corners.shape)
-    points[0] = 0.0
-    found = list(cloud_quality._indices_of_pieces(offsets(points), 1.0))
-    # One cube in three, of which six in seven have points enough.
-    assert 700 / 3 * 0.7 < len(found) < 300
-    for piece in found:
-        assert len(piece) == 30
-        assert len(np.unique(np.floor(points[piece]), axis=0)) == 1
 
 
 def room(turned_deg: float, *, without_level: bool = False) -> NDArray[np.float64]:
@@ -186,104 +147,6 @@ def test_another_axis_is_told_with_the_setting(tmp_path: Path) -> None:
     assert ctx.warnings == [said]
 
 
-def square(across: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-    """Points (1600, 3) of a square of 10 cm, so far before it in turn."""
-    u, v = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(40) * 0.0025]))
-    return np.column_stack([u, np.broadcast_to(across, u.shape), v])
-
-
-def shuffled(*values: float) -> NDArray[np.float64]:
-    return np.random.default_rng(1).permutation(np.resize(values, 1600))
-
-
-def test_a_piece_is_as_thick_as_its_points_lie_apart() -> None:
-    even = shuffled(*np.linspace(-0.002, 0.002, 1600))
-    scan = np.zeros(1600, dtype=np.uint16)
-    piece = cloud_quality._measured(square(even), scan, 0.1)
-    assert piece is not None
-    assert piece.sigma_m == pytest.approx(1.4826 * 0.001, rel=0.01)
-    assert piece.width_95_m == pytest.approx(0.95 * 0.004, rel=0.005)
-    assert piece.scan_step_m == pytest.approx(0.0025, rel=0.01)
-    assert np.isnan([piece.apart_m, piece.sigma_apart_m]).all()
-    # No more than 4000 points of a scan count, from its first on.
-    several = np.concatenate([square(even), square(even), square(even)[:800], square(5.0 * even)])
-    several[:, 0] += 0.0005 * np.repeat(np.arange(4), [1600, 1600, 800, 1600])
-    many = cloud_quality._measured(several, np.zeros(len(several), dtype=np.uint16), 0.1)
-    assert many is not None
-    assert many.sigma_m == pytest.approx(piece.sigma_m, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("points", "is_surface"),
-    [
-        (square()[::54], True),
-        (square()[::56], False),
-        # Scattered by 9 and by 11 mm, in a square of 10 cm.
-        (square(shuffled(0.009 / 1.4826, -0.009 / 1.4826)), True),
-        (square(shuffled(0.011, -0.011)), False),
-        # A strip as wide as half of the square, and one as a quarter.
-        (square()[square()[:, 0] < 0.055], True),
-        (square()[square()[:, 0] < 0.025], False),
-        # A fifth of the points six times as far off as the others scatter, and three times.
-        (square(shuffled(*4 * [0.001, -0.001], 0.006 * 1.4826, -0.006 * 1.4826)), False),
-        (square(shuffled(*4 * [0.001, -0.001], 0.003 * 1.4826, -0.003 * 1.4826)), True),
-    ],
-    ids=["30 points", "29", "scatter", "more", "strip", "narrow", "edge of another", "noise"],
-)
-def test_a_piece_is_one_surface_that_its_points_cover(
-    points: NDArray[np.float64], is_surface: bool
-) -> None:
-    scan = np.zeros(len(points), dtype=np.uint16)
-    assert (cloud_quality._measured(points, scan, 0.1) is not None) is is_surface
-
-
-def test_the_scan_farthest_from_the_fullest_one_tells_how_far_scans_lie_apart() -> None:
-    fine = shuffled(0.001, -0.001, 0.0)
-    points = [square(fine), square(0.004 + 2.0 * fine)[::2], square(0.002)[1::2]]
-    scan = np.repeat(np.array([7, 2, 5], dtype=np.uint16), [1600, 800, 800])
-    across = np.concatenate([part[:, 1] for part in points])
-    middles = {one: float(np.median(across[scan == one])) for one in (7, 2, 5)}
-    apart, sigma = cloud_quality._farthest(across, scan, middles, 7)  # type: ignore[arg-type]
-    assert apart == pytest.approx(0.004)
-    # A median of n values is 1.2533 / sqrt(n) times as sure as one of them.
-    one, other = 1.4826 * 0.001 / np.sqrt(1600), 1.4826 * 0.002 / np.sqrt(800)
-    assert sigma == pytest.approx(1.2533 * np.hypot(one, other))
-    piece = cloud_quality._measured(np.concatenate(points), scan, 0.1)
-    assert piece is not None
-    assert piece.apart_m == pytest.approx(0.004, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("sigma_m", "sigma_apart_m", "apart_m", "disagrees"),
-    [
-        (0.0002, 0.0001, 0.0009, False),
-        (0.0002, 0.0001, 0.0011, True),
-        (0.003, 0.0001, 0.0029, False),
-        (0.003, 0.0001, 0.0031, True),
-        (0.0002, 0.001, 0.0029, False),
-        (0.0002, 0.001, 0.0031, True),
-    ],
-)
-def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
-    sigma_m: float, sigma_apart_m: float, apart_m: float, disagrees: bool
-) -> None:
-    piece = cloud_quality._Piece(
-        sigma_m=sigma_m,
-        width_95_m=0.01,
-        scan_step_m=0.002,
-        apart_m=apart_m,
-        sigma_apart_m=sigma_apart_m,
-        normal=ASKEW[0],
-    )
-    found = cloud_quality._summed_up([piece] * 20, 0.1)
-    assert (found.scans_apart_m, found.sigma_apart_m) == (apart_m, sigma_apart_m)
-    assert found.disagrees == disagrees
-    # Nineteen pieces that two scans show say nothing.
-    few = cloud_quality._summed_up([piece] * 19, 0.1)
-    assert (few.scans_apart_m, few.sigma_apart_m, few.disagrees) == (None, 0.0, False)
-    assert few.n_pieces == 19
-
-
 def test_dense_clouds_are_judged_on_a_part_of_their_pieces() -> None:
     dense = judge_quality(offsets(wall(step_m=0.0015, noise_m=0.001)), None)
     assert dense is not None
@@ -327,3 +190,33 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
     quiet = context(tmp_path)
     report_quality(None, quiet)
     assert (quiet.metrics, quiet.warnings) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_apart_m", "limit_m"),
+    [(0.0002, 0.0001, 0.001), (0.003, 0.0001, 0.003), (0.0002, 0.001, 0.003)],
+    ids=["a millimetre", "their scatter", "chance"],
+)
+def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
+    sigma_m: float, sigma_apart_m: float, limit_m: float
+) -> None:
+    for off in (-0.0001, 0.0001):
+        quality = CloudQuality(
+            side_m=0.1,
+            n_pieces=40,
+            sigma_m=sigma_m,
+            width_95_m=0.01,
+            scan_step_m=0.002,
+            scans_apart_m=limit_m + off,
+            sigma_apart_m=sigma_apart_m,
+            normals=ASKEW[:1],
+        )
+        assert quality.disagrees is (off > 0.0)
+
+
+def test_of_a_large_cloud_a_part_is_measured() -> None:
+    # Of more than four million points some slabs.
+    quality = judge_quality(offsets(wall(step_m=0.0011, noise_m=0.001)), None)
+    assert quality is not None
+    assert quality.sigma_m == pytest.approx(0.001, rel=0.15)
+    assert quality.scan_step_m == pytest.approx(0.0011, rel=0.1)

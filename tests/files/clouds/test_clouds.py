@@ -501,12 +501,3 @@ def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(found.points), other.world)
     np.testing.assert_array_equal(np.rint(255.0 * np.asarray(found.colors)), other.rgb)
     np.testing.assert_allclose(np.asarray(found.normals), other.normal, atol=1e-6)
-
-
-def test_a_node_of_a_copc_keeps_so_many_points_whole() -> None:
-    # All in one cell of the root's grid, so that those of a node that is split go far down.
-    for n_points in (1 << 15, (1 << 15) + 1):
-        codes = np.arange(n_points, dtype=np.uint64)
-        totals = [np.eye(1, 8**level, dtype=np.int64)[0] * n_points for level in range(3)]
-        is_root = copc._levels(codes, totals) == 0
-        assert is_root.sum() == (n_points if n_points == 1 << 15 else 1)

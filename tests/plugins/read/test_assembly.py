@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read import assembly
 from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
 
-from orthoflow.errors import InputError, StoreError
+from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import PointBlock, PointField, Scan, ScanFile
-from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 
 FIELDS: tuple[PointField, ...] = ("intensity", "rgb", "grid")
@@ -224,50 +220,6 @@ def test_rows_and_columns_beyond_32_bits_are_cut(tmp_path: Path) -> None:
     found = assembled(tmp_path, file("a", odd))
     assert found.array("row").tolist() == [0, 7, 2**32 - 1]  # type: ignore[union-attr]
     assert found.array("column").tolist() == [2**32 - 1, 0, 1]  # type: ignore[union-attr]
-
-
-def test_sixteen_bits_number_the_scans(tmp_path: Path) -> None:
-    last = file("a", *(block(k, 1, scan=k) for k in range(2)))
-    growing = CloudAssembly(context(tmp_path), [last], metres())
-    growing._store_scan(65_535, slice(0, 1))
-    assert growing._scan is not None
-    assert growing._scan.tolist() == [65_535, 0]
-    with pytest.raises(InputError, match="more than 65536 scans"):
-        growing._store_scan(65_536, slice(0, 1))
-
-
-def test_there_is_room_for_every_array_of_a_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    many = replace(file("a", block(1, 1)), n_most=1000)
-    # x, y, z, intensity, row and column of 4 bytes, three of colour, two of the scan: what is asked
-    # for is more than that, and not twice.
-    growing = CloudAssembly(context(tmp_path), [many], metres())
-    growing._store_scan(1, slice(0, 1))
-    n_bytes = sum(path.stat().st_size for path in (tmp_path / "allocated").iterdir())
-    assert n_bytes == 1000 * (6 * 4 + 3 + 2)
-    for free, is_enough in ((n_bytes, False), (39_999, False), (40_000, True)):
-        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        folder = tmp_path / f"{free}"
-        folder.mkdir()
-        if is_enough:
-            CloudAssembly(context(folder), [many], metres())
-        else:
-            with pytest.raises(StoreError, match="1000 points need"):
-                CloudAssembly(context(folder), [many], metres())
-            assert list(folder.iterdir()) == []
-
-
-def test_points_that_can_all_be_used_are_not_copied() -> None:
-    points = np.random.default_rng(2).uniform(-FARTHEST_M, FARTHEST_M, (50, 3))
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    assert assembly._usable(points, bounds) == slice(None)
-    points[[7, 9], [0, 2]] = (1.1 * FARTHEST_M, np.nan)
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    np.testing.assert_array_equal(
-        np.flatnonzero(~assembly._usable(points, bounds)),  # type: ignore[operator]
-        [7, 9],
-    )
 
 
 # --- how coordinates are rounded ---

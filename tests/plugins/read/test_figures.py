@@ -232,34 +232,6 @@ def test_clouds_without_a_grid_have_no_lines() -> None:
     assert bare.shape[1] == 1200
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 46.0, 90.0, 178.0])
-@pytest.mark.parametrize("distance_m", [-3.68, 0.32, 7.43])
-def test_the_fullest_wall_is_found_to_a_degree_and_half_a_cell(
-    angle_deg: float, distance_m: float
-) -> None:
-    angle = np.radians(angle_deg)
-    along, away = (
-        np.array([np.cos(angle), np.sin(angle)]),
-        np.array([np.sin(angle), -np.cos(angle)]),
-    )
-    rng = np.random.default_rng(4)
-    wall = np.linspace(-4.0, 4.0, 400)[:, None] * along + distance_m * away
-    # A shorter wall across, things that stand about, and a fuller one far off.
-    shorter = np.linspace(-2.0, 2.0, 200)[:, None] * away
-    far = 1500.02 * along + np.linspace(0.0, 20.0, 450)[:, None] * away
-    plan = np.concatenate([wall, shorter, rng.uniform(-4.0, 4.0, (300, 2)), far])
-    found, found_m = figures._fullest_wall(plan)
-    np.testing.assert_allclose(found, along, atol=1e-9)
-    assert found_m == pytest.approx(distance_m, abs=0.025)
-    # Every point is looked at, whichever come first.
-    mixed = np.stack([rng.uniform(-4.0, 4.0, (400, 2)), wall], axis=1).reshape(-1, 2)
-    np.testing.assert_allclose(figures._fullest_wall(mixed)[0], along, atol=1e-9)
-    # As far as a kilometre off it counts.
-    plan[900:] -= 600.0 * along
-    found, _ = figures._fullest_wall(plan)
-    np.testing.assert_allclose(np.abs(found @ away), 1.0, atol=1e-9)
-
-
 @pytest.mark.parametrize(("before_m", "is_drawn"), [(0.1, True), (0.2, False)])
 def test_what_lies_fifteen_centimetres_beside_the_wall_is_drawn(
     before_m: float, is_drawn: bool
@@ -272,33 +244,6 @@ def test_what_lies_fifteen_centimetres_beside_the_wall_is_drawn(
     is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
     assert is_point[:280, 50:400].any() == is_drawn
     assert is_point[320:, 50:400].any()
-
-
-def test_a_line_breaks_where_a_step_is_six_times_as_long_as_usual() -> None:
-    steps = np.array([2, 2, 3, 2, 12, 2, 13, 2, 2, 40, 2])
-    line = np.column_stack([np.cumsum([5, *steps]), np.full(12, 7)])
-    pieces = figures._unbroken(line)
-    assert [piece[:, 0].tolist() for piece in pieces] == [
-        [5, 7, 9, 12, 14, 26, 28],
-        [41, 43, 45],
-        [85, 87],
-    ]
-    # Points that lie on one another have steps of a pixel.
-    dense = np.column_stack([[0, 0, 0, 0, 6, 6, 13], np.zeros(7, dtype=np.int64)])
-    assert [len(piece) for piece in figures._unbroken(dense)] == [6, 1]
-    assert [len(piece) for piece in figures._unbroken(line[:1])] == [1]
-
-
-def test_about_two_dozen_lines_are_drawn_each_in_its_order() -> None:
-    lines = np.repeat(np.arange(10, 105), 3)
-    order = np.tile([2, 0, 1], 95)
-    found = list(figures._some_lines(lines, order))
-    # Every third of 95.
-    assert [int(lines[mine[0]]) for mine in found] == list(range(10, 105, 3))
-    for mine in found:
-        assert order[mine].tolist() == [0, 1, 2]
-        assert len(set(lines[mine])) == 1
-    assert len(list(figures._some_lines(lines[:90], order[:90]))) == 30
 
 
 # --- the sheet ---
@@ -352,10 +297,3 @@ def test_a_photo_of_one_row_is_a_line() -> None:
         shown: Any = np.array(sheet.encoded())
         rows, columns = np.nonzero((shown == 0).all(axis=2))
         assert (len(set(rows)), len(set(columns))) == size
-
-
-def test_long_names_are_cut_in_the_middle() -> None:
-    assert figures._shortened("abcdefghij", 10) == "abcdefghij"
-    assert figures._shortened("abcdefghijk", 10) == "abc..ghijk"
-    assert figures._shortened("abcdefghijkl", 9) == "abc..ijkl"
-    assert figures._shortened("Gebäude.jpg", 40) == "Geb?ude.jpg"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterable
@@ -14,14 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import assembly
-from orthoflow_plugins.read.assembly import rounding_m
-from orthoflow_plugins.read.figures import polar_view_png
-from orthoflow_plugins.read.scales import ColourScale
 from orthoflow_plugins.read.scan import ReadScan
-from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 from orthoflow.errors import CancelledStepError, InputError, StoreError
-from orthoflow.files.images import decode_image
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import StepContext
 from tests import scan_files
@@ -271,14 +265,6 @@ def test_one_point_is_a_cloud(tmp_path: Path, read: Reader) -> None:
     assert cloud.intensity.tolist() == [1.0]
 
 
-@pytest.mark.parametrize("step", [0.01, 0.005, 2.0**-5])
-def test_rounded_coordinates_are_noticed(step: float, points: NDArray[np.float64]) -> None:
-    rounded = np.rint(points / step) * step
-    assert rounding_m(rounded, 1.0) == pytest.approx(step, rel=1e-12)
-    assert rounding_m(rounded / 0.3048, 0.3048) == pytest.approx(0.0, abs=1e-12)
-    assert rounding_m(points, 1.0) == 0.0
-
-
 def test_rounded_coordinates_are_warned_of_and_others_are_not(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -371,40 +357,6 @@ def test_fields_that_only_some_files_have_are_kept_with_a_word(
 
 
 # Stations
-
-
-def summary(
-    station: tuple[float, float, float] | None, *, is_posed: bool, at: float = 0.0
-) -> ScanSummary:
-    return ScanSummary(
-        station=None if station is None else np.array(station),
-        is_posed=is_posed,
-        low=np.full(3, at - 2.0),
-        high=np.full(3, at + 2.0),
-    )
-
-
-def test_a_scan_without_pose_was_seen_from_its_origin_when_it_lies_around_it() -> None:
-    stations = choose_stations([summary((0, 0, 0), is_posed=False)], None)
-    assert stations.source == "file"
-    np.testing.assert_array_equal(stations.positions, [[0, 0, 0]])
-
-
-@pytest.mark.parametrize(
-    "scans",
-    [
-        [summary((0, 0, 0), is_posed=False, at=1000.0)],
-        [summary((0, 0, 0), is_posed=False)] * 2,
-        [summary(None, is_posed=False)],
-        [],
-    ],
-    ids=["survey-coordinates", "registered-before-export", "no-station", "no-scan"],
-)
-def test_an_origin_that_cannot_be_a_scanner_is_none(scans: list[ScanSummary]) -> None:
-    assert choose_stations(scans, None).positions is None
-    viewed = choose_stations(scans, (1.0, 2.0, 3.0))
-    assert viewed.source == "view_from"
-    np.testing.assert_array_equal(viewed.positions, [[1.0, 2.0, 3.0]])
 
 
 def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
@@ -510,33 +462,6 @@ def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
     np.testing.assert_array_equal(cloud.rgb, rgb)
 
 
-@pytest.mark.parametrize(
-    ("parts", "expected", "scale"),
-    [
-        ([[[0.0, 0.5, 1.0]]], [[0, 128, 255]], "0..1"),
-        ([[[0.0, 1.0, 1.0]], [[7.0, 8.0, 255.0]]], [[0, 1, 1], [7, 8, 255]], "8 bit"),
-        ([[[0.0, 1.0, 200.0]], [[65535.0, 256.0, 0.0]]], [[0, 0, 0], [255, 1, 0]], "16 bit"),
-        ([[[-3.0, np.nan, 200.0]]], [[0, 0, 200]], "8 bit"),
-    ],
-    ids=["unit", "bytes-found-late", "words-found-late", "rubbish"],
-)
-def test_the_scale_of_colours_is_found_while_they_come(
-    parts: list[list[list[float]]], expected: list[list[int]], scale: str
-) -> None:
-    stored = np.zeros((4, 3), np.uint8)
-    colours = ColourScale(stored, None)
-    for part in parts:
-        colours.add(np.array(part))
-    np.testing.assert_array_equal(stored[: len(expected)], expected)
-    assert colours.scale == scale
-
-
-def test_a_stated_colour_limit_sets_the_scale() -> None:
-    stored = np.zeros((1, 3), np.uint8)
-    ColourScale(stored, 65535.0).add(np.array([[0, 32768, 65535]], np.uint16))
-    np.testing.assert_array_equal(stored, [[0, 128, 255]])
-
-
 # The method as a whole
 
 
@@ -569,34 +494,6 @@ def test_no_path_enters_the_cloud(
 ) -> None:
     cloud = read(write_text(tmp_path / "a.xyz", points))
     assert str(tmp_path) not in json.dumps(cloud.source)
-
-
-@pytest.mark.parametrize("turned", [False, True], ids=["clockwise", "counter-clockwise"])
-def test_a_gridded_scan_is_drawn_as_its_station_saw_it(turned: bool) -> None:
-    rows, columns = np.indices((30, 80))
-    azimuth = np.radians(90.0 + (1 if turned else -1) * (columns - 40.0))
-    elevation = np.radians(rows - 15.0)
-    away = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
-    # The upper right of what one sees who looks north is bright.
-    bright = (away[:, 0] > 0.3) & (away[:, 2] > 0.1)
-    cloud = PointCloud(
-        origin=np.zeros(3),
-        **{name: 5.0 * away[:, k].astype(np.float32) for k, name in enumerate("xyz")},
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity=np.where(bright, 0.9, 0.1).astype(np.float32),
-        row=rows.ravel().astype(np.uint32),
-        column=columns.ravel().astype(np.uint32),
-        stations=np.zeros((1, 3)),
-        stations_source="file",
-    )
-    picture = polar_view_png(cloud)
-    assert picture is not None
-    image = decode_image(picture)[..., 0]
-    assert image.shape == (30, 80)
-    assert image[:5, -10:].min() > 200
-    assert image[-5:].max() < 100
-    assert image[:, :40].max() < 100
-    assert polar_view_png(dataclasses.replace(cloud, intensity=None)) is None
 
 
 def test_a_picture_from_above_is_drawn(
