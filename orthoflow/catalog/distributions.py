@@ -11,8 +11,8 @@ from importlib.util import cache_from_source, find_spec
 from pathlib import Path
 from typing import Final
 
-_REQUIREMENT: Final = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?[^;]*(.*)", re.DOTALL)
-_OF_EXTRA: Final = re.compile(r"extra\s*==\s*[\"']([\w.-]+)[\"']")
+# The name at the beginning of a requirement.
+_REQUIREMENT: Final = re.compile(r"[\w.-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,39 +140,35 @@ def canonical_name(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def direct_requirements(name: str) -> frozenset[str] | None:
+    """Distributions that one requires itself, by canonical name, for whatever system.
+
+    Its extras are left out. None when it is not installed, or its metadata cannot be read.
+    """
+    try:
+        stated = requires(name) or []
+    except (PackageNotFoundError, ValueError):
+        return None
+    found = (_REQUIREMENT.match(text) for text in stated if "extra ==" not in text)
+    return frozenset(canonical_name(match[0]) for match in found if match)
+
+
 @cache
 def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
-    """Distributions and all that they require, by canonical name, whatever system that is for.
+    """Distributions and all that they require, directly or through others, by canonical name.
 
     None when one of the named is not installed here: its requirements are unknown.
     """
-    # Name and the extras that are asked for.
-    left = [(canonical_name(name), frozenset[str]()) for name in names]
-    asked = set(left)
-    missing: set[str] = set()
-    while left:
-        name, extras = left.pop()
-        try:
-            stated = requires(name) or []
-        except (PackageNotFoundError, ValueError):
-            # No such thing, or its metadata cannot be read.
-            missing.add(name)
-            continue
-        for text in stated:
-            found = _REQUIREMENT.fullmatch(text)
-            if found is None:
-                continue
-            of_extra = _OF_EXTRA.search(found[3])
-            if of_extra and canonical_name(of_extra[1]) not in extras:
-                continue
-            wanted = frozenset(canonical_name(one.strip()) for one in (found[2] or "").split(","))
-            new = canonical_name(found[1]), wanted
-            if new not in asked:
-                asked.add(new)
-                left.append(new)
-    if not missing.isdisjoint(map(canonical_name, names)):
+    left = [canonical_name(name) for name in names]
+    if any(direct_requirements(name) is None for name in left):
         return None
-    return frozenset(name for name, _ in asked)
+    found: set[str] = set()
+    while left:
+        name = left.pop()
+        if name not in found:
+            found.add(name)
+            left += direct_requirements(name) or ()
+    return frozenset(found)
 
 
 @cache

@@ -19,7 +19,12 @@ from pathlib import Path
 from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
-from orthoflow.catalog.distributions import canonical_name, package_path, source_files
+from orthoflow.catalog.distributions import (
+    canonical_name,
+    direct_requirements,
+    package_path,
+    source_files,
+)
 from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
@@ -44,7 +49,6 @@ _WITHOUT_EFFECT: Final = frozenset(
     | {"ruamel-yaml"}
 )
 _OUR_OWN: Final = frozenset({"orthoflow", "orthoflow_plugins", "orthoflow_provenance"})
-_REQUIREMENT: Final = re.compile(r"[\w.-]+")
 _IMPORTED: Final = re.compile(r"^\s*(?:import|from)\s+([A-Za-z_]\w*)", re.MULTILINE)
 _MADE_BY_PYTHON: Final = frozenset({"__pycache__", ".pyc", ".nbi", ".nbc"})
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
@@ -211,22 +215,13 @@ def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mappi
         distribution: of the plugin.
         sources: its Python files, where it is not one of ours.
     """
-    names = {*_CORE, *_required(DISTRIBUTION), *_required(distribution), *_imported(sources)}
+    required = [direct_requirements(name) or () for name in (DISTRIBUTION, distribution)]
+    names = {*_CORE, *required[0], *required[1], *_imported(sources)}
     versions: dict[str, str] = {}
     for name in sorted(names - _WITHOUT_EFFECT - {DISTRIBUTION, canonical_name(distribution)}):
         with suppress(metadata.PackageNotFoundError, ValueError, KeyError):
             versions[name] = metadata.version(name)
     return versions
-
-
-def _required(distribution: str) -> set[str]:
-    """Canonical names of what a distribution requires itself, without its extras."""
-    try:
-        stated = metadata.requires(distribution) or []
-    except (metadata.PackageNotFoundError, ValueError):
-        return set()
-    found = (_REQUIREMENT.match(text) for text in stated if "extra ==" not in text)
-    return {canonical_name(match[0]) for match in found if match}
 
 
 def _imported(sources: Iterable[Path]) -> set[str]:
