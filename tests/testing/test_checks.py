@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import Field
 
 from orthoflow.errors import OrthoflowError
 from orthoflow.products import (
@@ -23,9 +22,9 @@ from orthoflow.products import (
     Product,
     Ties,
 )
-from orthoflow.sdk import Method, MethodParams, Metric, Ports, StepContext
+from orthoflow.sdk import Method, Metric, Ports, StepContext
 from orthoflow.testing import checks
-from orthoflow.testing.examples import example_room, few_points
+from orthoflow.testing.examples import example_room
 
 
 class Finding(Method):
@@ -76,50 +75,12 @@ def subject(method: type[Method] = Finding, **witness: object) -> Any:
     return SimpleNamespace(method=method, witness=SimpleNamespace(**witness))
 
 
-def digests(**given: str) -> Any:
-    return SimpleNamespace(digests=given)
-
-
 def passes(check: Callable[[Any], None], of: Any) -> bool:
     try:
         check(of)
     except AssertionError:
         return False
     return True
-
-
-@pytest.mark.parametrize(
-    ("method", "again", "elsewhere", "fits"),
-    [
-        (Finding, {"planes": "1"}, {"planes": "1"}, True),
-        (Finding, {"planes": "2"}, {"planes": "1"}, False),
-        (Finding, {"planes": "1"}, {"planes": "2"}, False),
-        (Finding, {"planes": "1"}, {}, False),
-        (Guessing, {"planes": "2"}, {"planes": "3"}, True),
-        (Guessing, {"planes": "2"}, {}, False),
-    ],
-    ids=["alike", "again-other", "elsewhere-other", "elsewhere-none", "loose", "loose-none"],
-)
-def test_results_repeat_unless_a_method_says_that_they_do_not(
-    method: type[Method], again: dict[str, str], elsewhere: dict[str, str], fits: bool
-) -> None:
-    ran = subject(
-        method,
-        first=SimpleNamespace(run=digests(planes="1")),
-        again=digests(**again),
-        elsewhere=digests(**elsewhere),
-    )
-    assert passes(checks.results_repeat, ran) is fits
-
-
-def test_two_cores_give_what_one_gives() -> None:
-    same, other = digests(planes="1", labels="2"), digests(planes="1", labels="3")
-    one = SimpleNamespace(run=same)
-    assert passes(checks.threads_do_not_show, subject(first=one, again=same, on_two_cores=same))
-    with pytest.raises(AssertionError, match="output labels depends on the number of cores"):
-        checks.threads_do_not_show(subject(first=one, again=same, on_two_cores=other))
-    # What differs anyway is told by the rule on repeats.
-    assert passes(checks.threads_do_not_show, subject(first=one, again=other, on_two_cores=other))
 
 
 @pytest.mark.parametrize(
@@ -175,48 +136,6 @@ def test_an_output_that_is_another_one_when_stored_is_told() -> None:
         checks.outputs_are_valid(ran)
 
 
-class Documented(MethodParams):
-    """Of every kind that needs no unit, or has one."""
-
-    reach_m: float = Field(1.0, description="How far.")
-    share: float = Field(0.5, description="How much of it.")
-    least_m_between: float | None = Field(None, description="How far apart.")
-    rounds: int = Field(3, description="How often.")
-
-
-class Vague(MethodParams):
-    """Of no unit, but not given either."""
-
-    reach: float | None = Field(None, description="How far.")
-
-
-class Demanding(MethodParams):
-    """Of no default, twice."""
-
-    reach_m: float = Field(description="How far.")
-    n_trials: int
-
-
-@pytest.mark.parametrize(
-    ("params", "said"),
-    [
-        (Documented, ""),
-        (Vague, "parameter reach does not state its unit: end it with one of m, mm, m2, px"),
-        (
-            Demanding,
-            "^parameter reach_m has no default; parameter n_trials has no default; parameter n_t",
-        ),
-    ],
-)
-def test_parameters_say_what_they_are(params: type[MethodParams], said: str) -> None:
-    of = SimpleNamespace(method=SimpleNamespace(Params=params))
-    if not said:
-        checks.parameters_are_documented(of)  # type: ignore[arg-type]
-        return
-    with pytest.raises(AssertionError, match=said):
-        checks.parameters_are_documented(of)  # type: ignore[arg-type]
-
-
 def without_ties(outcome: Callable[[Ties], object]) -> Any:
     return SimpleNamespace(method=Posing, run_on=lambda _name, ties: outcome(ties))
 
@@ -240,21 +159,6 @@ def test_without_ties_no_photo_is_oriented() -> None:
         checks.missing_ties_are_reported(without_ties(lambda _: run))
     lost = SimpleNamespace(outputs={"cameras": Cameras(cameras=found.cameras[:1])})
     checks.missing_ties_are_reported(without_ties(lambda _: lost))
-
-
-def test_a_cloud_with_a_huge_coordinate_has_one_in_its_middle() -> None:
-    cloud = few_points(np.arange(15.0).reshape(5, 3))
-    seen: list[PointCloud] = []
-    ran = subject(trial=SimpleNamespace(inputs={"cloud": cloud}))
-    ran.run_on = lambda name, cloud: seen.append(cloud)
-    checks.a_huge_coordinate_does_no_harm(ran)
-    assert seen[0].x.tolist() == [*cloud.x[:2].tolist(), float(np.float32(1e30)), *cloud.x[3:]]
-
-    def fails(name: str, cloud: PointCloud) -> None:
-        raise OrthoflowError("too large")
-
-    ran.run_on = fails
-    checks.a_huge_coordinate_does_no_harm(ran)
 
 
 def test_refusing_without_a_word_is_no_refusal() -> None:

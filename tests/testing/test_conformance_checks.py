@@ -82,14 +82,27 @@ class Floor(Method):
     def lift_m(self, cloud, ctx):
         return 0.0
 """
+# Results of which need not repeat.
+LOOSE = """
+
+class Guess(Floor):
+    id = "plane.guess"
+    determinism = "loose"
+
+    def lift_m(self, cloud, ctx):
+        return float(np.random.default_rng().random())
+"""
 # Name of the cheat -> the check that must notice it, its sentence, and how the cheat cheats.
 CHEATS: dict[str, tuple[str, str, str]] = {
     "unitless": (
         "parameters-are-documented",
-        "parameter tolerance does not state its unit",
+        "parameter tolerance does not state its unit: end it with one of m, mm, m2, px",
         """
         class Params(MethodParams):
-            tolerance: float = Field(0.1, description="Near enough.")
+            tolerance: float | None = Field(None, description="Near enough.")
+            least_m_between: float | None = Field(None, description="How far apart.")
+            share: float = Field(0.5, description="How much of it.")
+            rounds: int = Field(3, description="How often.")
             lift_m: float = Field(0.0, description="Raises the plane.")
         """,
     ),
@@ -353,6 +366,7 @@ def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         'summary="For a test.")'
         for method_id in BESIDE_SAYS
     )
+    listing += ', MethodSpec(id="plane.guess", target="floors:Guess", summary="For a test.")'
     hooks = (
         "from orthoflow.sdk.hooks import MethodSpec, hookimpl\n\n\n"
         f"@hookimpl\ndef orthoflow_methods():\n    return [{listing}]\n"
@@ -360,7 +374,7 @@ def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_distribution(
         tmp_path / "site",
         "cheats",
-        {"floors.py": HONEST + classes, "beside.py": BESIDE, "cheats_hooks.py": hooks},
+        {"floors.py": HONEST + LOOSE + classes, "beside.py": BESIDE, "cheats_hooks.py": hooks},
     )
     monkeypatch.syspath_prepend(folder)
     # A cheat that litters does so here too, where it runs in this process.
@@ -396,6 +410,12 @@ def test_a_result_beside_the_truth_is_noticed(method_id: str) -> None:
 @pytest.mark.parametrize("check", sorted({check for check, _, _ in CHEATS.values()}))
 def test_a_method_that_keeps_the_rules_passes(check: str) -> None:
     case_of("plane.floor", check).run()
+
+
+@pytest.mark.usefixtures("cheats")
+def test_results_of_a_loose_method_need_not_repeat() -> None:
+    case_of("plane.guess", "results-repeat").run()
+    assert "threads-do-not-show" not in {one.check.name for one in conformance_cases("plane.guess")}
 
 
 def quickly_checked(method_id: str) -> tuple[int, dict[str, str]]:
