@@ -502,32 +502,6 @@ def test_graph_and_schema_print_what_other_programs_read(tmp_path: Path) -> None
     assert "paint.plain" in json.dumps(schema)
 
 
-def test_plugins_show_gives_parameters_with_units_and_limits(tmp_path: Path) -> None:
-    shown = orthoflow(tmp_path, "plugins", "show", "survey.offset").stdout
-    row = next(line.split() for line in shown.splitlines() if line.startswith("offset_m"))
-    assert row == [
-        "offset_m",
-        "number",
-        ">=",
-        "-10",
-        "<=",
-        "10",
-        "2.0",
-        "m",
-        *["Distance", "of", "the", "plane."],
-    ]
-    assert "https://doi.org/10.1000/workshop" in shown
-    answer = json.loads(orthoflow(tmp_path, "plugins", "show", "survey.offset", "--json").stdout)
-    assert answer["in"] == [{"port": "files", "product": "files", "required": False}]
-    assert (answer["distribution"], answer["version"]) == ("workshop", "1.0")
-
-
-def test_an_unknown_method_ends_with_2(tmp_path: Path) -> None:
-    done = orthoflow(tmp_path, "plugins", "show", "paint.plane")
-    assert done.returncode == 2
-    assert "did you mean paint.plain?" in done.stderr
-
-
 PAINTS = """
 from orthoflow.sdk import MethodSpec, hookimpl
 

@@ -61,7 +61,7 @@ def file(tmp_path: Path) -> Path:
 MOVED = "output planes is another one than golden.json has (6 of 6 sampled values of offset moved)"
 BITS = (
     "output planes is another one than golden.json has (in bits, not beyond the tolerances of its "
-    "type, where libraries and processor are alike)"
+    "type, where libraries and processor are the same)"
 )
 
 
