@@ -270,9 +270,15 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
     ]
     opaque: NDArray[np.bool_] | None = None
     with _tiff_page(encoded, start) as page:
-        if ColorInterp.alpha in page.colorinterp:
-            alpha = page.read(page.colorinterp.index(ColorInterp.alpha) + 1)
-            opaque = alpha > np.iinfo(alpha.dtype).max // 2
+        is_stated = ColorInterp.alpha in page.colorinterp
+        # Some programs do not state what the last of two or four samples is: one that is nothing
+        # but off and full is an alpha, and infrared is none.
+        band = page.colorinterp.index(ColorInterp.alpha) + 1 if is_stated else page.count
+        if is_stated or (band in (2, 4) and page.dtypes[0] in ("uint8", "uint16")):
+            alpha = page.read(band)
+            full = np.iinfo(alpha.dtype).max
+            if is_stated or np.isin(alpha, (0, full)).all():
+                opaque = alpha > full // 2
     for at in masks:
         with _tiff_page(encoded, at) as page:
             shown: NDArray[np.bool_] = page.read(1) > 0

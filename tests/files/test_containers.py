@@ -198,6 +198,22 @@ def test_what_is_transparent_is_known_in_every_format(kind: str) -> None:
     np.testing.assert_array_equal(opaque, expected)
 
 
+@pytest.mark.parametrize("is_alpha", [True, False])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_fourth_sample_of_a_tiff_that_is_off_or_full_is_its_alpha(
+    kind: type[np.unsignedinteger], is_alpha: bool
+) -> None:
+    # OpenCV states nothing of it; infrared, that it is grey.
+    full = np.iinfo(kind).max
+    fourth = np.full(PICTURE.shape[:2], full, dtype=kind)
+    fourth[:, :40] = 0 if is_alpha else full // 3
+    image = np.dstack([PICTURE.astype(kind) * (full // 255), fourth])
+    opaque = opaque_pixels(cv2.imencode(".tif", image)[1].tobytes())
+    assert (opaque is not None) is is_alpha
+    if opaque is not None:
+        np.testing.assert_array_equal(opaque, fourth > 0)
+
+
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG", "WEBP"])
 def test_a_photo_without_transparency_is_opaque(kind: str) -> None:
     assert opaque_pixels(saved(kind)) is None

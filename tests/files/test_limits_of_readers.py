@@ -125,33 +125,3 @@ def test_what_is_larger_than_any_file_of_its_kind_is_not_read(
     os.truncate(path, most_bytes + 1)  # without a byte on the disk
     with pytest.raises(InputError, match=rf"{name}.* (at most|more than) {most_bytes}"):
         read(path)
-
-
-@pytest.mark.parametrize(("n_letters", "is_read"), [(300, True), (301, False)])
-def test_a_field_of_a_title_block_has_three_hundred_letters(
-    tmp_path: Path, n_letters: int, is_read: bool
-) -> None:
-    path = tmp_path / "block.yaml"
-    path.write_text(f"title: {'x' * n_letters}\n")
-    if is_read:
-        assert title_blocks.read_title_block(path).title == "x" * n_letters
-        return
-    with pytest.raises(InputError, match=r":1:1: title: has 301 letters, at most 300 fit"):
-        title_blocks.read_title_block(path)
-
-
-@pytest.mark.parametrize(("count", "is_read"), [(10_000, True), (10_001, False)])
-def test_ten_thousand_polygons_are_the_most(tmp_path: Path, count: int, is_read: bool) -> None:
-    ring = [[0, 0], [4, 0], [4, 3], [0, 0]]
-    feature = {
-        "type": "Feature",
-        "properties": {"photo": "a.jpg"},
-        "geometry": {"type": "MultiPolygon", "coordinates": [[ring]] * count},
-    }
-    path = tmp_path / "masks.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    if is_read:
-        assert len(polygons.read_polygons(path, name="photo", what="a mask")) == count
-        return
-    with pytest.raises(InputError, match="holds more than 10000 polygons: split it"):
-        masks(path)

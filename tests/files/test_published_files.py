@@ -11,10 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoflow.errors import InputError
-from orthoflow.files import geotiff, images, publishing
-from orthoflow.files.geotiff import GridPlace, local_crs_name
-from orthoflow.files.sidecars import frame_of_raster, number, numbers
+from orthoflow.files import geotiff, publishing
+from orthoflow.files.geotiff import local_crs_name
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -354,110 +352,4 @@ def test_cameras_and_ties_are_told_completely(tmp_path: Path) -> None:
     )
 
 
-def test_a_part_of_a_raster_lies_where_its_corner_says() -> None:
-    whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
-    part = frame_of_raster(
-        whole, raster=GridPlace(gsd_m=0.25, corner_m=(1.0, -0.5)), shape=(4, 5), name="a.tif"
-    )
-    np.testing.assert_array_equal(part.origin_world, [10.0, 21.0, 29.5])
-    assert (part.gsd_m, part.width, part.height) == (0.25, 5, 4)
-
-
-@pytest.mark.parametrize(
-    ("key", "given"),
-    [
-        ("origin_world", None),
-        ("u_world", "text"),
-        ("v_world", [1.0, 2.0]),
-        ("normal_world", [1.0, 2.0, None]),
-        ("normal_world", [[1.0, 2.0, 3.0]]),
-        ("origin_world", [np.inf, 0.0, 0.0]),
-        ("u_world", {"x": 1.0}),
-    ],
-)
-def test_vectors_that_are_none_are_named(key: str, given: object) -> None:
-    whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
-    with pytest.raises(InputError) as caught:
-        frame_of_raster(
-            whole | {key: given},
-            raster=GridPlace(gsd_m=0.5, corner_m=(0.0, 0.0)),
-            shape=(2, 3),
-            name="a.json",
-        )
-    assert str(caught.value) == f"a.json: {key} must be three numbers below 1e+09, got {given!r}"
-    with pytest.raises(InputError, match=r"^a\.json: "):
-        frame_of_raster(
-            whole | {"u_world": [0.0, 2.0, 0.0]},
-            raster=GridPlace(gsd_m=0.5, corner_m=(0.0, 0.0)),
-            shape=(2, 3),
-            name="a.json",
-        )
-
-
-def test_what_json_cannot_hold_is_null() -> None:
-    assert numbers(np.array([[1.5, np.nan], [np.inf, -0.25]])) == [[1.5, None], [None, -0.25]]
-    assert numbers(np.array([True, False])) == [True, False]
-    assert json.dumps(numbers(np.array([3, 4], np.uint8))) == "[3, 4]"
-    assert [number(value) for value in (None, np.nan, -np.inf, 2)] == [None, None, None, 2.0]
-
-
 # --- previews ---
-
-
-@pytest.mark.parametrize(
-    ("shape", "whole_px", "covered"),
-    [
-        ((1600, 3), 1 << 26, (1.0, 1.0)),
-        ((3200, 800), 1 << 26, (2.0, 2.0)),
-        ((3200, 3), 1 << 26, (2.0, 1.5)),
-        ((4000, 1), 1 << 26, (2.5, 1.0)),
-        # Squares of two cells are averaged first; of 6401 rows one is left over.
-        ((6401, 3200), 1000, (4.0, 4.0)),
-        ((6401, 3200), 1 << 26, (6401 / 1600, 4.0)),
-    ],
-)
-def test_a_pixel_of_a_preview_covers_so_many_cells(
-    monkeypatch: pytest.MonkeyPatch,
-    shape: tuple[int, int],
-    whole_px: int,
-    covered: tuple[float, float],
-) -> None:
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", whole_px)
-    assert images.cells_per_preview_px(shape) == covered
-
-
-def test_colours_of_a_preview_are_those_of_the_shown_cells_alone() -> None:
-    rgb = np.zeros((2, 8, 3), np.uint8)
-    rgb[:, :4] = (90, 60, 30)
-    shown = np.zeros((2, 8), np.bool_)
-    shown[0, 0] = shown[:, 2:4] = True
-    encoded = images.preview_png(rgb, shown, longest_side_px=4)
-    small = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert small is not None
-    assert small.tolist() == [[[30, 60, 90, 64], [30, 60, 90, 255], [0] * 4, [0] * 4]]
-    grey = images.preview_png(rgb[:, :, 0], shown, longest_side_px=8)
-    whole = cv2.imdecode(np.frombuffer(grey, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert whole is not None
-    np.testing.assert_array_equal(whole[:, :, :3], rgb[:, :, :1].repeat(3, axis=2))
-    np.testing.assert_array_equal(whole[:, :, 3], 255 * shown)
-
-
-@pytest.mark.parametrize("side", [39, 40, 41])
-def test_a_shrunk_picture_has_its_longest_side(side: int) -> None:
-    picture = np.full((20, 40, 3), (200, 100, 50), np.uint8)
-    shrunk = images.shrunk_webp(images.encode_png(picture), "a", longest_side_px=side)
-    found = images.decode_image(shrunk, "b")
-    assert found.shape == (20, min(side, 40), 3)
-    assert np.abs(found.astype(int) - picture[:, : min(side, 40)]).max() <= 6
-
-
-@pytest.mark.parametrize(("n_rows", "n_kept"), [(10, 10), (11, 6), (25, 9)])
-def test_large_rasters_are_sampled_by_rows(
-    monkeypatch: pytest.MonkeyPatch, n_rows: int, n_kept: int
-) -> None:
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 30)
-    values = np.arange(3 * n_rows).reshape(n_rows, 3)
-    kept = images.sampled_rows(values)
-    assert len(kept) == n_kept
-    step = -(-3 * n_rows // 30)
-    np.testing.assert_array_equal(kept, values[::step])

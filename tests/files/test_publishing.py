@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import dataclasses
 import json
 from contextlib import suppress
 from dataclasses import replace
@@ -167,58 +166,6 @@ def test_previews_open_where_their_rasters_lie(
     assert downwards == pytest.approx(-4.0, abs=side_m)
 
 
-def test_the_profile_of_the_photos_goes_into_the_file(tmp_path: Path, frame: WallFrame) -> None:
-    import rasterio
-
-    profile = bytes(range(256)) * 3
-    for name, given in (("with", profile), ("without", None)):
-        folder = tmp_path / name
-        folder.mkdir()
-        product = Orthoimages(images=(orthoimage(frame),), icc_profile=given)
-        publishing.publish_orthoimages(product, folder, DIGEST)
-        with rasterio.open(folder / "wall_3_ortho.tif") as dataset:
-            told = dataset.tags(ns="COLOR_PROFILE").get("SOURCE_ICC_PROFILE")
-            content = dataset.tags()["content"]
-        assert told == (None if given is None else base64.b64encode(profile).decode())
-        assert content == (
-            "orthoimage, sRGB" if given is None else "orthoimage, ICC profile of the photos"
-        )
-
-
-def test_percentiles_get_rasters_of_their_own(tmp_path: Path, frame: WallFrame) -> None:
-    plain = walls(frame, np.full(frame.shape, 0.5, np.float32))
-    layered = np.stack([plain.walls[0].depth_m - 0.01, plain.walls[0].depth_m + 0.01], axis=2)
-    product = dataclasses.replace(
-        plain,
-        walls=(dataclasses.replace(plain.walls[0], percentiles_m=layered),),
-        percentiles=(5.0, 97.5),
-    )
-    publishing.publish_walls(product, tmp_path, DIGEST)
-    low = geotiff.read_raster(tmp_path / "wall_2_depth_p5_0.tif")
-    high = geotiff.read_raster(tmp_path / "wall_2_depth_p97_5.tif")
-    np.testing.assert_array_equal(low.values, layered[:, :, 0])
-    np.testing.assert_array_equal(high.values, layered[:, :, 1])
-    assert high.tags["content"].startswith("percentile 97.5")
-    assert (low.tags["unit"], high.tags["unit"]) == ("m", "m")
-    intensity = geotiff.read_raster(tmp_path / "wall_2_intensity.tif")
-    assert (intensity.tags["unit"], intensity.tags["intensity_source"]) == ("1", "laser")
-
-
-def test_the_sidecar_places_the_raster_in_the_world(tmp_path: Path, frame: WallFrame) -> None:
-    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
-    sidecar = json.loads((tmp_path / "wall_3_ortho.json").read_text())
-    pixel = np.array([[123.5, 20.5]])
-    world = np.array(sidecar["origin_world"]) + sidecar["gsd_m"] * (
-        pixel[0, 0] * np.array(sidecar["u_world"]) + pixel[0, 1] * np.array(sidecar["v_world"])
-    )
-    np.testing.assert_allclose(world, frame.world_from_wall(pixel)[0], atol=1e-9)
-    assert sidecar["normal_world"] == [1.0, 0.0, 0.0]
-    assert (sidecar["width"], sidecar["height"]) == (700, 40)
-    assert set(sidecar["mask"]) == {"0", "1", "2", "3", "4"}
-    assert sum(sidecar["mask_counts"].values()) == 700 * 40
-    assert sidecar["product_digest"] == DIGEST
-
-
 def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame) -> None:
     intensity = np.linspace(0, 1, 28000, dtype=np.float32).reshape(frame.shape)
     contents = []
@@ -235,83 +182,6 @@ def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame)
         *(f"wall_2_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
         *(f"wall_2_intensity{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
     }
-
-
-def test_depth_keeps_its_bits_and_its_nothing(tmp_path: Path, frame: WallFrame) -> None:
-    product = walls(frame, None)
-    publishing.publish_walls(product, tmp_path, DIGEST)
-    read = geotiff.read_raster(tmp_path / "wall_2_depth.tif")
-    np.testing.assert_array_equal(read.values, product.walls[0].depth_m)
-    np.testing.assert_array_equal(read.shown, np.isfinite(product.walls[0].depth_m))
-    assert read.nodata is not None
-    assert np.isnan(read.nodata)
-    sidecar = json.loads((tmp_path / "wall_2_depth.json").read_text())
-    assert sidecar["buffer"] == {"front_m": 0.3, "behind_m": 0.2}
-    assert sidecar["plane"]["normal"] == [1.0, 0.0, 0.0]
-    assert sidecar["name"] == "wall 2"
-    assert sidecar["intensity_source"] == "none"
-    assert not (tmp_path / "wall_2_intensity.tif").exists()
-
-
-def test_planes_are_published_with_the_agreed_keys(tmp_path: Path) -> None:
-    corners = np.array([[[3.0, 0, 2], [3.0, 0, 0], [3.0, 4, 0], [3.0, 4, 2]]])
-    product = samples.planes(
-        normal=np.array([[1.0, 0.0, 0.0]]),
-        offset=np.array([3.0]),
-        corners=corners,
-        n_points=np.array([1234], np.int64),
-        rms_m=np.array([np.nan]),
-        names=("wall 0",),
-        part_corners=np.concatenate([corners, corners + 1.0]),
-        part_plane=np.array([0, 0], np.int32),
-    )
-    publishing.publish_planes(product, tmp_path, DIGEST)
-    (plane,) = json.loads((tmp_path / "planes.json").read_text())["planes"]
-    assert plane["normal"] == [1.0, 0.0, 0.0]
-    assert plane["offset_m"] == 3.0
-    assert plane["corners_world"] == corners[0].tolist()
-    assert plane["n_points"] == 1234
-    assert plane["rms_mm"] is None
-    assert plane["label"] == "wall 0"
-    assert len(plane["part_corners_world"]) == 2
-    assert (plane["omega_deg"], plane["phi_deg"]) == (0.0, 0.0)
-
-
-def test_published_cameras_and_ties_agree_in_opencv_pixels(tmp_path: Path) -> None:
-    camera = Camera(
-        photo="a.jpg",
-        status="ok",
-        intrinsics=Intrinsics(width=3000, height=2000, fx=2500.0, fy=2501.0, cx=1500.0, cy=1000.0),
-        rotation_camera_from_world=np.eye(3),
-        translation_camera_from_world=np.array([0.0, 0.0, 5.0]),
-        sigma_wall_m=0.0015,
-    )
-    lost = Camera(photo="b.jpg", status="only 3 ties, 6 are needed")
-    publishing.publish_cameras(Cameras(cameras=(camera, lost), ties=ties()), tmp_path, DIGEST)
-
-    content = json.loads((tmp_path / "cameras.json").read_text())
-    assert "OpenCV" in content["pixel_convention"]
-    first = content["cameras"]["a.jpg"]
-    assert first["K"] == [[2500.0, 0.0, 1499.5], [0.0, 2501.0, 999.5], [0.0, 0.0, 1.0]]
-    assert first["distortion"] == [0.0] * 5
-    assert first["R_camera_from_world"] == np.eye(3).tolist()
-    assert first["t_camera_from_world"] == [0.0, 0.0, 5.0]
-    assert (first["width"], first["height"]) == (3000, 2000)
-    assert first["sigma_wall_mm"] == pytest.approx(1.5, abs=1e-12)
-    assert content["cameras"]["b.jpg"] == {"status": "only 3 ties, 6 are needed"}
-
-    with (tmp_path / "ties.csv").open() as table:
-        rows = list(csv.DictReader(table))
-    assert (rows[0]["photo"], rows[0]["wall"], rows[0]["role"]) == ("a.jpg", "0", "control")
-    assert (float(rows[0]["u_px"]), float(rows[0]["v_px"])) == (0.0, 0.0)
-    assert float(rows[0]["x"]) == 634512.347
-    assert float(rows[0]["residual_v_px"]) == -0.125
-    assert (rows[1]["photo"], rows[1]["role"], rows[1]["residual_u_px"]) == (
-        "b.jpg",
-        "rejected",
-        "",
-    )
-    assert any("opencv" in name for name in rows[0])
 
 
 def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(
@@ -345,54 +215,6 @@ def test_reading_something_else_as_a_geotiff_is_refused(tmp_path: Path) -> None:
     path.write_text("no picture")
     with pytest.raises(InputError, match=r"text\.tif cannot be read as a GeoTIFF"):
         geotiff.read_raster(path)
-
-
-def test_png_round_trip_keeps_the_order_of_the_channels() -> None:
-    rgb = np.random.default_rng(1).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(images.decode_image(images.encode_png(rgb)), rgb)
-
-
-def test_jpeg_keeps_red_red() -> None:
-    red = np.zeros((16, 16, 3), np.uint8)
-    red[:, :, 0] = 255
-    decoded = images.decode_image(images.encode_jpeg(red, quality=95))
-    assert decoded[..., 0].min() > 240
-    assert decoded[..., 2].max() < 20
-
-
-def test_what_is_no_image_is_refused() -> None:
-    with pytest.raises(InputError, match=r"photo\.jpg is no JPEG.*\(4 bytes\)"):
-        images.decode_image(b"text", "photo.jpg")
-    with pytest.raises(InputError, match=r"is no JPEG"):
-        images.decode_image(b"", "photo.jpg")
-    with pytest.raises(ProductError, match="must be uint8"):
-        images.encode_png(np.zeros((2, 2, 5), np.uint8))
-
-
-def test_the_stretch_puts_the_percentiles_at_black_and_white() -> None:
-    values = np.linspace(0.0, 100.0, 1001)
-    values[0] = np.nan
-    grey = images.stretch_to_grey(values)
-    assert grey[0] == 0
-    assert grey[5] == 0
-    assert grey[-5] == 255
-    assert grey[501] == pytest.approx(128, abs=1)
-    assert images.stretch_to_grey(np.full((2, 2), np.nan)).max() == 0
-
-
-def test_previews_are_small_and_do_not_darken_at_the_rim_of_voids() -> None:
-    rgb = np.zeros((100, 5000, 3), np.uint8)
-    shown = np.zeros((100, 5000), np.bool_)
-    rgb[:, :2501] = 200
-    shown[:, :2501] = True
-    import cv2
-
-    preview = cv2.imdecode(
-        np.frombuffer(images.preview_png(rgb, shown), np.uint8), cv2.IMREAD_UNCHANGED
-    )
-    assert preview is not None
-    assert preview.shape == (32, 1600, 4)
-    assert set(np.unique(preview[preview[:, :, 3] > 0][:, :3])) <= {199, 200}
 
 
 def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) -> None:
@@ -479,16 +301,6 @@ def test_large_images_are_written_in_bands_and_read_back_the_same(
     assert names[0] == names[1]
     with pytest.raises(StoreError, match=r"wall_3_ortho\.tif cannot be written: .*No such file"):
         publishing.publish_orthoimages(product, tmp_path / "missing", DIGEST)
-
-
-def test_previews_of_large_images_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(3)
-    rgb = np.repeat(np.repeat(rng.integers(0, 256, (24, 40, 3), np.uint8), 16, 0), 16, 1)
-    shown = np.repeat(np.repeat(rng.random((24, 40)) < 0.8, 16, 0), 16, 1)
-    whole = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "whole")
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
-    bands = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "bands")
-    np.testing.assert_array_equal(bands, whole)
 
 
 def test_a_layer_of_a_photo_with_any_name_has_a_file(tmp_path: Path, frame: WallFrame) -> None:

@@ -80,17 +80,6 @@ def test_long_values_are_cut_in_messages() -> None:
     assert sidecars.shown_value("a" * 99) == "'" + "a" * 99 + " ..."
 
 
-def test_a_sidecar_of_a_megabyte_is_read_and_a_larger_one_is_not(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("{}".ljust(1 << 20), encoding="utf-8")
-    assert sidecars.read_sidecar(path) == {}
-    path.write_text("{}".ljust((1 << 20) + 1), encoding="utf-8")
-    with pytest.raises(
-        InputError, match=r"a\.json has 1048577 bytes, a JSON object .* at most 1048576"
-    ):
-        sidecars.read_sidecar(path)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files import survey_points
 from orthoflow.files.survey_points import (
     MeasuredTie,
     SurveyPoint,
@@ -165,36 +163,6 @@ def test_all_mistakes_come_at_once_and_many_are_counted(tmp_path: Path, n: int) 
     expected = [f"p.csv:{k}: y must be a number, got x" for k in range(2, 22)]
     more = [] if n == 20 else [f"... and {n - 20} more problems"]
     assert str(caught.value).splitlines() == expected + more
-
-
-def test_a_line_may_have_ten_thousand_letters(tmp_path: Path) -> None:
-    name = "x" * (10_000 - len(",1,2,3"))
-    assert [point.name for point in read(tmp_path, f"{name},1,2,3")] == [name]
-
-
-def test_a_list_may_have_so_many_points_and_no_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(survey_points, "MOST_POINTS", 3)
-    lines = [f"P{k},1,2,{k}" for k in range(4)]
-    assert len(read(tmp_path, "\n".join(lines[:3]))) == 3
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, "\n".join(lines))
-    assert str(caught.value) == "p.csv:4: the file holds more than 3 points: split it"
-    # The last that there may be, and too long.
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, "\n".join([*lines[:2], "x" * 10_001]))
-    assert str(caught.value) == "p.csv:3: the line is longer than 10000 letters: this is no list"
-
-
-def test_a_file_of_a_hundred_megabytes_is_no_list(tmp_path: Path) -> None:
-    path = tmp_path / "p.csv"
-    path.touch()
-    os.truncate(path, 100_000_001)  # without a byte on the disk
-    with pytest.raises(
-        InputError, match=r"^p\.csv has \d+ bytes, a CSV file of points with .* at most "
-    ):
-        read_survey_points(path)
 
 
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:

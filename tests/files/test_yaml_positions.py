@@ -12,7 +12,6 @@ from orthoflow.files.yaml_positions import (
     Text,
     Value,
     describe,
-    join,
     plain,
     read_yaml,
 )
@@ -166,13 +165,6 @@ def test_a_dialect_bounds_its_documents_and_words_their_mistakes() -> None:
     assert problems_of("a: 1\na: 2", small) == [(2, 1, "a", "a again, as in line 1")]
 
 
-def test_documents_are_at_most_sixty_levels_deep() -> None:
-    assert isinstance(read("[" * 60 + "]" * 60), Listing)
-    assert problems_of("[" * 61 + "]" * 61) == [
-        (1, 61, "", "the document is nested deeper than 60 levels")
-    ]
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -185,11 +177,6 @@ def test_documents_are_at_most_sixty_levels_deep() -> None:
 )
 def test_values_are_described_for_messages(text: str, words: str) -> None:
     assert describe(read(text)) == words
-
-
-def test_paths_are_keys_joined_by_dots() -> None:
-    assert join("", "a") == "a"
-    assert join("a.b", "c") == "a.b.c"
 
 
 @pytest.mark.parametrize("marks", ["[]", "{}"], ids=["lists", "mappings"])
@@ -215,33 +202,6 @@ def test_keys_and_values_are_counted(text: str, n_values: int) -> None:
     dialect = Dialect(is_strict=False, most_values=n_values - 1)
     (problem,) = problems_of(text, dialect)
     assert problem[3] == f"the document has more than {n_values - 1} values"
-
-
-def test_expanded_aliases_are_counted_without_keys() -> None:
-    text = "[&a [x, y], *a, *a]"
-    # The list, three lists in it, and two values in each.
-    read(text, Dialect(is_strict=False, most_values=10))
-    (problem,) = problems_of(text, Dialect(is_strict=False, most_values=9))
-    assert problem[3] == "the document has more than 9 values once aliases are expanded"
-    (problem,) = problems_of("a: &a [*a]", TOLERANT)
-    assert problem[3] == "the value contains itself through its anchor"
-
-
-def test_merged_entries_stand_behind_those_of_the_table() -> None:
-    document = read("base: &b {x: 1, y: 2}\nmore: &m {y: 3, z: 4}\nall: {<<: [*b, *m], x: 9}\n")
-    assert plain(document)["all"] == {"x": 9, "y": 2, "z": 4}  # type: ignore[call-overload, index]
-    assert plain(read('{"<<": {x: 1}}')) == {"<<": {"x": 1}}
-    assert plain(read("a: &b {x: 1}\nc: {<<: *b}"))["c"] == {"x": 1}  # type: ignore[call-overload, index]
-    (problem,) = problems_of("a: {<<: [3], x: 1}", TOLERANT)
-    assert problem[2:] == (
-        "a.<<",
-        "expected a mapping or a list of mappings to merge, got 3",
-    )
-
-
-def test_the_place_of_what_the_reader_refuses_is_told() -> None:
-    ((line, column, _, _),) = problems_of("a: 1\nbc: \x01", TOLERANT)
-    assert (line, column) == (2, 5)
 
 
 @pytest.mark.parametrize(

@@ -566,12 +566,6 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
     assert "the focal length of photo c.jpg is unknown" in read.warnings
 
 
-def test_a_calibration_of_another_size_is_refused(tmp_path: Path, read: Reader) -> None:
-    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture(48, 64))})
-    with pytest.raises(InputError, match=r"photo a\.jpg has 48 x 64 pixels.*the turned photo"):
-        read(*paths, calibration=f"cameras: {{'*': {CAMERA}}}")
-
-
 def test_several_calibration_files_are_refused(tmp_path: Path, read: Reader) -> None:
     paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     inputs = ReadPhotos.In(
@@ -594,25 +588,6 @@ def test_reading_stops_when_it_is_cancelled(tmp_path: Path, read: Reader) -> Non
     inputs = ReadPhotos.In(files=InputFiles(name="photos", paths=paths))
     with pytest.raises(CancelledStepError):
         ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
-
-
-@pytest.mark.parametrize(
-    ("count", "caption"),
-    [
-        (1, "The photos, as they are stored: "),
-        (10, "The photos, as they are stored: "),
-        (103, "The first 100 of 103 photos, as they are stored: "),
-    ],
-)
-def test_the_contact_sheet_stays_small(
-    tmp_path: Path, read: Reader, count: int, caption: str
-) -> None:
-    image = encode_jpeg(made.picture(200, 150))
-    names = [f"äußerst langer Name eines Fotos {index:03}.jpg" for index in range(count)]
-    read(*made.write(tmp_path, dict.fromkeys(names, image)))
-    assert max(read.sheet) <= 1200
-    assert min(read.sheet) >= 100
-    assert read.ctx.figures[0].caption.startswith(caption)
 
 
 def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Reader) -> None:
