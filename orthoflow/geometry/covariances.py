@@ -59,7 +59,7 @@ def honest_covariance(
     normals = np.add.reduceat(np.einsum("nij,nik->njk", jacobian, jacobian), starts)
     left_out = _inverses(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
     moves = (cofactors @ left_out)[:, :, 0]
-    return widened(plain, (names.size - 1) / names.size * moves.T @ moves)
+    return widened_by_moves(plain, moves)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,6 +278,27 @@ def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.pinv(matrices), dtype=np.float64)
+
+
+def widened_by_moves(
+    plain: NDArray[np.float64], moves: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Widen a covariance (p, p) by what leaving out each of some groups changes (g, p).
+
+    Of few groups and many unknowns the largest spread is far too large and the smallest far too
+    small by chance, so that the larger of two covariances is too large along most axes even where
+    nothing errs together. Spreads are drawn towards their mean by the share of their differences
+    that chance explains (Ledoit & Wolf 2004, doi:10.1016/S0047-259X(03)00096-4).
+    """
+    n, p = moves.shape
+    root = _root(plain)
+    white = math.sqrt((n - 1) / n) * moves @ np.linalg.inv(root).T
+    spread = white.T @ white
+    mean = np.trace(spread) / p * np.eye(p)
+    differences = float(((spread - mean) ** 2).sum())
+    of_chance = float(((white**2).sum(axis=1) ** 2).sum() - (spread**2).sum() / n)
+    kept = max(0.0, 1.0 - of_chance / differences) if differences > 0.0 else 0.0
+    return widened(plain, root @ (mean + kept * (spread - mean)) @ root.T)
 
 
 def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -113,11 +113,6 @@ class MatchGuided(Method):
         max_ties: int = Field(
             default=1200, ge=50, description="Places measured per photo, spread evenly."
         )
-        finds_missing: bool = Field(
-            default=True,
-            description="Whether photos without a pose are looked for on what the others show of "
-            "the walls.",
-        )
 
         @model_validator(mode="before")
         @classmethod
@@ -201,7 +196,7 @@ def _traced(
         ctx.progress(len(traces) / (len(indices) + 1), name)
         if not any(len(piece) for piece in found.pieces):
             ctx.report(NOTHING_AGREES, subject=name)
-    if not params.finds_missing or len(indices) == len(photos):
+    if len(indices) == len(photos):
         return traces
     recovered = recovered_traces(inputs.photos, oriented, desk, list(traces.values()))
     for name in recovered:

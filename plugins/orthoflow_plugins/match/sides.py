@@ -10,7 +10,6 @@ from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, frame_over
 from orthoflow.geometry.levels import REC_601
@@ -49,6 +48,10 @@ _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _CELLS_MOST: Final = 4_000_000
 _POINTS_LEAST: Final = 3
+# So many matches over all photos must agree on a side, and so many times as many as on the other: a
+# front that is symmetric agrees with its mirror image in part.
+_MIN_AGREEING: Final = 16
+_MIN_MARGIN_RATIO: Final = 2.0
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
     severity="warning",
@@ -82,19 +85,7 @@ class FaceByPhotos(Method):
     )
 
     class Params(MethodParams):
-        """What counts as evidence."""
-
-        n_agreeing_min: int = Field(
-            default=16,
-            ge=8,
-            description="Matches over all photos that must agree on a side of a wall.",
-        )
-        margin_min_ratio: float = Field(
-            default=2.0,
-            ge=1.0,
-            description="How many times as many they must be as those that agree on its other "
-            "side: a front that is symmetric agrees with its mirror image in part.",
-        )
+        """Nothing to choose."""
 
     class In(Ports):
         """The planes, the cloud that they were found in, and the photos."""
@@ -110,6 +101,7 @@ class FaceByPhotos(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Ask the photos about each plane whose side was guessed."""
+        del params
         planes, cloud = inputs.planes, inputs.cloud
         require_photos(inputs.photos)
         cloud.require_points(_POINTS_LEAST)
@@ -122,11 +114,11 @@ class FaceByPhotos(Method):
             _warn_of_guesses(planes, planes.side_from, ctx)
             return self.Out(planes=planes)
         pictures = [_features(planes, index, cloud, ctx.cores) for index in asked]
-        counts = self._counts(inputs.photos, pictures, params, ctx)
+        counts = self._counts(inputs.photos, pictures, ctx)
         sources: list[SideSource] = [planes.side_source(index) for index in range(len(planes))]
         n_turned = 0
         for index, (front, behind) in zip(asked, counts.tolist(), strict=True):
-            if not _is_told(front, behind, params):
+            if not _is_told(front, behind):
                 continue
             sources[index] = "photos"
             if behind > front:
@@ -147,7 +139,6 @@ class FaceByPhotos(Method):
         self,
         photos: Photos,
         pictures: Sequence[Features | None],
-        params: Params,
         ctx: StepContext,
     ) -> NDArray[np.intp]:
         """Matches (planes, 2) that agree with the front and with the other side of each plane.
@@ -163,7 +154,7 @@ class FaceByPhotos(Method):
             for nth, matches in enumerate(found):
                 ctx.progress((nth + 1) / (len(photos.photos) + 1), f"photos on both sides, {name}")
                 tried += matches
-            if any(_is_told(front, behind, params) for front, behind in tried.tolist()):
+            if any(_is_told(front, behind) for front, behind in tried.tolist()):
                 return tried
             if name == "grey":
                 counts = tried
@@ -175,9 +166,9 @@ class FaceByPhotos(Method):
         return opencv_version()
 
 
-def _is_told(front: int, behind: int, params: FaceByPhotos.Params) -> bool:
+def _is_told(front: int, behind: int) -> bool:
     """Whether matches tell the side of a plane."""
-    least = max(params.n_agreeing_min, params.margin_min_ratio * min(front, behind))
+    least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
 
 

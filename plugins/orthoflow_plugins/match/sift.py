@@ -20,14 +20,12 @@ from orthoflow_plugins.match.pairing import (
     PairingParams,
     PhotoPairs,
     pair_in_colours,
-    pair_photo,
     wall_features,
 )
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features, with_paper_ratio
 from orthoflow_plugins.match.pictures import (
     one_by_one,
     opencv_version,
-    photo_grey,
     require_photos,
 )
 from orthoflow_plugins.match.ties import (
@@ -107,11 +105,6 @@ class MatchSift(Method):
             description="paper: SIFT as OpenCV sets it, on the pictures as they are, and the key "
             "points of a wall with their best match in the photo, as in markiewicz2015; of the "
             "other options `ratio` applies.",
-        )
-        tries_colours: bool = Field(
-            default=True,
-            description="Whether photos whose grey shows no wall clearly are tried in mixtures of "
-            "their colours, as a laser that sees red dark may show it.",
         )
         structure: Literal["never", "confirmed", "alone"] = Field(
             default="confirmed",
@@ -195,9 +188,7 @@ def _matched(
     """
 
     def pair(photo: Photo) -> PhotoPairs:
-        if params.tries_colours:
-            return pair_in_colours(photo, on_walls, params)
-        return pair_photo(photo_grey(photo), on_walls, params)
+        return pair_in_colours(photo, on_walls, params)
 
     paired: list[PhotoPairs] = []
     for photo, pairs in zip(photos.photos, one_by_one(pair, photos.photos, ctx.cores), strict=True):

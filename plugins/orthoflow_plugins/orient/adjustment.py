@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Misfit, Resection, fitted, misfit, moved_origin
-from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow_plugins.orient.block import (
     Block,
     BlockCovariance,
@@ -273,6 +272,8 @@ def _weighed(
     rejection_sigma: float,
 ) -> tuple[_State, list[float]]:
     """Reject what disagrees with the block, and estimate how exact the rest is."""
+    from scipy.special import chdtri  # scipy.stats would take seconds to import
+
     block, fits, state = found
     agreeing, units, limits = [], [], []
     for item, fit, used in zip(photos, fits, state.agreeing, strict=True):
@@ -285,10 +286,13 @@ def _weighed(
     active, sigma = state.tie_active, state.tie_sigma
     if active.any():
         lengths = _tie_residuals(ties, block) / ties.scale
-        # Of 2 m coordinates, 3 go into the point.
-        per_point = np.bincount(ties.point[active], minlength=len(state.tie_points))
-        left = np.maximum(2 * per_point[per_point > 0] - 3, 1).sum() / (2 * active.sum())
-        sigma = float(np.median(lengths[active]) / MEDIAN_LENGTH / math.sqrt(left))
+        # Of 2 m coordinates, 3 go into the point: its sum of squares is as chi-square of the rest.
+        point = ties.point[active]
+        squares = np.bincount(point, lengths[active] ** 2)
+        n_seeing = np.bincount(point)
+        is_tied = n_seeing > 1
+        usual = chdtri(2 * n_seeing[is_tied] - 3, 0.5)
+        sigma = math.sqrt(float(np.median(squares[is_tied] / usual)))
         sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
         active = _in_several(ties.point, lengths <= rejection_sigma * sigma)
     return (

@@ -18,7 +18,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
     outwards,
-    widened,
+    widened_by_moves,
     with_common_error,
 )
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values, linearised
@@ -331,7 +331,7 @@ def _honest(
     # Fewer groups than unknowns of a photo say nothing of it.
     if len(by_group) <= max(part.columns.size for part in rows):
         return plain
-    spread = np.zeros_like(plain)
+    moves = []
     for parts in by_group.values():
         columns = np.unique(np.concatenate([part.columns for part in parts]))
         normal, pull = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
@@ -340,9 +340,8 @@ def _honest(
             normal[np.ix_(at, at)] += np.einsum("ij,ik->jk", part.jacobian, part.jacobian)
             pull[at] += np.einsum("ij,i->j", part.jacobian, part.residuals)
         inner = np.eye(columns.size) - normal @ cofactors[np.ix_(columns, columns)]
-        move = cofactors[:, columns] @ (np.linalg.pinv(inner) @ pull)
-        spread += np.outer(move, move)
-    return widened(plain, (len(by_group) - 1) / len(by_group) * spread)
+        moves.append(cofactors[:, columns] @ (np.linalg.pinv(inner) @ pull))
+    return widened_by_moves(plain, np.array(moves))
 
 
 def _adjusted_points(

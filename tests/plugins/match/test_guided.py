@@ -215,16 +215,6 @@ def test_a_warped_photo_shows_the_walls_own_grey(scene: ms.TexturedWall, walls: 
     assert np.std(warped[rows, columns] - 255.0 * grey) < 4.0
 
 
-def test_photos_without_a_pose_give_no_ties_unless_looked_for(
-    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
-) -> None:
-    camera = ms.camera_before(scene)
-    photos = ms.photos(*(ms.photo_of(scene, camera, name=name) for name in ("a.png", "b.png")))
-    start = ms.cameras(Camera(photo="a.png", status="too dark"), ms.oriented(camera, name="b.png"))
-    ties = guided(photos, walls, start, tmp_path, finds_missing=False)
-    assert set(ties.photo.tolist()) == {1}
-
-
 def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(
     scene: ms.TexturedWall, walls: Walls, tmp_path: Path
 ) -> None:
