@@ -15,7 +15,8 @@ import time
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.match.descriptors import mutual_matches
+
+from orthoflow.geometry.key_points import mutual_matches
 
 RATIO = 0.85
 

@@ -280,9 +280,7 @@ def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.linalg.pinv(matrices), dtype=np.float64)
 
 
-def widened_by_moves(
-    plain: NDArray[np.float64], moves: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def widened_by_moves(plain: NDArray[np.float64], moves: NDArray[np.float64]) -> NDArray[np.float64]:
     """Widen a covariance (p, p) by what leaving out each of some groups changes (g, p).
 
     Of few groups and many unknowns the largest spread is far too large and the smallest far too

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthoflow.products import Photo, Wall
-from orthoflow.sdk import MethodParams
-from orthoflow_plugins.match.descriptors import (
+from orthoflow.geometry.key_points import (
     Matches,
     Window,
     mutual_matches,
     mutual_matches_within,
 )
+from orthoflow.products import Photo, Wall
+from orthoflow.sdk import MethodParams
 from orthoflow_plugins.match.features import Features, find_features
 from orthoflow_plugins.match.pictures import (
     CLIP_LIMIT,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.key_points import best_matches
 from orthoflow.products import Photo, Wall, Walls
-from orthoflow_plugins.match.descriptors import best_matches
 from orthoflow_plugins.match.features import Features, find_features
 from orthoflow_plugins.match.pictures import photo_grey, wall_picture
 from orthoflow_plugins.match.ties import TiePiece, key_point_ties

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.key_points import in_turns, root_sift
+from orthoflow.geometry.key_points import in_turns, mutual_matches, root_sift
 from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.geometry.rotations import cross_matrix
 from orthoflow.products import Photo
@@ -24,7 +24,6 @@ _CONTRAST_THRESHOLD: Final = 0.02
 _SPREAD_CELLS: Final = 16
 _RATIO_MOST: Final = 0.85
 _PARTNERS_MOST: Final = 8
-_BLOCK_ROWS: Final = 1024
 # The poses are known to a few pixels already.
 _OFF_LINE_MOST_PX: Final = 6.0
 _OFF_POINT_MOST_PX: Final = 8.0
@@ -160,12 +159,15 @@ def tie_photos(
     ]
     links = [np.empty((0, 2), dtype=np.intp)]
     for first, second in pairs:
-        matched = _mutual(features[first].descriptors, features[second].descriptors)
-        off = _off_line_px(
-            (cameras[first], rays[first][matched[:, 0]]),
-            (cameras[second], rays[second][matched[:, 1]]),
+        matched = mutual_matches(
+            features[first].descriptors, features[second].descriptors, ratio=_RATIO_MOST
         )
-        links.append(matched[off <= _OFF_LINE_MOST_PX] + [starts[first], starts[second]])
+        off = _off_line_px(
+            (cameras[first], rays[first][matched.first]),
+            (cameras[second], rays[second][matched.second]),
+        )
+        near = matched.take(off <= _OFF_LINE_MOST_PX)
+        links.append(np.column_stack([near.first + starts[first], near.second + starts[second]]))
     tracks = _tracks(np.vstack(links), starts)
     return _located(cameras, features, rays, tracks[:n_most], starts)
 
@@ -176,33 +178,6 @@ def _spread(points: NDArray[np.float64], shape: tuple[int, ...], n_most: int) ->
     cells = np.clip(cells, 0, _SPREAD_CELLS - 1)
     cell = cells[:, 1] * _SPREAD_CELLS + cells[:, 0]
     return in_turns(cell, (-points[:, 4],), n_most)
-
-
-def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Pairs (n, 2) of descriptors that are each other's nearest, and distinctly so."""
-    if min(len(first), len(second)) < 2:
-        return np.empty((0, 2), dtype=np.intp)
-    norms = (second**2).sum(axis=1)
-    nearest = np.empty(len(first), dtype=np.intp)
-    distinct = np.empty(len(first), dtype=np.bool_)
-    back_best = np.full(len(second), np.inf, dtype=np.float32)
-    back = np.zeros(len(second), dtype=np.intp)
-    for start in range(0, len(first), _BLOCK_ROWS):
-        part = first[start : start + _BLOCK_ROWS]
-        distances = (part**2).sum(axis=1)[:, None] + norms - 2.0 * (part @ second.T)
-        rows = np.arange(len(part))
-        two = np.argpartition(distances, 1, axis=1)[:, :2]
-        values = np.take_along_axis(distances, two, axis=1)
-        nearest[start : start + len(part)] = two[rows, values.argmin(axis=1)]
-        distinct[start : start + len(part)] = values.min(axis=1) <= _RATIO_MOST**2 * values.max(
-            axis=1
-        )
-        best_row = distances.argmin(axis=0)
-        best = distances[best_row, np.arange(len(second))]
-        closer = best < back_best
-        back[closer], back_best[closer] = best_row[closer] + start, best[closer]
-    index = np.flatnonzero(distinct & (back[nearest] == np.arange(len(first))))
-    return np.column_stack([index, nearest[index]])
 
 
 def _off_line_px(

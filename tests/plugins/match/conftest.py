@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import features, pairing
-from orthoflow_plugins.match.descriptors import Matches
+
+from orthoflow.geometry.key_points import Matches
 
 # What compares runs, or looks at how key points are found, finds them anew each time.
 _ANEW: Final = (

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.descriptors import Matches
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pairing import (
     Expectation,
@@ -18,6 +17,8 @@ from orthoflow_plugins.match.pairing import (
     rematched,
     verified,
 )
+
+from orthoflow.geometry.key_points import Matches
 
 LOOSE_PX = 20.0
 # Photo pixels from wall pixels: turned, shrunk, and seen a little from aside.

@@ -7,12 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.descriptors import (
-    Matches,
-    Window,
-    mutual_matches,
-    mutual_matches_within,
-)
 from orthoflow_plugins.match.features import find_features
 from orthoflow_plugins.match.pairing import Expectation, rematched
 from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
@@ -22,6 +16,12 @@ from scipy.spatial.distance import cdist
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
+from orthoflow.geometry.key_points import (
+    Matches,
+    Window,
+    mutual_matches,
+    mutual_matches_within,
+)
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms

@@ -12,7 +12,6 @@ from orthoflow_plugins.orient import photo_ties
 from orthoflow_plugins.orient.photo_ties import (
     PhotoFeatures,
     PhotoTies,
-    _off_line_px,
     overlapping_pairs,
     photo_features,
     tie_photos,
@@ -32,30 +31,6 @@ def camera(centre: tuple[float, float, float], *, focal_px: float) -> ViewingCam
     return samples.camera(
         rotation, where, width=1000, height=800, fx=focal_px, fy=focal_px, cx=500.0, cy=400.0
     )
-
-
-@pytest.mark.parametrize("focal_px", [500.0, 1700.0])
-def test_rays_are_off_by_the_pixels_that_they_were_moved_across_the_line(focal_px: float) -> None:
-    rng = np.random.default_rng(1)
-    first, second = (
-        camera((-1.0, 0.0, 0.0), focal_px=900.0),
-        camera((1.0, 0.3, 0.2), focal_px=focal_px),
-    )
-    points = rng.uniform((-1.5, 4.0, -1.0), (1.5, 6.0, 1.0), (40, 3))
-    seen = [(points - view.centre_world) @ view.rotation.T for view in (first, second)]
-    rays = [item / item[:, 2:] for item in seen]
-    none = _off_line_px((first, rays[0]), (second, rays[1]))
-    np.testing.assert_allclose(none, 0.0, atol=1e-8)
-    # The line of a point is the picture of its ray from the first camera: move across it by 3 px.
-    farther = (points - first.centre_world) * 1.2 + first.centre_world - second.centre_world
-    ahead = farther @ second.rotation.T
-    along = (ahead / ahead[:, 2:] - rays[1])[:, :2]
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    moved = rays[1].copy()
-    moved[:, :2] += across * 3.0 / focal_px
-    off = _off_line_px((first, rays[0]), (second, moved))
-    np.testing.assert_allclose(off, 3.0, rtol=1e-8)
 
 
 CENTRES = ((-1.0, 0.0, 0.0), (1.0, 0.3, 0.2), (0.2, -0.4, 0.9), (0.1, 0.2, -0.8))
@@ -201,27 +176,6 @@ def test_points_behind_a_camera_are_none() -> None:
     assert photo_ties._intersection(centres, unit[::-1]) is None
 
 
-@pytest.mark.parametrize("block", [7, 1024])
-def test_matches_are_each_others_nearest_and_clearly_so(
-    block: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(6)
-    first = rng.integers(0, 12, (60, 6)).astype(np.float32)
-    second = rng.integers(0, 12, (50, 6)).astype(np.float32)
-    monkeypatch.setattr(photo_ties, "_BLOCK_ROWS", block)
-    apart = np.linalg.norm(first[:, None] - second[None], axis=2)
-    expected = []
-    for one in range(60):
-        best, next_best = np.argsort(apart[one], kind="stable")[:2]
-        if apart[one, best] <= 0.85 * apart[one, next_best] and apart[:, best].argmin() == one:
-            expected.append((one, int(best)))
-    found = photo_ties._mutual(first, second)
-    assert len(expected) > 5
-    assert [tuple(pair) for pair in found.tolist()] == expected
-    assert photo_ties._mutual(first[:1], second).shape == (0, 2)
-    assert photo_ties._mutual(first, second[:1]).shape == (0, 2)
-
-
 def test_a_track_with_two_points_of_one_photo_is_none() -> None:
     starts = np.array([0, 10, 20, 30])
     links = np.array([[0, 10], [10, 20], [1, 11], [11, 21], [21, 2], [3, 22]])
@@ -289,10 +243,3 @@ def test_a_photo_of_nothing_has_no_key_points() -> None:
     found = photo_features(plain, 100)
     assert found.pixels.shape == (0, 2)
     assert found.descriptors.shape == (0, 128)
-
-
-def test_no_ties_have_as_many_of_everything() -> None:
-    none = photo_ties.no_photo_ties()
-    assert none.photo.shape == none.point.shape == none.scale.shape == (0,)
-    assert none.pixels.shape == (0, 2)
-    assert none.points_world.shape == (0, 3)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.match.descriptors import (
+
+from orthoflow.geometry.key_points import (
     Matches,
     Window,
     best_matches,
