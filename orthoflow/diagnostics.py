@@ -192,14 +192,6 @@ def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
     )
 
 
-class Ref(Protocol):
-    """A product by its content."""
-
-    @property
-    def digest(self) -> str:
-        """Digest of the content."""
-
-
 class ReportingCell(Protocol):
     """A cell with its outcome, of a run or a record."""
 

@@ -280,9 +280,13 @@ def selection_options(command: _Decorated) -> _Decorated:
     """Add the options that choose steps: `--only --from --until --force`."""
     for name, parameter, text in [
         ("--force", "force", "Run this step although its result is stored."),
-        ("--until", "until", "Run this step and what it needs."),
-        ("--from", "from_", "Run this step and what follows; what it needs must be stored."),
-        ("--only", "only", "Run this step alone; what it needs must be stored."),
+        (
+            "--until",
+            "until",
+            "Run this step and what it needs; what is stored is not computed again.",
+        ),
+        ("--from", "from_", "Run this step, what follows, and what these need and is not stored."),
+        ("--only", "only", "Run this step, and what it needs and is not stored."),
     ]:
         command = click.option(
             name, parameter, metavar="STEP", multiple=True, help=f"{text} Repeatable."
