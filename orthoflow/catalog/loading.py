@@ -132,7 +132,7 @@ def product_complaint(cls: type[Product]) -> str:
     known = dict.fromkeys(_names_within(cls, set()))
     return next(
         (
-            f"tolerances of {cls.__qualname__} names {name}, which is no field"
+            f"tolerances of {cls.__qualname__} names {name}, which is not a field"
             f"{did_you_mean(name, known)}"
             for name in cls.tolerances
             if name not in known

@@ -57,7 +57,7 @@ def current_session() -> Session:
 
 
 def command_again(output: Path) -> str:
-    """Write the running command as a shell takes it, with a folder behind -o."""
+    """Write the running command as a shell takes it, with a folder after -o."""
     context = click.get_current_context()
     words = [context.command_path]
     for item in context.command.params:
@@ -413,7 +413,7 @@ def error_text(error: Exception) -> str:
 
 
 def echo_error(*lines: str) -> None:
-    """Write lines to standard error; a closed one is no reason to fail."""
+    """Write lines to standard error; ignore a closed one."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
 

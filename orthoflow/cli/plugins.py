@@ -365,7 +365,7 @@ def plugins_new(
     if about["kind"] and new_kind:
         raise click.UsageError(
             f"--kind {about['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
-            "its own) exclude each other: leave one of them away"
+            "its own) exclude each other: leave one of them out"
         )
     if not (about["kind"] or new_kind):
         raise click.UsageError(

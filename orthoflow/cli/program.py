@@ -83,7 +83,7 @@ class Program(LazyGroup):
         sys.exit(code if isinstance(code, int) else EXIT_CELL_FAILED)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the chosen command; a reader that closed the pipe early is no error."""
+        """Run the chosen command; a reader that closed the pipe early is not an error."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError:

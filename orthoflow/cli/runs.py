@@ -227,7 +227,7 @@ class _Condition:
         match = _CONDITION.fullmatch(text)
         if match is None:
             raise click.UsageError(
-                f"--where {text!r} is no condition: expected a name, one of "
+                f"--where {text!r} is not a condition: expected a name, one of "
                 f"{' '.join(_SIGNS)} and a number, e.g. --where 'rmse_u_mm < 2'"
             )
         return cls(name=match[1], holds=_SIGNS[match[2]], limit=float(match[3]))

@@ -38,7 +38,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     not name, and a report that was changed are noted; with --strict they fail. Figures beside the
     report, and other files in the folder, such as logs, are not covered. With --signer the record
     must be signed with that key.
-    Ends with 3 when something differs, or RUN is no record or of another version.
+    Ends with 3 when something differs, or RUN is not a record or has another version.
     """
     from orthoflow.records.verification import verify_run
 

@@ -303,15 +303,17 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     noticed = _mark_position(error.problem_mark)
     words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
     if "\\t" in problem:
-        return _UnreadableError(noticed, "this is not YAML: a tab stands here; indent with spaces")
+        return _UnreadableError(
+            noticed, "this is not YAML: there is a tab here; indent with spaces"
+        )
     stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
     if re.search(r":[\[{]$", text[: stumbled + 1]):
-        return _UnreadableError(noticed, "this is not YAML: put a space behind the colon")
+        return _UnreadableError(noticed, "this is not YAML: put a space after the colon")
     # `key:value` above is text, which cannot be followed by another key.
     above = noticed.line - 1
     if "mapping values" in problem and (glued := _GLUED.match(text.splitlines()[above - 1])):
         position = Position(line=above, column=glued.end())
-        return _UnreadableError(position, "this is not YAML: put a space behind the colon")
+        return _UnreadableError(position, "this is not YAML: put a space after the colon")
     if context in _OPENED and error.context_mark is not None:
         opened = _mark_position(error.context_mark)
         where = f"noticed in line {noticed.line}"

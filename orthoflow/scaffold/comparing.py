@@ -98,7 +98,7 @@ def _judged(
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:
-    """Give a workflow in which a method of a new kind stands behind a shipped recipe, in two ways.
+    """Return a workflow in which a method of a new kind follows a shipped recipe, in two ways.
 
     Args:
         method_id: the new method, which has a parameter `factor`.

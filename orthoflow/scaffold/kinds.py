@@ -145,7 +145,7 @@ def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str])
     if made and not start:
         raise ArgumentError(
             f"no installed method makes {' and '.join(made)} of {' and '.join(takes)}, so there is "
-            f"nothing to start from: name {' and '.join(made)} behind --takes, too"
+            f"nothing to start from: name {' and '.join(made)} with --takes, too"
         )
     module, _, class_name = start.spec.target.partition(":") if start else ("", "", "")
     return KindPorts(

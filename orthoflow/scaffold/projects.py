@@ -146,8 +146,8 @@ def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
     if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
         raise ArgumentError(
-            f"a plugin's name must be 2 to 32 small letters, digits and hyphens, a letter first, "
-            f"and no word of Python's, as in my-detector, got {project.name!r}"
+            f"a plugin's name must be 2 to 32 lower-case letters, digits and hyphens, start "
+            f"with a letter and be no keyword of Python, as in my-detector, got {project.name!r}"
         )
     if project.is_new_kind:
         _check_new_kind(project, catalog)
@@ -178,12 +178,12 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
     for name in filter(None, (project.kind, project.product)):
         if not re.fullmatch(NAME_PATTERN, name) or keyword.iskeyword(name) or "-" in name:
             raise ArgumentError(
-                f"kinds and products are named with small letters, digits and underscores, got "
+                f"names of kinds and products are lower-case letters, digits and underscores, got "
                 f"{name!r}"
             )
     if project.product in catalog.products:
         raise ArgumentError(
-            f"product {project.product} is announced already: name another behind --gives"
+            f"product {project.product} is announced already: name another with --gives"
         )
     for name in (*project.takes, *project.gives):
         if name not in catalog.products:

@@ -216,7 +216,7 @@ def _parsed(text: str, file: Path) -> dict[str, Golden]:
         return _FORMAT.validate_json(text) if text else {}
     except ValidationError as error:
         raise InputError(
-            f"{file.name} is no file of golden results ({error.error_count()} mistakes): remove "
+            f"{file.name} is not a file of golden results ({error.error_count()} mistakes): remove "
             "it, and the next run writes another"
         ) from error
 

@@ -81,13 +81,13 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     Args:
         name_or_path: an existing file, else the name of a shipped recipe.
         catalog: the installed plugins.
-        sets: `step[.variant].param=value`, each as behind `--set`.
-        inputs: `NAME=PATH`, each as behind `--input`; relative to the working directory.
-        datasets: a table in the place of the file's datasets, as behind `--datasets`, or what the
-            file would state in their place.
-        only_data: names of datasets, each as behind `--only-data`.
-        set_files: YAML files of `step.parameter: value`, as behind `--set-file`; what stands
-            behind `--set` goes before them.
+        sets: `step[.variant].param=value`, each as given with `--set`.
+        inputs: `NAME=PATH`, each as given with `--input`; relative to the working directory.
+        datasets: a table in the place of the file's datasets, as given with `--datasets`, or what
+            the file would state in their place.
+        only_data: names of datasets, each as given with `--only-data`.
+        set_files: YAML files of `step.parameter: value`, as given with `--set-file`; what is
+            given with `--set` takes precedence.
         also_files: of a file with problems, input files that are missing are reported with them.
 
     Raises:
@@ -300,7 +300,7 @@ class _Reader:
     def _variants(self, section: StepSection, location: Location) -> tuple[DraftCall, ...]:
         for key in _OF_CALLS:
             if self.log.value((*location, key)) is not None:
-                message = f"with variants, {key} belongs into each of them"
+                message = f"with variants, {key} belongs in each of them"
                 self.log.report((*location, key), message, at_key=True)
         calls = [
             self._call(name, call, (*location, "variants", name))

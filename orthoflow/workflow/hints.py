@@ -97,7 +97,7 @@ def meant_number(parameter: str, text: object) -> str:
     >>> meant_number("tolerance_m", "0,02")
     '; decimals have a point: 0.02'
     >>> meant_number("tolerance_m", "5 cm")
-    '; it is in metres, and no unit stands behind it: 0.05'
+    '; it is in metres; write it without a unit: 0.05'
     """
     found = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
     if found is None:
@@ -110,8 +110,8 @@ def meant_number(parameter: str, text: object) -> str:
     own = parameter.rpartition("_")[2]
     factor = _factor(unit, own)
     if factor is None:
-        return "; no unit stands behind a number"
-    return f"; it is in {_WORDS.get(own, own)}, and no unit stands behind it: {value * factor:g}"
+        return "; write numbers without a unit"
+    return f"; it is in {_WORDS.get(own, own)}; write it without a unit: {value * factor:g}"
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:

@@ -140,7 +140,7 @@ class InputOption:
 
 
 def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOption, ...]:
-    """Read what stands behind each `--input`; what is no NAME=PATH goes to the log."""
+    """Read the value of each `--input`; report what is not NAME=PATH."""
     options = []
     for text in texts:
         name, _, path = text.partition("=")
@@ -544,7 +544,7 @@ class DatasetReader:
         step, _, parameter = key.partition(".")
         meant = ""
         if key == SEED or (parameter and any(one.name == step for one in self.steps)):
-            meant = f"; parameters stand in set: {{set: {{{key}: VALUE}}}}"
+            meant = f"; parameters go in set: {{set: {{{key}: VALUE}}}}"
         elif origin.table:
             # A table has parameters by the dot in the names of their columns.
             meant = "; columns of parameters are called step.parameter"
@@ -596,7 +596,7 @@ def _unplaced(value: JsonValue) -> Value:
 def choose_data(
     texts: Sequence[str], datasets: Mapping[str, Dataset], log: ProblemLog
 ) -> tuple[str, ...]:
-    """Read what stands behind each `--only-data`: names of datasets with commas between them."""
+    """Read the value of each `--only-data`: names of datasets with commas between them."""
     chosen: dict[str, None] = {}
     for text in texts:
         for name in (part.strip() for part in text.split(",")):
@@ -695,7 +695,7 @@ def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, tuple[int, 
     if "name" not in columns:
         listed = ", ".join(columns) or "none"
         is_mapping = any(": " in name or name.endswith(":") for name in columns)
-        way_out = "; a mapping stands in the workflow, under datasets:" if is_mapping else ""
+        way_out = "; write a mapping in the workflow, under datasets:" if is_mapping else ""
         log.add(
             start,
             "",
@@ -715,9 +715,7 @@ def _row(
     named = {index for index, _ in columns.values()}
     if unnamed := [index for index in places if index not in named]:
         field = row[unnamed[0]]
-        message = (
-            f"{field.value} stands in column {unnamed[0] + 1}, which has no name in the header"
-        )
+        message = f"{field.value} is in column {unnamed[0] + 1}, which has no name in the header"
         log.add(field.position, "", message)
         return None
     if columns["name"][0] not in places:
@@ -741,7 +739,7 @@ def _row(
 
 
 def _as_yaml(field: Text, key: str, log: ProblemLog) -> Value | None:
-    """Read what stands in a column of parameters, as behind `--set`."""
+    """Read what stands in a column of parameters, as given with `--set`."""
     text = str(field.value)
     if _NUMBER.fullmatch(text):
         # A thousand rooms have a thousand numbers, and to read each as YAML takes milliseconds.

@@ -766,7 +766,7 @@ class Workflow:
 
 
 def factors_of(workflow: Workflow) -> frozenset[str]:
-    """Return the factors of addresses that are no steps: `data`, `seed`."""
+    """Return the factors of addresses that are not steps: `data`, `seed`."""
     data = {DATA} if workflow.datasets else set()
     return frozenset(data | ({SEED} if workflow.has_seeds else set()))
 

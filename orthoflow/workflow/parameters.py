@@ -258,7 +258,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     if not mark or len(parts) < 2 or not all(parts):
         raise ArgumentError("expected step.parameter=value or step.variant.parameter=value")
     if not raw.strip():
-        raise ArgumentError("expected a value behind the equals sign")
+        raise ArgumentError("expected a value after the equals sign")
     log = ProblemLog(file="the value")
     value = log.parse(raw)
     try:
@@ -395,7 +395,7 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
     for key in outer:
         inner = place.setdefault(key, {})
         if not isinstance(inner, dict):
-            override.report(f"{key} is no mapping, so nothing in it can be set")
+            override.report(f"{key} is not a mapping, so nothing in it can be set")
             return
         place = inner
     # Several calls may take the same value, and later settings go into it.
@@ -478,7 +478,7 @@ class _Reporter:
                 listed = f"; {self.info.id} has {', '.join(known) or 'none'}" if known else ""
                 meant = meant_parameter(name, known, details["input"]) or did_you_mean(name, known)
                 if known and name in _BESIDE:
-                    meant = f" ({name} stands beside params, not in it)"
+                    meant = f" ({name} belongs beside params, not in it)"
                 return f"unknown parameter {name}{meant}{listed}"
             case "missing":
                 return f"{self.info.id} needs parameter {name}"

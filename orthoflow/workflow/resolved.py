@@ -148,7 +148,7 @@ def workflow_from_resolved(resolved: str, source: str) -> Workflow:
         source: text of the workflow file as written.
 
     Raises:
-        WorkflowError: the text is no resolved workflow, or one of a newer format.
+        WorkflowError: the text is not a resolved workflow, or one of a newer format.
     """
     try:
         workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)

@@ -182,7 +182,7 @@ def _report(
         log.report(
             here,
             f"unknown key {name}{did_you_mean(name, known)}; known here: {', '.join(known)}"
-            f"{'; parameters of the method belong into params' if 'params' in known else ''}",
+            f"{'; parameters of the method belong in params' if 'params' in known else ''}",
             at_key=True,
         )
         return

@@ -446,7 +446,7 @@ def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"tolerances": {"rbg": 1}}, "tolerances of Own names rbg, which is no field"),
+        ({"tolerances": {"rbg": 1}}, "tolerances of Own names rbg, which is not a field"),
         ({"tolerances": {"depth_m": 1, "gsd_m": 1}}, ""),
     ],
 )

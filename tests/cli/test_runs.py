@@ -270,8 +270,8 @@ def test_links_are_not_followed(runs: Path) -> None:
     ("arguments", "sentence"),
     [
         (("nowhere",), "nowhere is no folder: give folders that runs lie in"),
-        (("--where", "rmse_u_mm"), "is no condition: expected a name, one of < <= > >= = !="),
-        (("--where", "rmse_u_mm < 2 mm"), "is no condition"),
+        (("--where", "rmse_u_mm"), "is not a condition: expected a name, one of < <= > >= = !="),
+        (("--where", "rmse_u_mm < 2 mm"), "is not a condition"),
         (("--where", "rmse_u < 2"), "no run has a metric or parameter 'rmse_u'; did you mean"),
         (("--where", "cell_m = 1"), "parameter 'cell_m'; did you mean 'plane.cell_m'?"),
         (("--sort", "zzz"), "no run has a metric or parameter 'zzz'; --json has the names"),

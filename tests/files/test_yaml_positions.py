@@ -222,7 +222,7 @@ def test_keys_and_values_are_counted(text: str, n_values: int) -> None:
             (1, 8, "a[1]"),
             "0,05 is two numbers; decimals have a point: 0.05",
         ),
-        ("a: {b:[1, 2]}", (1, 7, ""), "this is not YAML: put a space behind the colon"),
+        ("a: {b:[1, 2]}", (1, 7, ""), "this is not YAML: put a space after the colon"),
         ("a: {1.5: x}", (1, 5, "a"), "a key must be text, got 1.5"),
         ("a: {: x}", (1, 6, "a"), "a key must be text, got nothing"),
         ("a: !foo {b: 1}", (1, 4, "a"), "tags are not allowed in a workflow, got !foo"),
@@ -256,7 +256,7 @@ def test_reading_goes_on_with_the_number_that_was_meant() -> None:
 @pytest.mark.parametrize(
     ("text", "place", "words"),
     [
-        ("a:\n\tb: 1", (2, 1), "a tab stands here; indent with spaces"),
+        ("a:\n\tb: 1", (2, 1), "there is a tab here; indent with spaces"),
         (
             "a:\n    b: 1\n  c: 2",
             (3, 3),

@@ -219,7 +219,12 @@ def test_no_class_has_the_name_of_another_one_beside_it(
     ("kind", "product", "takes", "sentence"),
     [
         ("plane", "parts", ("cloud",), "kind plane is announced by an installed plugin already"),
-        ("my-parts", "parts", ("cloud",), "small letters, digits and underscores, got 'my-parts'"),
+        (
+            "my-parts",
+            "parts",
+            ("cloud",),
+            "lower-case letters, digits and underscores, got 'my-parts'",
+        ),
         ("part", "planes", ("cloud",), "product planes is announced already"),
         ("part", "parts", ("clouds",), r"no product type clouds \(did you mean cloud\?\)"),
     ],
@@ -239,7 +244,7 @@ def test_a_new_kind_that_cannot_be_is_refused(
         ([], "give --kind, the kind of the method"),
         (["--new-kind", "part", "--gives", "a,b"], "of a and b no plugin has a product type"),
         (["--new-kind", "part", "--gives", "truth"], "no installed method makes truth of cloud"),
-        (["--kind", "plane", "--new-kind", "part"], "exclude each other: leave one of them away"),
+        (["--kind", "plane", "--new-kind", "part"], "exclude each other: leave one of them out"),
     ],
 )
 def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], said: str, tmp_path: Path) -> None:
@@ -252,8 +257,8 @@ def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], said: str, tmp_p
 @pytest.mark.parametrize(
     ("name", "kind", "sentence"),
     [
-        ("My Detector", "plane", "a plugin's name must be 2 to 32 small letters"),
-        ("x", "plane", "a plugin's name must be 2 to 32 small letters"),
+        ("My Detector", "plane", "a plugin's name must be 2 to 32 lower-case letters"),
+        ("x", "plane", "a plugin's name must be 2 to 32 lower-case letters"),
         ("mine", "plain", r"no installed plugin announces kind plain \(did you mean plane\?\)"),
         ("hough2d", "plane", "method plane.hough2d is brought by orthoflow-tls"),
         ("numpy", "plane", "a Python package numpy is installed already"),

@@ -157,7 +157,9 @@ def test_an_output_that_appears_is_noticed(file: Path) -> None:
 def test_another_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
     path = tmp_path / "golden.json"
     path.write_text('{"plane.mine": {"1": {}}}')
-    with pytest.raises(InputError, match=r"golden.json is no file of golden results .*: remove it"):
+    with pytest.raises(
+        InputError, match=r"golden.json is not a file of golden results .*: remove it"
+    ):
         golden_problem(path, trial(), {"planes": planes()})
 
 

@@ -287,7 +287,7 @@ MAPPINGS = {
         "datasets: {hall: {wall.gsd_m: 0.5}}",
         (
             "datasets.hall.wall.gsd_m: there is no input wall.gsd_m; inputs: scan, photos; "
-            "parameters stand in set: {set: {wall.gsd_m: VALUE}}"
+            "parameters go in set: {set: {wall.gsd_m: VALUE}}"
         ),
     ),
     "bad name": (
@@ -349,7 +349,7 @@ MAPPINGS = {
     ),
     "no mapping inside": (
         "datasets: {hall: {set: {plane.hough2d.cell_m.deep: 1}}}",
-        "datasets.hall.set.plane.hough2d.cell_m.deep: cell_m is no mapping, so nothing in it can",
+        "datasets.hall.set.plane.hough2d.cell_m.deep: cell_m is not a mapping, so nothing in it",
     ),
     "no such table": (
         "datasets: nowhere.csv",
@@ -405,7 +405,7 @@ TABLES = {
         "hall: {set: {wall.gsd_m: 1}}\n",
         (
             "rooms.csv:1:1: a table of datasets needs the column name; its columns are hall: "
-            "{set: {wall.gsd_m: 1}}; a mapping stands in the workflow, under datasets:"
+            "{set: {wall.gsd_m: 1}}; write a mapping in the workflow, under datasets:"
         ),
     ),
     "a line without a name": (
@@ -426,7 +426,7 @@ TABLES = {
     ),
     "a field too many": (
         "name,scan\nhall,a,b\n",
-        "rooms.csv:2:8: b stands in column 3, which has no name in the header",
+        "rooms.csv:2:8: b is in column 3, which has no name in the header",
     ),
     "an open quote": ('name,scan\nhall,"a\n', "rooms.csv:2:1: the line cannot be read as CSV"),
     "nothing": ("# nothing\n", "a table of datasets begins with a line of column names, got none"),

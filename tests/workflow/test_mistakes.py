@@ -23,7 +23,7 @@ CASES = {
     "key of the call": (
         STEP % ", params: {repeat: 3}",
         "steps.x.params.repeat",
-        "unknown parameter repeat (repeat stands beside params, not in it); plane.hough2d has",
+        "unknown parameter repeat (repeat belongs beside params, not in it); plane.hough2d has",
     ),
     "unknown parameter": (
         STEP % ", params: {cel_m: 1}",
@@ -118,7 +118,7 @@ CASES = {
     "parameter beside the others": (
         "x: {use: plane.hough2d, in: {cloud: cloud.cloud}, cell_m: 1}",
         "steps.x.cell_m",
-        "timeout, in, if, unless, variants; parameters of the method belong into params",
+        "timeout, in, if, unless, variants; parameters of the method belong in params",
     ),
     "no use": ("x: {in: {cloud: cloud.cloud}}", "steps.x", "needs the key use"),
     "use is no text": ("x: {use: 3}", "steps.x.use", "expected a text, got 3"),
@@ -183,7 +183,7 @@ CASES = {
     "params beside variants": (
         "x: {in: {cloud: cloud.cloud}, params: {cell_m: 1}, variants: {a: {use: plane.hough2d}}}",
         "steps.x.params",
-        "with variants, params belongs into each of them",
+        "with variants, params belongs in each of them",
     ),
     "no variants": (
         "x: {in: {cloud: cloud.cloud}, variants: {}}",
@@ -363,11 +363,11 @@ def test_a_step_that_cannot_be_read_does_not_bring_problems_of_its_users(
 
 UNREADABLE = {
     "unclosed bracket": ("steps: [1", 1, "this is not YAML: the bracket [ that opens"),
-    "tab": ("orthoflow: 1\n\tsteps: 2\n", 2, "this is not YAML: a tab stands here; indent"),
+    "tab": ("orthoflow: 1\n\tsteps: 2\n", 2, "this is not YAML: there is a tab here; indent"),
     "no space behind a colon": (
         "steps:\n  x:\n    use:plane.hough2d\n    in: {cloud: cloud.cloud}\n",
         3,
-        "this is not YAML: put a space behind the colon",
+        "this is not YAML: put a space after the colon",
     ),
     "undefined alias": ("steps: *nothing\n", 1, "this is not YAML: found undefined alias"),
     "two documents": ("a: 1\n---\nb: 2\n", 2, "expected a single document"),

@@ -158,11 +158,11 @@ BAD_SETS = {
     "plane.depth=1": "no parameter depth in plane.hough2d or plane.ransac; known: cell_m, iter",
     "wall.gsd_m": "expected step.parameter=value or step.variant.parameter=value",
     "gsd_m=1": "expected step.parameter=value or step.variant.parameter=value",
-    "wall.gsd_m=": "expected a value behind the equals sign",
+    "wall.gsd_m=": "expected a value after the equals sign",
     "wall.gsd_m=[1": "the value cannot be read as YAML: this is not YAML",
     "wall.gsd_m=-1": "input should be greater than 0, got -1",
     'wall.gsd_m="1"': 'a valid number, got the text "1"; write it without quotes',
-    "plane.ransac.tolerance_m.x=1": "tolerance_m is no mapping, so nothing in it can be set",
+    "plane.ransac.tolerance_m.x=1": "tolerance_m is not a mapping, so nothing in it can be set",
 }
 
 
@@ -563,13 +563,13 @@ def test_a_missing_file_of_parameters_is_an_argument_that_is_wrong(catalog: Cata
     ("parameter", "text", "said"),
     [
         ("gsd_m", "0,003", "; decimals have a point: 0.003"),
-        ("gsd_m", "3mm", "; it is in metres, and no unit stands behind it: 0.003"),
-        ("gsd_m", "5 cm", "; it is in metres, and no unit stands behind it: 0.05"),
-        ("gsd_m", "0,5 cm", "; it is in metres, and no unit stands behind it: 0.005"),
-        ("max_tilt_deg", "10°", "; it is in degrees, and no unit stands behind it: 10"),
-        ("noise_mm", "0.002 m", "; it is in millimetres, and no unit stands behind it: 2"),
-        ("min_share", "5 m", "; no unit stands behind a number"),
-        ("gsd_m", "5 deg", "; no unit stands behind a number"),
+        ("gsd_m", "3mm", "; it is in metres; write it without a unit: 0.003"),
+        ("gsd_m", "5 cm", "; it is in metres; write it without a unit: 0.05"),
+        ("gsd_m", "0,5 cm", "; it is in metres; write it without a unit: 0.005"),
+        ("max_tilt_deg", "10°", "; it is in degrees; write it without a unit: 10"),
+        ("noise_mm", "0.002 m", "; it is in millimetres; write it without a unit: 2"),
+        ("min_share", "5 m", "; write numbers without a unit"),
+        ("gsd_m", "5 deg", "; write numbers without a unit"),
         ("gsd_m", "0.003", "; write it without quotes"),
         ("gsd_m", "fine", ""),
         ("gsd_m", "1.2.3", ""),
@@ -600,7 +600,7 @@ def test_units_of_one_family_are_reckoned_into_each_other(
 ) -> None:
     for unit, factor in units.items():
         assert meant_number(parameter, f"3 {unit}") == (
-            f"; it is in {words}, and no unit stands behind it: {3 * factor:g}"
+            f"; it is in {words}; write it without a unit: {3 * factor:g}"
         )
 
 
