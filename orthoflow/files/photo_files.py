@@ -509,10 +509,8 @@ _RESOLUTION_Y: Final = 0xA20F
 _RESOLUTION_UNIT: Final = 0xA210
 _FOCAL_LENGTH_35MM: Final = 0xA405
 
-_DIGITAL_ZOOM: Final = 0xA404
-
 _TAGS: Final = frozenset(
-    {_ORIENTATION, _MAKE, _MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM}
+    {_ORIENTATION, _MAKE, _MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM}
     | {_WIDTH, _HEIGHT, _RESOLUTION_X, _RESOLUTION_Y, _RESOLUTION_UNIT}
 )
 _MAX_TEXT: Final = 200
@@ -539,7 +537,6 @@ class Exif:
         model: model of the camera.
         focal_mm: focal length.
         focal_35mm: full-frame equivalent of it.
-        digital_zoom: by how much the picture was enlarged; 1 without.
         resolution_px_per_mm: pixels of the picture as it was taken per millimetre of the sensor.
         width: pixels of the picture as it was taken; it may have been made smaller since.
         height: pixels.
@@ -551,7 +548,6 @@ class Exif:
     model: str = ""
     focal_mm: float | None = None
     focal_35mm: float | None = None
-    digital_zoom: float | None = None
     resolution_px_per_mm: float | None = None
     width: int | None = None
     height: int | None = None
@@ -592,7 +588,6 @@ def read_exif(encoded: bytes) -> Exif:
         model=_text(found.get(_MODEL)),
         focal_mm=_positive(found.get(_FOCAL_LENGTH)),
         focal_35mm=_positive(found.get(_FOCAL_LENGTH_35MM)),
-        digital_zoom=_positive(found.get(_DIGITAL_ZOOM)),
         resolution_px_per_mm=_resolution(found),
         width=_whole(_positive(found.get(_WIDTH))),
         height=_whole(_positive(found.get(_HEIGHT))),

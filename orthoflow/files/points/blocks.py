@@ -95,7 +95,6 @@ class ScanFile:
         n_most: at most so many points will come.
         scans: its scans, in the order in which their blocks come.
         read: yields the points; may be called once.
-        details: what else the header states and is worth keeping.
         notes: what the reader noticed, in sentences for the user; complete after reading.
         is_chosen: only the parts of the file come that were asked for.
     """
@@ -105,7 +104,6 @@ class ScanFile:
     n_most: int
     scans: list[Scan]
     read: Callable[[], Iterator[PointBlock]]
-    details: dict[str, str | int | float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     is_chosen: bool = False
 

@@ -103,11 +103,6 @@ class Octree:
             np.all(wish.box[0] <= low + side + slack) and np.all(wish.box[1] >= low - slack)
         )
 
-    @property
-    def deepest(self) -> int:
-        """Level of the deepest nodes."""
-        return max(node.level for node in self.nodes)
-
 
 def read_octree(path: Path, chunks: Collection[tuple[int, int, int]]) -> Octree | None:
     """Read the octree of a LAZ file; None for one that has none.

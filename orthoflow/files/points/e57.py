@@ -115,7 +115,6 @@ def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         n_most=sum(header.n_points for header in headers),
         scans=[header.scan for header in headers],
         read=lambda: _blocks(path, pye57, headers),
-        details={"scans": len(headers)},
     )
 
 

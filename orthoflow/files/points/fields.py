@@ -64,13 +64,11 @@ class Columns:
 
     Attributes:
         names: meaning of each, `_` for one that is not used.
-        rule: how they were found: `parameter`, `header`, `values`.
         labels: what the file calls them.
         unit: of the coordinates, where their names state it (`X [ft]`).
     """
 
     names: tuple[str, ...]
-    rule: str
     labels: tuple[str, ...] = field(default=())
     unit: str | None = None
 
@@ -133,7 +131,7 @@ def may_be_intensity(name: str) -> bool:
 
 
 def columns_of_names(
-    labels: Sequence[str], *, intensity_field: str | None = None, rule: str = "header"
+    labels: Sequence[str], *, intensity_field: str | None = None
 ) -> Columns | None:
     """Sort out fields by their names.
 
@@ -141,7 +139,6 @@ def columns_of_names(
         labels: names of the fields, in their order.
         intensity_field: name of the field that is to be the intensity; None for the usual names,
             else those of reflectance, amplitude and remission.
-        rule: for `Columns`.
 
     Returns:
         None when they name no x, y and z.
@@ -163,7 +160,6 @@ def columns_of_names(
     units = {_split_unit(labels[names.index(axis)])[1] for axis in "xyz"}
     return Columns(
         names=tuple(names),
-        rule=rule,
         labels=tuple(labels),
         unit=units.pop() if len(units) == 1 else None,
     )
@@ -189,7 +185,7 @@ def columns_of_user(text: str | Sequence[str]) -> Columns:
             "cloud.columns must name x, y and z once each, and may name r, g, b, intensity, row, "
             f"column, nx, ny, nz or skip a column with {IGNORED}, got {' '.join(words)!r}"
         )
-    return Columns(names=tuple(known), rule="parameter")
+    return Columns(names=tuple(known))
 
 
 def columns_of_values(
@@ -229,7 +225,7 @@ def columns_of_values(
             f"{first_line[:80]!r}: name them with cloud.columns, e.g. "
             "--set 'cloud.columns=[x, y, z, r, g, b, intensity]', with _ for one to skip"
         )
-    return Columns(names=(*lead, "x", "y", "z", *readings[0]), rule="values")
+    return Columns(names=(*lead, "x", "y", "z", *readings[0]))
 
 
 def point_block(

@@ -84,18 +84,9 @@ def open_las(
         unit = _unit(path, header)
     nodes: tuple[Node, ...] | None = None
     octree = read_octree(path, chunks) if wish and chunks else None
-    details: dict[str, str | int | float] = {
-        "version": str(header.version),
-        "point_format": int(header.point_format.id),
-        "scale": float(np.max(header.scales)),
-    }
     if octree is not None and wish:
         nodes = octree.chosen(wish)
         n_points = sum(node.n_points for node in nodes)
-        details["octree"] = (
-            f"{len(nodes)} of {len(octree.nodes)} nodes, levels 0 to "
-            f"{max(node.level for node in nodes)} of 0 to {octree.deepest}"
-        )
     names = tuple(header.point_format.dimension_names)
     extra = tuple(header.point_format.extra_dimension_names)
     columns = columns_of_names(names, intensity_field=intensity_field)
@@ -122,7 +113,6 @@ def open_las(
         n_most=n_points,
         scans=[scan],
         read=lambda: _blocks(path, laspy, notes, wanted),
-        details=details,
         notes=notes,
         is_chosen=nodes is not None,
     )

@@ -88,7 +88,6 @@ def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         n_most=header.n_points,
         scans=[scan],
         read=lambda: _blocks(path, header),
-        details={"encoding": header.data},
     )
 
 

@@ -118,7 +118,6 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         n_most=vertex.count,
         scans=[scan],
         read=lambda: _blocks(path, header, position, columns),
-        details={"encoding": "binary" if header.byte_order else "ascii"},
     )
 
 

@@ -210,7 +210,7 @@ def _read_header(path: Path, file: BinaryIO, start: int, end: int, line: int) ->
             f"b where the scan has them, got {first[:60]!r}"
         )
     layout = layout or Layout(separator=r"\s+", decimal=".", n_columns=3)
-    columns = Columns(names=tuple(_COLUMNS[layout.n_columns].split()), rule="format")
+    columns = Columns(names=tuple(_COLUMNS[layout.n_columns].split()))
     return ScanHeader(
         n_columns=n_columns,
         n_rows=n_rows,

@@ -97,7 +97,6 @@ def open_text(
         n_most=count_lines(path) - head.n_header_lines,
         scans=[scan],
         read=lambda: _blocks(path, head),
-        details={"columns": " ".join(head.columns.names), "columns_from": head.columns.rule},
     )
 
 
