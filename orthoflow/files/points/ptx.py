@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import BLOCK_POINTS, PointBlock, Scan, ScanFile
 from orthoflow.files.points.fields import Columns, axes_of, point_block
-from orthoflow.files.points.tables import Layout, find_layout, read_table, take_lines
+from orthoflow.files.points.tables import Layout, find_data, read_table, take_lines
 
 FORMAT: Final = "PTX"
 HEADER_LINES: Final = 10
@@ -197,7 +197,7 @@ def _read_header(path: Path, file: BinaryIO, start: int, end: int, line: int) ->
             begin, line = begin + len(sample), line + 1
             continue
         first = first or text
-        found = find_layout(text)
+        found = find_data(text)
         # Points without a return may be shorter than others.
         if found and found.n_columns in _COLUMNS:
             layout = max(layout or found, found, key=lambda item: item.n_columns)

@@ -89,15 +89,6 @@ def unquoted(field: str) -> str:
     return field[1:-1].strip() if len(field) > 1 and field[0] == field[-1] == '"' else field
 
 
-def find_layout(line: str) -> Layout | None:
-    """Layout of a line that begins with three numbers, or None when it does not."""
-    fields, separator = split_fields(line)
-    if len(fields) < 3 or not _are_numbers(fields[:3]):
-        return None
-    has_comma = separator != "," and any("," in field for field in fields)
-    return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
-
-
 def numbers_of(line: str, layout: Layout) -> list[float]:
     """Numbers of a line; NaN for a field that is none."""
     return [
