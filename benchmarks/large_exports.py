@@ -52,10 +52,10 @@ def write_large_run(folder: Path, side: int) -> None:
     for name in ("rgb", "mask", "quality"):
         (folder / name).unlink()
     outputs = {
-        "ortho": {"layers": RecordedProduct(type_name="layers", encoding_version=2, digest=digest)},
+        "ortho": {"layers": RecordedProduct(type_name="layers", encoding_version=1, digest=digest)},
         "mosaic": {
             "orthoimages": RecordedProduct(
-                type_name="orthoimages", encoding_version=2, digest=f"sha256:{'0' * 64}"
+                type_name="orthoimages", encoding_version=1, digest=f"sha256:{'0' * 64}"
             )
         },
     }

@@ -6,16 +6,19 @@ locks of SQLite's, and no limits.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sqlite3
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Protocol
 
 _FOREVER_S: Final = 1e6
 _ZEROS_BYTES: Final = 1 << 20
+_PR_SET_CHILD_SUBREAPER: Final = 36
 
 
 def _module(name: str) -> Any:
@@ -80,6 +83,17 @@ def children_processor_s() -> float:
         return times.children_user + times.children_system
     used = _resource.getrusage(_resource.RUSAGE_CHILDREN)
     return float(used.ru_utime + used.ru_stime)
+
+
+def adopt_orphans() -> None:
+    """Make this process the parent of what descendants leave running, where the kernel can.
+
+    A process that was started in a session of its own is then found below the one that is to end
+    with it, also when what started it has ended.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 class FileLock(Protocol):

@@ -26,6 +26,37 @@ def daemon(values, params, ctx):
     return np.array([float(subprocess.Popen(SLEEPER, start_new_session=True).pid)])
 
 
+# The process that starts it is gone before the step is.
+HIDING = (
+    "import subprocess, sys; p = subprocess.Popen([sys.executable, '-c', "
+    "'import time; time.sleep(600)'], start_new_session=True, stdout=subprocess.DEVNULL); "
+    "print(p.pid)"
+)
+
+
+def hidden():
+    asked = subprocess.run([sys.executable, "-c", HIDING], stdout=subprocess.PIPE, check=True)
+    return int(asked.stdout)
+
+
+@work("exact")
+def hides(values, params, ctx):
+    ctx.log(f"hidden {hidden()}")
+    return values
+
+
+@work("exact")
+def hides_and_crashes(values, params, ctx):
+    ctx.log(f"hidden {hidden()}")
+    os.abort()
+
+
+@work("exact")
+def hides_and_stops(values, params, ctx):
+    ctx.log(f"hidden {hidden()}")
+    time.sleep(600)
+
+
 @work("exact")
 def forks(values, params, ctx):
     if os.fork():

@@ -11,8 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -22,7 +21,7 @@ from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.environment import now
 from orthoflow.engine.kernels import kernel_folder, kernels_in
 from orthoflow.engine.measuring import GIB, MIB, MemoryGuard, oom_kills, process_memory
-from orthoflow.engine.processes import ask_to_end, end_tree, start_step
+from orthoflow.engine.processes import StepProcess, start_step
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
@@ -228,8 +227,7 @@ class _Running:
 
     Attributes:
         task: the task.
-        process: of the step.
-        pipe: what it says.
+        step: its process.
         log: what it prints.
         started: ISO 8601 UTC.
         clock: monotonic seconds at the start.
@@ -242,8 +240,7 @@ class _Running:
     """
 
     task: Task
-    process: BaseProcess
-    pipe: Connection
+    step: StepProcess
     log: StepLog
     started: str
     clock: float
@@ -279,30 +276,29 @@ class LocalExecutor:
             task.scratch.mkdir(parents=True, exist_ok=True)
         log, kills = StepLog(Path(task.log)), oom_kills()
         try:
-            process, pipe = start_step(task)
+            step = start_step(task)
         except StepFailedError as error:
             log.close()
             self._unstarted.append(TaskEnd(address=task.address, result=failed_result(task, error)))
             return
         run = _Running(
             task=task,
-            process=process,
-            pipe=pipe,
+            step=step,
             log=log,
             started=now(),
             clock=time.monotonic(),
             oom_kills=kills,
         )
-        self._running[task.address] = _all_running[_pid(run)] = run
+        self._running[task.address] = _all_running[run.step.pid] = run
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
         """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
         unstarted, self._unstarted = tuple(self._unstarted), []
-        waited = [run.process.sentinel for run in self._running.values()]
-        heard = [run.pipe for run in self._running.values() if not run.pipe.closed]
+        waited = [run.step.process.sentinel for run in self._running.values()]
+        heard = [run.step.pipe for run in self._running.values() if not run.step.pipe.closed]
         wait([*heard, *waited], 0.0 if unstarted else min(timeout_s, self._guard.interval_s))
         # Asked for before the last words are taken: nothing is said after the end.
-        ended = [run for run in self._running.values() if not run.process.is_alive()]
+        ended = [run for run in self._running.values() if not run.step.process.is_alive()]
         for run in self._running.values():
             self._hear(run)
         ends = tuple(self._end(run) for run in ended)
@@ -317,21 +313,21 @@ class LocalExecutor:
     def close(self) -> None:
         """Kill whatever still runs."""
         for run in list(self._running.values()):
-            end_tree(run.process)
-            run.process.join(_GRACE_S)
+            run.step.end_tree()
+            run.step.process.join(_GRACE_S)
             self._forget(run)
 
     def _hear(self, run: _Running) -> None:
         for _ in range(_MOST_MESSAGES):
-            if run.pipe.closed:
+            if run.step.pipe.closed:
                 return
             try:
-                if not run.pipe.poll(0):
+                if not run.step.pipe.poll(0):
                     return
-                message = run.pipe.recv_bytes(_LARGEST_MESSAGE)
+                message = run.step.pipe.recv_bytes(_LARGEST_MESSAGE)
             except (EOFError, OSError):
                 # Ended, or it wrote there what is no message.
-                run.pipe.close()
+                run.step.pipe.close()
                 return
             self._take(run, message)
 
@@ -349,11 +345,11 @@ class LocalExecutor:
     def _watch(self) -> None:
         time_now = time.monotonic()
         for run in self._running.values():
-            run.peak_bytes = max(run.peak_bytes, process_memory(_pid(run)))
+            run.peak_bytes = max(run.peak_bytes, process_memory(run.step.pid))
             run.log.shorten()
             limit = run.task.timeout_s
             if run.kill_at is not None and time_now > run.kill_at:
-                end_tree(run.process)
+                run.step.end_tree()
                 run.kill_at = time_now + _GRACE_S
             elif limit is not None and run.reason is None and time_now - run.clock > limit:
                 self._stop(run, describe_timeout(run.task.who, limit))
@@ -361,7 +357,7 @@ class LocalExecutor:
 
     def _guard_memory(self) -> None:
         runs = {str(pid): run for pid, run in _all_running.copy().items()}
-        victim = self._guard.check({name: _pid(run) for name, run in runs.items()})
+        victim = self._guard.check({name: run.step.pid for name, run in runs.items()})
         # One at a time: the memory of a dying process is not free at once.
         if victim is None or any(run.is_victim for run in runs.values()):
             return
@@ -372,17 +368,17 @@ class LocalExecutor:
         run.is_victim = True
         run.reason = describe_memory(run.task.who, victim.n_bytes)
         run.peak_bytes = max(run.peak_bytes, victim.n_bytes)
-        end_tree(run.process)
+        run.step.end_tree()
         run.kill_at = time.monotonic() + _GRACE_S
 
     def _stop(self, run: _Running, reason: OrthoflowError) -> None:
         if run.reason is None:
             run.reason = reason
             run.kill_at = time.monotonic() + _GRACE_S
-            ask_to_end(run.process)
+            run.step.ask_to_end()
 
     def _end(self, run: _Running) -> TaskEnd:
-        end_tree(run.process)
+        run.step.end_tree()
         run.log.shorten()
         result = dataclasses.replace(_result(run), log=run.log.text())
         self._forget(run)
@@ -390,16 +386,9 @@ class LocalExecutor:
 
     def _forget(self, run: _Running) -> None:
         run.log.close()
-        run.pipe.close()
-        del _all_running[_pid(run)]
+        del _all_running[run.step.pid]
         del self._running[run.task.address]
-        if not run.process.is_alive():
-            run.process.close()
-
-
-def _pid(run: _Running) -> int:
-    assert run.process.pid is not None  # noqa: S101 - it was started
-    return run.process.pid
+        run.step.close()
 
 
 def _result(run: _Running) -> CellResult:
@@ -422,7 +411,7 @@ def _events() -> TypeAdapter[StepEvent]:
 
 
 def _reason_of_silence(run: _Running) -> OrthoflowError:
-    code = run.process.exitcode or 0
+    code = run.step.process.exitcode or 0
     if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
         return describe_memory(run.task.who, run.peak_bytes)
     tail = one_line(run.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)

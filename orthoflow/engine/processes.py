@@ -12,10 +12,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from types import ModuleType
 from typing import Final
 
@@ -51,11 +53,74 @@ _AT_START: Final = {
 _starting: Final = threading.Lock()
 
 
-def start_step(task: Task) -> tuple[BaseProcess, Connection]:
-    """Start the process of a task; its log and its folder exist.
+@dataclass(frozen=True, kw_only=True)
+class StepProcess:
+    """The process of a step, in a session of its own.
 
-    Returns:
-        The process, and what it says as in `worker.run_step`.
+    Attributes:
+        process: of the step.
+        pipe: what it sends, as in `worker.run_step`.
+        scratch: what it starts knows this folder as `TMPDIR`, or works there.
+        server: what it was forked from; None where that is unknown.
+    """
+
+    process: BaseProcess
+    pipe: Connection
+    scratch: Path
+    server: psutil.Process | None
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+        assert self.process.pid is not None  # noqa: S101 - it was started
+        return self.process.pid
+
+    def ask_to_end(self) -> None:
+        """Ask it to stop by itself."""
+        with suppress(OSError):
+            self.process.terminate()
+
+    def end_tree(self) -> None:
+        """Kill it with all that it started, also when it has ended by itself."""
+        _kill(_with_descendants(self.pid))
+        if hasattr(os, "killpg"):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, signal.SIGKILL)
+        if self.server is not None and self.process.exitcode:
+            # What a step that crashed had started is the server's now.
+            left = _with_descendants(self.server.pid)
+            _kill(one for one in left if one != self.server and _is_at_work_in(one, self.scratch))
+
+    def close(self) -> None:
+        """Let go of it."""
+        self.pipe.close()
+        if not self.process.is_alive():
+            self.process.close()
+
+
+def _with_descendants(process_id: int) -> list[psutil.Process]:
+    with suppress(psutil.Error):
+        root = psutil.Process(process_id)
+        return [*root.children(recursive=True), root]
+    return []
+
+
+def _kill(processes: Iterable[psutil.Process]) -> None:
+    for one in processes:
+        with suppress(psutil.Error):
+            one.kill()
+
+
+def _is_at_work_in(process: psutil.Process, scratch: Path) -> bool:
+    with suppress(psutil.Error):
+        if process.environ().get("TMPDIR") == str(scratch):
+            return True
+        return Path(process.cwd()).is_relative_to(scratch)
+    return False
+
+
+def start_step(task: Task) -> StepProcess:
+    """Start the process of a task; its log and its folder exist.
 
     Raises:
         StepFailedError: this machine gives no process more.
@@ -78,7 +143,9 @@ def start_step(task: Task) -> tuple[BaseProcess, Connection]:
             except (OSError, EOFError) as error:
                 failure = error
             else:
-                return process, ours
+                return StepProcess(
+                    process=process, pipe=ours, scratch=task.scratch, server=_parent(process.pid)
+                )
     ours.close()
     is_of_files = isinstance(failure, OSError) and failure.errno in (errno.EMFILE, errno.ENFILE)
     why = (
@@ -89,23 +156,11 @@ def start_step(task: Task) -> tuple[BaseProcess, Connection]:
     raise StepFailedError(f"no process could be started for {task.who}: {why}") from failure
 
 
-def ask_to_end(process: BaseProcess) -> None:
-    """Ask a step to stop by itself."""
-    with suppress(OSError):
-        process.terminate()
-
-
-def end_tree(process: BaseProcess) -> None:
-    """Kill a step with all that it started, also when it has ended by itself."""
-    assert process.pid is not None  # noqa: S101 - it was started
+def _parent(process_id: int | None) -> psutil.Process | None:
     with suppress(psutil.Error):
-        step = psutil.Process(process.pid)
-        for one in (*step.children(recursive=True), step):
-            with suppress(psutil.Error):
-                one.kill()
-    if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
+        parent = psutil.Process(process_id).parent()
+        return parent if parent is not None and parent.pid != os.getpid() else None
+    return None
 
 
 @contextmanager

@@ -65,7 +65,7 @@ from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, labelled
-from orthoflow.system import children_processor_s, flags
+from orthoflow.system import adopt_orphans, children_processor_s, flags
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
@@ -220,6 +220,7 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
     """Take the surroundings of a step for this process."""
     if hasattr(os, "setsid"):
         os.setsid()
+    adopt_orphans()
     log = os.open(task.log, flags("O_WRONLY", "O_APPEND", "O_NOFOLLOW"))
     for descriptor in (1, 2):
         os.dup2(log, descriptor)

@@ -102,7 +102,6 @@ class Truth(Product):
     """
 
     type_name: ClassVar[str] = "truth"
-    encoding_version: ClassVar[int] = 2
     embedded: ClassVar[bool] = False
 
     scene: Scene

@@ -233,7 +233,6 @@ class Ties(Product):
     """
 
     type_name: ClassVar[str] = "ties"
-    encoding_version: ClassVar[int] = 3
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "pixels_photo": Tolerance(limit=0.05, unit="px"),
         "points_world": Tolerance(limit=1e-4, unit="m"),
@@ -400,7 +399,6 @@ class Cameras(Product):
     """
 
     type_name: ClassVar[str] = "cameras"
-    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rotation_camera_from_world": Tolerance(limit=1e-5, unit="1"),
         "translation_camera_from_world": Tolerance(limit=1e-3, unit="m"),

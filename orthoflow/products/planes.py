@@ -130,7 +130,6 @@ class Planes(Product):
     """
 
     type_name: ClassVar[str] = "planes"
-    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "normal": Tolerance(limit=1e-6, unit="1"),
         "offset": Tolerance(limit=1e-5, unit="m"),

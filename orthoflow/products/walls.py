@@ -130,7 +130,6 @@ class Walls(Product):
     """
 
     type_name: ClassVar[str] = "walls"
-    encoding_version: ClassVar[int] = 3
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "depth_m": Tolerance(limit=1e-4, unit="m"),
         "sigma_m": Tolerance(limit=1e-4, unit="m"),
@@ -240,7 +239,6 @@ class Layers(Product):
     """
 
     type_name: ClassVar[str] = "layers"
-    encoding_version: ClassVar[int] = 2
     embedded: ClassVar[bool] = False
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rgb": Tolerance(limit=2, unit="grey"),
@@ -330,7 +328,6 @@ class Orthoimages(Product):
     """
 
     type_name: ClassVar[str] = "orthoimages"
-    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rgb": Tolerance(limit=2, unit="grey"),
         "error_m": Tolerance(limit=1e-4, unit="m"),

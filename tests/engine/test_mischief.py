@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,8 @@ WHO = "method work.{} of toy-plugin 1.0"
 
 def all_of(world: World, *names: str, **options: object) -> RunOutcome:
     """Run methods side by side, each on the same numbers; those that never end, for 2 s."""
-    limits = dict.fromkeys(("never_silent", "stops"), ", timeout: 2s")
+    endless = ("never_silent", "stops", "hides_and_stops")
+    limits = dict.fromkeys(endless, ", timeout: 2s")
     variants = "".join(f"      {n}: {{use: work.{n}{limits.get(n, '')}}}\n" for n in names)
     steps = (
         "steps:\n  first: {use: make.range}\n  bad:\n    in: {numbers: first.numbers}\n"
@@ -38,6 +40,16 @@ def test_what_a_step_started_ends_with_it(world: World) -> None:
     from toy_plugin.products import Numbers
 
     assert has_ended(int(world.store.get_product(digest, Numbers).values[0]))
+
+
+@pytest.mark.parametrize("name", ["hides", "hides_and_crashes", "hides_and_stops"])
+def test_what_was_started_in_another_session_by_a_process_that_is_gone_ends_too(
+    world: World, name: str
+) -> None:
+    log = result_of(all_of(world, name), name).log
+    found = re.search(r"hidden (\d+)", log)
+    assert found, log
+    assert has_ended(int(found[1]))
 
 
 def test_a_step_that_kills_the_server_of_all_steps_fails_and_the_next_run_has_another(

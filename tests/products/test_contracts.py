@@ -85,23 +85,6 @@ def test_a_type_is_stored_and_compared_as_ever(name: str) -> None:
     }
 
 
-# Raised when the fields of a type change, so that older and newer ones are told apart.
-RAISED = {
-    "planes": 2,
-    "walls": 3,
-    "ties": 3,
-    "layers": 2,
-    "orthoimages": 2,
-    "cameras": 2,
-    "truth": 2,
-}
-
-
-@pytest.mark.parametrize("name", TOLERANCES)
-def test_a_type_has_the_encoding_of_today(name: str) -> None:
-    assert TYPES[name].encoding_version == RAISED.get(name, 1)
-
-
 def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.MonkeyPatch) -> None:
     labels = products.PointLabels(plane_index=np.zeros(4, np.int16))
     points = products.CheckPoints(

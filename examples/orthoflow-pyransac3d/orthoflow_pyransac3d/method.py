@@ -20,7 +20,7 @@ class PyRansac3d(Method):
     """
 
     id = "plane.pyransac3d"
-    result_version = 2
+    result_version = 1
     determinism = "seeded"
     citations = ("pyRANSAC-3D, doi:10.5281/zenodo.7212567",)
 

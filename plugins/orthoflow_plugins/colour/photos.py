@@ -32,7 +32,6 @@ class ColourPhotos(Method):
     """
 
     id: ClassVar[str] = "colour.photos"
-    result_version: ClassVar[int] = 3
     determinism = "loose"
     metrics = (
         MetricSpec("coloured_share", label="points that got a colour"),

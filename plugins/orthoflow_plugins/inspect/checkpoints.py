@@ -92,7 +92,6 @@ class InspectCheckpoints(Method):
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
-    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_points", label="check points"),

@@ -51,7 +51,6 @@ class InspectOpenings(Method):
     """
 
     id: ClassVar[str] = "inspect.openings"
-    result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_true_openings", label="openings of the scene"),

@@ -75,7 +75,6 @@ class InspectSurf(Method):
     """
 
     id: ClassVar[str] = "inspect.surf"
-    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls_inspected", label="walls inspected"),

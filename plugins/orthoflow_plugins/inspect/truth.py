@@ -218,7 +218,6 @@ class InspectTruth(Method):
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *_needing(("orthoimages", "walls"), *of_walls(_OF_WALLS), *IMAGE_QUALITY),

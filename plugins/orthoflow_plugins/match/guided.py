@@ -52,7 +52,6 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),

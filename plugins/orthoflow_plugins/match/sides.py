@@ -73,7 +73,6 @@ class FaceByPhotos(Method):
     """
 
     id: ClassVar[str] = "face.photos"
-    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_planes_guessed", label="planes whose side the photos were asked for"),

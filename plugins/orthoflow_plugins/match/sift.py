@@ -77,7 +77,6 @@ class MatchSift(Method):
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 9
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),

@@ -136,7 +136,6 @@ class MosaicSeams(Method):
     """
 
     id: ClassVar[str] = "mosaic.seams"
-    result_version: ClassVar[int] = 7
     repeatable: ClassVar[tuple[str, ...]] = ("seams",)
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (

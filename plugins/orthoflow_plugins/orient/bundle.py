@@ -73,7 +73,6 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 13
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,

@@ -94,7 +94,6 @@ class OrientDlt(Method):
     """
 
     id: ClassVar[str] = "orient.dlt"
-    result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (

@@ -48,7 +48,6 @@ class OrientGiven(Method):
     """
 
     id: ClassVar[str] = "orient.given"
-    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = ()

@@ -49,7 +49,6 @@ class OrientPnp(Method):
     """
 
     id: ClassVar[str] = "orient.pnp"
-    result_version: ClassVar[int] = 11
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (

@@ -71,7 +71,6 @@ class DsmBackward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
-    result_version: ClassVar[int] = 7
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_layers", label="photos projected onto walls"),

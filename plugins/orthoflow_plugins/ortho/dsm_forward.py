@@ -58,7 +58,6 @@ class DsmForward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
-    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_layers", label="photos projected onto walls"),

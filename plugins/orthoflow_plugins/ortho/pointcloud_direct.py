@@ -87,7 +87,6 @@ class PointcloudDirect(Method):
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
-    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("painted_share", label="cells painted"),

@@ -109,7 +109,6 @@ class GivenPlane(Method):
     """
 
     id = "plane.given"
-    result_version = 2
     determinism = "exact"
     metrics = (
         MetricSpec("n_planes", label="planes found"),

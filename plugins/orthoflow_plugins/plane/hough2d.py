@@ -70,7 +70,6 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
-    result_version = 6
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (PAPER,)

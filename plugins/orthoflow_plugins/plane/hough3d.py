@@ -63,7 +63,6 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 6
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

@@ -34,7 +34,6 @@ class Open3dPatches(Method):
     """
 
     id = "plane.open3d-patches"
-    result_version = 6
     determinism = "loose"
     metrics = DETECTOR_METRICS
     citations = (

@@ -47,7 +47,6 @@ class Open3dRansac(Method):
     """
 
     id = "plane.open3d-ransac"
-    result_version = 6
     determinism = "loose"
     metrics = DETECTOR_METRICS
     citations = (

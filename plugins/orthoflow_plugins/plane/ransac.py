@@ -94,7 +94,6 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
-    result_version = 5
     determinism = "seeded"
     metrics = (
         *DETECTOR_METRICS,

@@ -84,7 +84,6 @@ class Region(Method):
     """
 
     id = "plane.region"
-    result_version = 5
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,

@@ -92,7 +92,6 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 10
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),

@@ -49,7 +49,6 @@ class ReadCameras(Method):
     """
 
     id = "read.cameras"
-    result_version = 4
     repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (

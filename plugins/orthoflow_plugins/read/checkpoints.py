@@ -29,7 +29,6 @@ class ReadCheckpoints(Method):
     """
 
     id = "read.checkpoints"
-    result_version = 1
     determinism = "exact"
     metrics = (
         MetricSpec("n_points", label="check points"),

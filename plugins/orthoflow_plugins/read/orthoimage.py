@@ -38,7 +38,6 @@ class ReadOrthoimage(Method):
     """
 
     id: ClassVar[str] = "read.orthoimage"
-    result_version: ClassVar[int] = 4
     repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (

@@ -132,7 +132,6 @@ class ReadPhotos(Method):
     """
 
     id = "read.photos"
-    result_version = 5
     repeatable: ClassVar[tuple[str, ...]] = ("calibration", "cameras", "masks")
     determinism = "exact"
     metrics = (

@@ -29,7 +29,6 @@ class ReadTies(Method):
     """
 
     id = "read.ties"
-    result_version = 1
     determinism = "exact"
     metrics = (
         MetricSpec("n_ties", label="ties"),

@@ -32,7 +32,6 @@ class RegisterSimilarity(Method):
     """
 
     id: ClassVar[str] = "register.similarity"
-    result_version: ClassVar[int] = 2
     determinism = "loose"
     metrics = (
         MetricSpec("n_pairs", label="pairs of points"),

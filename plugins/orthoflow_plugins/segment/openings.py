@@ -86,7 +86,6 @@ class SegmentOpenings(Method):
     """
 
     id: ClassVar[str] = "segment.openings"
-    result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_openings", label="openings found"),

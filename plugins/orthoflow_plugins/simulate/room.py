@@ -63,7 +63,6 @@ class SimulateRoom(Method):
     """
 
     id: ClassVar[str] = "simulate.room"
-    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_points", label="points"),
