@@ -192,7 +192,7 @@ def _needs(
     return tuple(f"{name}>={version}" for name, version in sorted(versions.items()))
 
 
-def _declared(start: MethodEntry) -> tuple[dict[str, PortSpec], dict[str, PortSpec]]:
+def _declared(start: MethodEntry) -> tuple[Mapping[str, PortSpec], Mapping[str, PortSpec]]:
     method = start.load()
     return port_specs(method.In), port_specs(method.Out)
 

@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import cache
 from typing import Any, ClassVar, Final, Literal, Union, dataclass_transform
 
 from pydantic import BaseModel, ConfigDict
@@ -59,15 +60,21 @@ class PortSpec:
     required: bool
 
 
-def port_specs(ports: type[Ports]) -> dict[str, PortSpec]:
+def port_specs(ports: type[Ports]) -> Mapping[str, PortSpec]:
     """Ports of an `In` or `Out` class by name, read from its annotations.
 
     Raises:
         PluginError: an annotation is not a product class, or product class | None.
     """
+    # Any: mypy does not let a class be the key of a cache.
+    return _port_specs(typing.cast("Any", ports))
+
+
+@cache
+def _port_specs(ports: Any) -> Mapping[str, PortSpec]:
     hints = typing.get_type_hints(ports)
     specs: dict[str, PortSpec] = {}
-    for field in dataclasses.fields(typing.cast("Any", ports)):
+    for field in dataclasses.fields(ports):
         hint = hints[field.name]
         alternatives = (
             typing.get_args(hint)
@@ -83,7 +90,7 @@ def port_specs(ports: type[Ports]) -> dict[str, PortSpec]:
             )
         required = len(classes) == len(alternatives)
         specs[field.name] = PortSpec(name=field.name, type_name=type_name, required=required)
-    return specs
+    return types.MappingProxyType(specs)
 
 
 @dataclass(frozen=True)
