@@ -20,6 +20,7 @@ from orthoflow_plugins.orient.wall_errors import sigmas_on_wall
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _SIDE_PX: Final = 900
 # markiewicz2015, Figure 17: control green, rejected red, check yellow.
@@ -46,6 +47,8 @@ _CURVE_COLOUR: Final = "#b03a2e"
 _VIEW_M: Final = 0.4
 _CONTROL_MOST: Final = 300
 _PERCENTILE: Final = 99.5
+# Width of a letter of the names of photos, inches.
+_LETTER_IN: Final = 0.065
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
 
@@ -156,8 +159,9 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     sides = first.corners_world[[3, 1]] - first.corners_world[0]
     axes_world = np.vstack([sides / np.linalg.norm(sides, axis=1)[:, None], first.normal])
     origin = first.corners_world[0]
-    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    figure = Figure(figsize=(11.0, 5.0))
     panels = figure.subplots(1, 2)
+    _set_margins(figure, left_in=0.6)
     for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
         shown = axes_world[[0, axis]].T
         for wall in walls.values():
@@ -226,8 +230,9 @@ def _error_map(shares: NDArray[np.float64]) -> bytes:
 def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 2.6 * len(pooled)), layout="constrained")
+    figure = Figure(figsize=(7.0, 2.6 * len(pooled)))
     panels = figure.subplots(len(pooled), 2, squeeze=False)
+    _set_margins(figure, left_in=0.4)
     for (kind, values), row in zip(pooled.items(), panels, strict=True):
         for label, column, axes in zip("uv", values.T, row, strict=True):
             # One outline instead of forty bars, each of which takes its time to draw.
@@ -259,8 +264,10 @@ def _draw_each(
 
     shown = photos[:_PHOTOS_MOST]
     columns = [(kind, axis) for kind in pooled for axis in (0, 1)]
-    figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)))
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    longest = max(len(photo.name) for photo in shown)
+    _set_margins(figure, left_in=min(0.2 + _LETTER_IN * longest, 2.6))
     for (kind, axis), axes in zip(columns, panels, strict=True):
         reach = max(float(np.percentile(np.abs(pooled[kind][:, axis]), _PERCENTILE)), 1e-6)
         for row, photo in enumerate(shown):
@@ -291,6 +298,19 @@ def _draw_row(axes: Axes, values: NDArray[np.float64], base: float, reach: float
     axes.stairs(scale * counts + base, edges, baseline=base, fill=True, color=_BAR_COLOUR)
     axes.plot(grid, scale * curve + base, color=_CURVE_COLOUR, linewidth=0.8)
     axes.text(1.55 * reach, base, f"{len(values)}\nSD {values.std():.2f}", fontsize=5.5, ha="right")
+
+
+def _set_margins(figure: Figure, *, left_in: float) -> None:
+    """Leave room for labels and titles: a layout that measures them draws everything twice."""
+    width, height = figure.get_size_inches()
+    figure.subplots_adjust(
+        left=left_in / width,
+        right=1.0 - 0.15 / width,
+        bottom=0.5 / height,
+        top=1.0 - 0.3 / height,
+        wspace=0.2,
+        hspace=0.45,
+    )
 
 
 def _normal(

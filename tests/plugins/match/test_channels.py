@@ -32,14 +32,6 @@ def wall(count: NDArray[np.uint32], depth_m: NDArray[np.float32], intensity: boo
     )
 
 
-def test_a_part_of_channels_is_that_part() -> None:
-    whole = channels.grey_channels(texture())
-    part = whole.part((slice(10, 20), slice(30, 50)))
-    np.testing.assert_array_equal(part.values, whole.values[10:20, 30:50])
-    np.testing.assert_array_equal(part.known, whole.known[10:20, 30:50])
-    assert part.values.flags.c_contiguous
-
-
 @pytest.mark.parametrize("content", ["grey", "gradients"])
 def test_weak_and_strong_contrast_count_alike(content: str) -> None:
     grey = texture()

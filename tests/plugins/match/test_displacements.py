@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.displacements import Displacements, Search, measure
+from orthoflow_plugins.match.displacements import Search, measure
 from scipy.ndimage import gaussian_filter, shift
 
 SEARCH = Search(radius_cells=4, min_score=0.5)
@@ -77,17 +77,3 @@ def test_a_mixture_of_colours_is_found_where_no_single_one_shows_it() -> None:
     )
     kept = {tuple(place) for place in PLACES.tolist()}
     assert {tuple(place) for place in found.places.tolist()} <= kept
-
-
-def test_every_column_is_taken_alike() -> None:
-    whole = Displacements(
-        places=PLACES,
-        shift_cells=PLACES * 0.5,
-        score=np.arange(9.0),
-        sigma_cells=np.arange(9.0) + 1.0,
-    )
-    chosen = np.arange(9) % 4 == 1
-    part = whole.take(chosen)
-    np.testing.assert_array_equal(part.places, PLACES[[1, 5]])
-    np.testing.assert_array_equal(part.shift_cells, 0.5 * PLACES[[1, 5]])
-    assert (part.score.tolist(), part.sigma_cells.tolist()) == ([1.0, 5.0], [2.0, 6.0])

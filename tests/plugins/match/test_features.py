@@ -23,16 +23,6 @@ def columns(of: Features) -> list[np.ndarray]:
     return [of.pixels, of.sizes_px, of.angles_deg, of.descriptors]
 
 
-def test_every_column_is_taken_alike() -> None:
-    whole = some()
-    chosen = np.array([3, 0])
-    for one, other in zip(columns(whole.take(chosen)), columns(whole), strict=True):
-        np.testing.assert_array_equal(one, other[chosen])
-    for one, other in zip(columns(whole.strongest(2)), columns(whole), strict=True):
-        np.testing.assert_array_equal(one, other[:2])
-    assert (len(whole), len(whole.strongest(99)), len(whole.strongest(0))) == (5, 5, 0)
-
-
 def test_an_enlarged_image_has_larger_key_points_elsewhere() -> None:
     whole, double = some(), some().scaled(2.0)
     np.testing.assert_allclose(double.pixels, 2.0 * whole.pixels)

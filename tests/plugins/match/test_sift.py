@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.features import find_features
 from orthoflow_plugins.match.pairing import Expectation, rematched
-from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
+from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.sift import MatchSift
-from orthoflow_plugins.match.ties import TiePiece, without_twins
 from scipy.spatial.distance import cdist
 
 from orthoflow.errors import MethodError
@@ -180,11 +179,6 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
     np.testing.assert_array_equal(found.second, nearest[expected])
 
 
-def test_nothing_matches_nothing() -> None:
-    empty = np.empty((0, 128), dtype=np.float32)
-    assert len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio=0.8)) == 0
-
-
 def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
     photo = ms.photo_of(scene, ms.camera_before(scene))
     grey = decode_image(photo.encoded)[:, :, 0]
@@ -259,26 +253,6 @@ def test_a_second_look_finds_several_times_the_ties(scene: ms.TexturedWall) -> N
     np.testing.assert_array_equal(found.first, found.second)
 
 
-def test_shrinking_keeps_positions() -> None:
-    columns = np.arange(200) + 0.5
-    grey = np.rint(np.tile(columns, (60, 1))).astype(np.uint8)
-    small = shrunk(grey, 0.37)
-    expected = (np.arange(small.shape[1]) + 0.5) / 0.37
-    # Away from the border; grey counts whole levels.
-    np.testing.assert_allclose(small[10, 4:-4], expected[4:-4], atol=1.01)
-    assert abs(np.mean(small[10, 4:-4] - expected[4:-4])) < 0.5
-
-
-def test_void_is_filled_from_around_and_the_rest_is_kept() -> None:
-    values = np.tile(np.linspace(0.0, 1.0, 64), (48, 1))
-    holed = values.copy()
-    holed[10:30, 20:40] = np.nan
-    filled = filled_smoothly(holed)
-    known = np.isfinite(holed)
-    np.testing.assert_array_equal(filled[known], values[known].astype(np.float32))
-    assert np.abs(filled - values)[~known].max() < 0.25
-
-
 def test_points_on_a_smooth_wall_are_exact_and_on_an_edge_uncertain(
     scene: ms.TexturedWall, walls: Walls
 ) -> None:
@@ -313,24 +287,6 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
     assert flat.sigma_m[0] < (0.01 if n_even else 0.7 * ms.GSD_M)
     edge = points_on_wall(sparse, np.array([[300.1, 80.7]]))
     assert edge.sigma_m[0] > 0.05
-
-
-def test_twins_on_overlapping_walls_count_once() -> None:
-    def piece(wall: int, shift_m: float, sigma_m: float) -> TiePiece:
-        pixels = np.array([[10.0, 20.0], [30.0, 40.0]])
-        points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) + shift_m
-        sigma = np.full(2, sigma_m)
-        return TiePiece(
-            photo=0,
-            wall=wall,
-            pixels_photo=pixels,
-            points_world=points,
-            sigma_px=np.ones(2),
-            sigma_m=sigma,
-        )
-
-    pieces = without_twins([piece(0, 0.0, 0.004), piece(1, 0.001, 0.002), piece(2, 0.5, 0.004)])
-    assert [len(item) for item in pieces] == [0, 2, 2]
 
 
 def test_no_photos_are_refused(walls: Walls, tmp_path: Path) -> None:

@@ -10,14 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match.structures import (
-    Place,
     WallStructure,
-    _coarser,
     _energy_under,
-    _is_elsewhere,
     _part_map,
-    _samples,
-    _slipped,
     _widths_cells,
     closer,
     likely_places,
@@ -75,25 +70,6 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
     assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
 
 
-def test_a_coarser_wall_has_means_of_intensity_and_single_depths(wall: Wall) -> None:
-    rows, columns = wall.frame.shape
-    ramp = np.broadcast_to(np.linspace(2.0, 6.0, columns, dtype=np.float32), (rows, columns))
-    depths = np.arange(rows * columns, dtype=np.float32).reshape(rows, columns) / 1e4
-    depths[:5, :6] = np.nan  # whole cells of 3 x 3 in the first row, two thirds in the second
-    coarse = _coarser(replace(wall, intensity=ramp.copy(), depth_m=depths), 3)
-    assert coarse.frame.shape == (rows // 3, columns // 3)
-    assert coarse.frame.gsd_m == 3 * wall.frame.gsd_m
-    middles = depths[1::3, 1::3][: rows // 3, : columns // 3]
-    expected = middles.copy()
-    expected[1, :2] = np.nan
-    np.testing.assert_array_equal(coarse.depth_m, expected)
-    assert coarse.intensity is not None
-    # From the first to the last hundredth of the intensities, cut off beyond.
-    scaled = np.clip((ramp[0] - 2.04) / 3.92, 0.0, 1.0)
-    means = scaled[: 3 * (columns // 3)].reshape(-1, 3).mean(axis=1)
-    np.testing.assert_allclose(coarse.intensity[5:], np.tile(means, (rows // 3 - 5, 1)), atol=4e-3)
-
-
 @pytest.mark.parametrize("photo", [(600, 900), (900, 600), (500, 500)], ids=str)
 @pytest.mark.parametrize("wall_shape", [(200, 260), (400, 200), (900, 2000)], ids=str)
 def test_widths_go_from_a_fifth_of_the_wall_to_more_than_all_of_it(
@@ -146,51 +122,6 @@ def test_a_part_is_compared_with_what_lies_under_it_everywhere(
         expected = float((part * under).sum()) / math.sqrt(own * energy)
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
     assert np.unravel_index(found.argmax(), found.shape) == (9, 15)
-
-
-def test_larger_photos_are_compared_in_wider_cells(wall: Wall, structure: WallStructure) -> None:
-    cell_m, shape = structure.wall.frame.gsd_m, structure.wall.frame.shape
-    for levels in (structure.fine, structure.rough):
-        assert [level.sample_m / cell_m for level in levels] == [2.0, 4.0, 8.0]
-    for level in (*structure.fine, *structure.rough):
-        # Beside the wall there is room for the largest part of a photo, wherever it slips.
-        longest = level.photo_cells * cell_m / structure.fine[0].sample_m
-        room = np.array(level.padded) - level.shape
-        assert (room >= 0.5 * longest + 2.0 * np.floor(0.03 * longest)).all()
-    for level in structure.fine:
-        assert level.shape == tuple(int(length * cell_m / level.sample_m) for length in shape)
-    # Halves of what the wall shows, in every second of those cells: means over four of them.
-    level = structure.fine[0]
-    mine = np.fft.irfft2(np.conj(level.layers), level.padded)[:, : level.shape[0], : level.shape[1]]
-    even = structure.channels.values[: 2 * level.shape[0], : 2 * level.shape[1]]
-    means = even.reshape(level.shape[0], 2, level.shape[1], 2, 5).mean(axis=(1, 3))
-    np.testing.assert_allclose(mine, np.moveaxis(means, 2, 0), atol=1e-5)
-    np.testing.assert_allclose(_samples(structure.channels), np.moveaxis(means, 2, 0), atol=1e-6)
-
-
-def test_a_part_slips_to_the_best_place_nearby_also_across_the_border() -> None:
-    part = np.zeros((30, 40), dtype=np.float32)
-    part[28, 3], part[10, 12], part[10, 17] = 0.5, 0.7, 0.9
-    np.testing.assert_array_equal(_slipped(part, (0, 1), 3), [3, -2])
-    np.testing.assert_array_equal(_slipped(part, (9, 13), 3), [12, 10])
-    np.testing.assert_array_equal(_slipped(part, (9, 13), 4), [17, 10])
-
-
-@pytest.mark.parametrize(
-    ("far_m", "scale", "elsewhere"),
-    [(0.49, 1.0, False), (0.51, 1.0, True), (0.0, 1.28, False), (0.0, 1.29, True)],
-)
-def test_places_differ_by_a_quarter_of_the_width_or_of_the_size(
-    far_m: float, scale: float, elsewhere: bool
-) -> None:
-    def place(x_m: float, width_m: float) -> Place:
-        parts = np.zeros((9, 2))
-        centre_m = np.array([x_m, 1.0])
-        return Place(centre_m=centre_m, width_m=width_m, lead=1.0, parts_photo=parts, parts_m=parts)
-
-    assert _is_elsewhere(place(1.0 + far_m, 2.0 * scale), place(1.0, 2.0)) is elsewhere
-    if not far_m:
-        assert _is_elsewhere(place(1.0, 2.0), place(1.0, 2.0 * scale)) is elsewhere
 
 
 def test_a_piece_of_the_wall_lies_where_it_was_taken_from(

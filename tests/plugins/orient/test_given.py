@@ -173,11 +173,6 @@ def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() ->
         assert values == {"n": n_off, "n_ties": 4, "longest_px": longest_px, "n_least": 6}
 
 
-def test_without_walls_ties_are_as_they_are() -> None:
-    ties: Any = object()
-    assert given_poses._on_walls(ties, None) is ties
-
-
 @pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])
 def test_the_error_that_handed_on_cameras_carry_is_reported(folder: Path, n_by_hand: int) -> None:
     names_mm = {"a.png": 1.25, "b.png": 3.5, "c.png": None, "d.png": 1.5}

@@ -234,12 +234,3 @@ def test_key_points_lie_in_pixels_of_the_photo_however_it_was_shrunk(
     assert len(few.pixels) == 3
     # One of each part of the photo, before a second of any.
     assert np.linalg.norm(few.pixels[:, None] - centres[None], axis=2).min(axis=0).max() < 20.0
-
-
-def test_a_photo_of_nothing_has_no_key_points() -> None:
-    plain = Photo(
-        name="a.png", encoded=encode_png(np.full((60, 80), 90, np.uint8)), width=80, height=60
-    )
-    found = photo_features(plain, 100)
-    assert found.pixels.shape == (0, 2)
-    assert found.descriptors.shape == (0, 128)

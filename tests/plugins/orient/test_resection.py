@@ -17,7 +17,6 @@ from orthoflow.geometry.resection import (
     pixels_by_point,
     predicted_covariances,
 )
-from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
@@ -175,12 +174,3 @@ def test_a_start_that_looks_away_is_refused() -> None:
     turned = ms.nudged(camera, (0.0, np.pi, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(GeometryError, match=r"cannot see its points"):
         adjust(seen_by(camera, 9), turned)
-
-
-def test_rotation_vectors_turn_by_their_length() -> None:
-    vector = np.array([0.3, -0.2, 0.5])
-    rotation = rotation_from_vector(vector)
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(rotation @ vector, vector, atol=1e-14)
-    angle = np.arccos(0.5 * (np.trace(rotation) - 1.0))
-    assert angle == pytest.approx(np.linalg.norm(vector), abs=1e-12)
