@@ -13,7 +13,6 @@ from orthoflow_plugins.read.photos import ReadPhotos
 from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import InputError
-from orthoflow.files import e57_images
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images, read_e57_images
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
 from orthoflow.products import Cameras, InputFiles, Photos
@@ -205,9 +204,3 @@ def test_a_lens_that_is_none_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, pinhole(numbers=NUMBERS | {"pixelWidth": 0.0}))
     with pytest.raises(InputError, match=r"the lens of photo room_000\.jpg is none"):
         read(path)
-
-
-def test_a_cylinder_is_told_to_be_none_of_the_photos_that_paint(tmp_path: Path) -> None:
-    camera = e57_images._camera(tmp_path / "a.e57", "a.jpg", None, "cylindrical", None)
-    assert camera.reason == "it is a cylindrical image, which cannot be painted from"
-    assert (camera.name, camera.lens, camera.rotation) == ("a.jpg", None, None)

@@ -16,7 +16,6 @@ from orthoflow.files.cube_faces import (
     FisheyeFace,
     FisheyeLens,
     PanoramaFace,
-    _fold_rad,
     face_lenses,
     faces_of,
     fisheye_faces,
@@ -203,27 +202,6 @@ def test_a_lens_that_is_none_says_why(change: dict[str, float], problem: str) ->
         fisheye_faces(b"", "a", lens)
 
 
-@pytest.mark.parametrize(
-    ("radial", "fold_rad"),
-    [
-        # 1 - 3 t^2, 1 - 0.9 t^2, 1 - 5 (0.1) t^4, 1 - 7 (0.01) t^6, 1 - 9 (0.001) t^8.
-        ((-1.0, 0.0, 0.0, 0.0), 3.0**-0.5),
-        ((-0.3, 0.0, 0.0, 0.0), 0.9**-0.5),
-        ((0.0, -0.1, 0.0, 0.0), 0.5**-0.25),
-        ((0.0, 0.0, -0.01, 0.0), 0.07 ** (-1 / 6)),
-        ((0.0, 0.0, 0.0, -0.001), 0.009**-0.125),
-        ((0.1, 0.0, 0.0, 0.0), np.pi),
-        ((0.0, 0.0, 0.0, 0.0), np.pi),
-    ],
-)
-def test_a_lens_folds_where_its_picture_stops_growing(
-    radial: tuple[float, ...], fold_rad: float
-) -> None:
-    found = _fold_rad(radial)
-    # Two thousand angles are tried.
-    assert fold_rad - np.pi / 1_900 < found <= fold_rad
-
-
 @pytest.mark.parametrize("field_of_view_deg", [92.0, 95.0, 98.0, 101.0, 105.0, 112.0])
 def test_faces_that_show_a_fiftieth_of_the_largest_are_shown(field_of_view_deg: float) -> None:
     wide = replace(LENS, width=2_000, height=2_000, cx=1_000.0, cy=1_000.0)
@@ -273,17 +251,3 @@ def test_faces_are_as_large_as_pictures_may_be(focal_px: float, height: int, pro
         field_of_view_deg=90.0,
     )
     assert problem_of(lens) == problem
-
-
-@pytest.mark.parametrize("theta_rad", [0.0, 0.5, 1.5])
-def test_a_plain_fisheye_is_finest_around_its_axis(theta_rad: float) -> None:
-    plain = replace(LENS, radial=(0.0, 0.0, 0.0, 0.0))
-    # Along a radius all angles are as long; a circle is as the angle over its sine.
-    around = theta_rad / np.sin(theta_rad) if theta_rad else 1.0
-    assert plain.finest_px(theta_rad) == pytest.approx(151.0 * around)
-
-
-def test_a_lens_that_spreads_outwards_is_finest_there() -> None:
-    spreading = replace(LENS, radial=(0.1, 0.0, 0.0, 0.0))
-    # The bent angle t + 0.1 t^3 grows by 1 + 0.3 t^2, more than it is over the sine.
-    assert spreading.finest_px(0.5) == pytest.approx(151.0 * (1.0 + 0.3 * 0.25))

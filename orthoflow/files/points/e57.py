@@ -324,7 +324,34 @@ def check_xml(path: Path) -> None:
     encoding = _ENCODING.match(xml)
     if encoding is not None and encoding[1].upper() != b"UTF-8":
         raise _refusal(path, f"it is in {encoding[1][:40]!r}, expected UTF-8")
-    _Elements(path).parse(xml)
+    # Of each element around the present place: how many children, and how many it may have.
+    around: list[list[int]] = [[0, 1]]
+    n_elements = 0
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        nonlocal n_elements
+        n_elements += 1
+        around[-1][0] += 1
+        if around[-1][0] > around[-1][1]:
+            raise _refusal(path, f"a structure in it has more than {MOST_XML_CHILDREN} elements")
+        is_vector = attributes.get("type") == "Vector"
+        around.append([0, MOST_XML_ELEMENTS if is_vector else MOST_XML_CHILDREN])
+        if len(around) > DEEPEST_XML + 1:
+            raise _refusal(path, f"it is nested deeper than {DEEPEST_XML} elements")
+        if n_elements > MOST_XML_ELEMENTS:
+            raise _refusal(path, f"it has more than {MOST_XML_ELEMENTS} elements")
+
+    def refuse_doctype(*declaration: object) -> None:
+        raise _refusal(path, "it declares a document type or entities, which no E57 has")
+
+    parser = ParserCreate("UTF-8")
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda name: around.pop()
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    try:
+        parser.Parse(xml, True)  # noqa: FBT003 - it is all there is
+    except ExpatError as error:
+        raise _refusal(path, f"it is no XML ({error})") from error
 
 
 def _xml_of(path: Path) -> bytes:
@@ -340,52 +367,6 @@ def _xml_of(path: Path) -> bytes:
         raw = file.read((offset + length) // _PAYLOAD * _PAGE + 2 * _PAGE)
     pages = b"".join(raw[at : at + _PAYLOAD] for at in range(0, len(raw), _PAGE))
     return pages[offset : offset + length]
-
-
-class _Elements:
-    """Counts elements and how deep they lie, and refuses what is none."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._n_elements = 0
-        # Of each element around the present place: how many children, and how many it may have.
-        self._open: list[list[int]] = []
-
-    def parse(self, xml: bytes) -> None:
-        """Parse it all.
-
-        Raises:
-            InputError: something in it is refused.
-        """
-        parser = ParserCreate("UTF-8")
-        parser.StartElementHandler = self._begin
-        parser.EndElementHandler = self._end
-        parser.StartDoctypeDeclHandler = self._refuse_doctype
-        try:
-            parser.Parse(xml, True)  # noqa: FBT003 - it is all there is
-        except ExpatError as error:
-            raise _refusal(self._path, f"it is no XML ({error})") from error
-
-    def _begin(self, name: str, attributes: dict[str, str]) -> None:
-        if self._open:
-            self._open[-1][0] += 1
-            if self._open[-1][0] > self._open[-1][1]:
-                raise _refusal(
-                    self._path, f"a structure in it has more than {MOST_XML_CHILDREN} elements"
-                )
-        is_vector = attributes.get("type") == "Vector"
-        self._open.append([0, MOST_XML_ELEMENTS if is_vector else MOST_XML_CHILDREN])
-        self._n_elements += 1
-        if len(self._open) > DEEPEST_XML:
-            raise _refusal(self._path, f"it is nested deeper than {DEEPEST_XML} elements")
-        if self._n_elements > MOST_XML_ELEMENTS:
-            raise _refusal(self._path, f"it has more than {MOST_XML_ELEMENTS} elements")
-
-    def _end(self, name: str) -> None:
-        self._open.pop()
-
-    def _refuse_doctype(self, *declaration: object) -> None:
-        raise _refusal(self._path, "it declares a document type or entities, which no E57 has")
 
 
 def _refusal(path: Path, reason: str) -> InputError:

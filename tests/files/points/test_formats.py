@@ -61,15 +61,6 @@ def test_a_folder_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         open_scan(tmp_path / "none.las")
 
 
-def test_a_header_that_states_more_points_than_can_be_read_is_refused(
-    tmp_path: Path, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(blocks_module, "MOST_POINTS", 40)
-    path = scan_files.write_las(tmp_path / "a.laz", points)
-    with pytest.raises(InputError, match=r"a\.laz states 40 points, at most 39 can be read"):
-        open_scan(path)
-
-
 def test_points_are_counted_in_four_bytes() -> None:
     def stated(n_most: int) -> blocks_module.ScanFile:
         return blocks_module.ScanFile(

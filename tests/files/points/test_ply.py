@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points import open_scan
 from tests import scan_files
-from tests.scan_files import read_all, read_points
+from tests.scan_files import read_points
 
 EMPTY_PLY = (
     "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
@@ -57,14 +57,3 @@ def test_ply_headers_that_make_no_sense_are_refused(
     path.write_text(header)
     with pytest.raises(InputError, match=message):
         open_scan(path)
-
-
-@pytest.mark.parametrize(("n_bytes", "is_read"), [(1 << 20, True), ((1 << 20) + 1, False)])
-def test_a_header_has_a_megabyte(tmp_path: Path, n_bytes: int, is_read: bool) -> None:
-    begin, end = "ply\nformat ascii 1.0\ncomment ", EMPTY_PLY.partition("1.0")[2]
-    blank = " " * (n_bytes - len(begin) - len(end))
-    path = tmp_path / "a.ply"
-    path.write_text(begin + blank + end)
-    told = "holds no points" if is_read else "no end_header"
-    with pytest.raises(InputError, match=told):
-        read_all(path)

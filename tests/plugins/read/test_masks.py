@@ -166,12 +166,3 @@ def test_two_masks_of_one_photo_are_refused(tmp_path: Path) -> None:
     masks = [file_in(tmp_path / "masks", name, picture()) for name in ("a.png", "a_mask.png")]
     with pytest.raises(InputError, match=r"a_mask\.png and a\.png are masks of one photo"):
         read(tmp_path, [photo_in(tmp_path)], masks)
-
-
-def test_more_polygons_than_anybody_draws_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orthoflow.files.polygons.MOST_POLYGONS", 0)
-    mask = file_in(tmp_path / "masks", "a.json", polygons("a.jpg", RING))
-    with pytest.raises(InputError, match=r"a.json holds more than 0 polygons: split it"):
-        read(tmp_path, [photo_in(tmp_path)], [mask])
