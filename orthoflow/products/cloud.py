@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Final
 
@@ -35,6 +35,8 @@ class PointCloud(Product):
         has_rgb: (n,) bool, which points have a colour; None if all have (or none, with `rgb`).
         scan: (n,) uint16 index of the scan the point is from, or None.
         row: (n,) uint32 position in the scan's grid, or None; column likewise.
+        point_id: (n,) uint32 place of the point in the cloud that its source gave; None where that
+            is its place here. See `selected`.
         stations: (s, 3) float64 metres, positions of the scanner (or the viewer), or None.
         stations_source: `file`, `view_from` (given by the user) or None without stations.
         source: how the data were read: files, unit, ranges before normalising, counts dropped; for
@@ -64,6 +66,7 @@ class PointCloud(Product):
     scan: NDArray[np.uint16] | None = None
     row: NDArray[np.uint32] | None = None
     column: NDArray[np.uint32] | None = None
+    point_id: NDArray[np.uint32] | None = None
     stations: NDArray[np.float64] | None = None
     stations_source: str | None = None
     source: dict[str, JsonValue] = field(default_factory=dict)
@@ -82,6 +85,7 @@ class PointCloud(Product):
             "scan": (self.scan, (n_points,), "u2"),
             "row": (self.row, (n_points,), "u4"),
             "column": (self.column, (n_points,), "u4"),
+            "point_id": (self.point_id, (n_points,), "u4"),
         }
         for name, (value, shape, dtype) in wanted.items():
             if value is None:
@@ -118,6 +122,21 @@ class PointCloud(Product):
         """Return world points (m, 3) float64 of a selection; a copy, so keep selections small."""
         offsets = np.column_stack([self.x[index], self.y[index], self.z[index]])
         return self.origin + offsets.astype(np.float64)
+
+    def selected(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> PointCloud:
+        """Return the cloud of some points; each keeps its id and all that was measured of it.
+
+        Args:
+            chosen: (n,) which points, or the places of those wanted in their new order.
+        """
+        fields = ("x", "y", "z", "intensity", "rgb", "has_rgb", "scan", "row", "column")
+        arrays = {name: getattr(self, name) for name in fields}
+        ids = np.arange(len(self), dtype=np.uint32) if self.point_id is None else self.point_id
+        return replace(
+            self,
+            point_id=ids[chosen],
+            **{name: array[chosen] for name, array in arrays.items() if array is not None},
+        )
 
     def require_points(self, n_least: int) -> None:
         """Refuse a cloud that no method can process.

@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, angle_between_deg
-from orthoflow.products import Finding, Inspection, Planes, PointLabels, Truth
+from orthoflow.products import Finding, Inspection, Planes, PointCloud, PointLabels, Truth
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _FOUND_ANGLE_DEG: Final = 1.0
@@ -27,9 +26,28 @@ MAIN_MISSED: Final = DiagnosticSpec(
     "{angle_deg:g} deg and {offset_m:g} m: errors of planes are reported without it",
 )
 
+LABELS_NOT_COMPARED: Final = DiagnosticSpec(
+    code="labels-not-compared",
+    severity="warning",
+    text="labels are not compared with the truth: they are of {n_labels:,} points, the simulated "
+    "cloud has {n_true:,}, and which of them these are is unknown",
+    remedy="wire the cloud that was labelled to {step}; a filter keeps track of points with "
+    "`cloud.selected(...)`",
+)
+POINTS_LEFT_OUT: Final = DiagnosticSpec(
+    code="points-left-out-before-labels",
+    severity="note",
+    text="labels are compared for {n_labels:,} of {n_true:,} simulated points; a step before "
+    "{step} left out the others",
+)
+
 
 def inspect_planes(
-    planes: Planes, labels: PointLabels | None, truth: Truth, ctx: StepContext
+    planes: Planes,
+    labels: PointLabels | None,
+    cloud: PointCloud | None,
+    truth: Truth,
+    ctx: StepContext,
 ) -> Inspection:
     """Compare planes, and labels if there are any, with the truth.
 
@@ -74,7 +92,7 @@ def inspect_planes(
                 for item in _plane_findings(distance, 0)
             ]
     if labels is not None:
-        findings += _with_those_of_the_main_wall(label_findings(labels, truth), truth)
+        findings += _with_those_of_the_main_wall(label_findings(labels, cloud, truth, ctx), truth)
     for item in findings:
         if "[" not in item.name:
             ctx.metric(item.name, item.value, item.unit)
@@ -90,6 +108,8 @@ def inspect_planes(
 
 def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Finding]:
     """Add the scores of the truth's first plane without its name."""
+    if not scores:
+        return []
     values = {item.name: item.value for item in scores}
     main = truth.planes.names[0]
     return scores + [
@@ -128,20 +148,33 @@ def found_planes(planes: Planes, true: Planes) -> list[Finding]:
     ]
 
 
-def label_findings(labels: PointLabels, truth: Truth) -> list[Finding]:
-    """Compute precision, recall, F1 and IoU of the labels per true plane, matched one to one.
+def label_findings(
+    labels: PointLabels, cloud: PointCloud | None, truth: Truth, ctx: StepContext
+) -> list[Finding]:
+    """Precision, recall, F1 and IoU of the labels per true plane, matched one to one.
 
-    Raises:
-        MethodError: the labels are not of the simulated cloud.
+    None where it is unknown to which points the labels belong. Points that a filter left out count
+    neither for nor against a detector.
+
+    Args:
+        labels: of a detector.
+        cloud: that the detector had; None for the simulated one.
+        truth: of the simulated cloud.
+        ctx: takes diagnostics.
     """
     from scipy.optimize import linear_sum_assignment
 
-    if len(labels.plane_index) != len(truth.labels):
-        raise MethodError(
-            f"the labels have {len(labels.plane_index)} points, but the truth has "
-            f"{len(truth.labels)}: wire the labels of the simulated cloud itself"
-        )
-    counts = _joint_counts(labels.plane_index, truth.labels, len(truth.planes))
+    true_labels = truth.labels
+    ids = None if cloud is None else cloud.point_id
+    n_labels, n_true = len(labels.plane_index), len(true_labels)
+    if ids is not None and len(ids) == n_labels and n_labels and int(ids.max()) < n_true:
+        true_labels = true_labels[ids]
+        if n_labels < n_true:
+            ctx.report(POINTS_LEFT_OUT, n_labels=n_labels, n_true=n_true)
+    elif n_labels != n_true:
+        ctx.report(LABELS_NOT_COMPARED, n_labels=n_labels, n_true=n_true)
+        return []
+    counts = _joint_counts(labels.plane_index, true_labels, len(truth.planes))
     both = counts[1:, 1:].astype(np.float64)
     n_true, n_found = counts[1:].sum(axis=1), counts[:, 1:].sum(axis=0)
     union = n_true[:, None] + n_found[None, :] - both

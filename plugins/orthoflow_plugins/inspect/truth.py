@@ -22,6 +22,7 @@ from orthoflow.products import (
     Orthoimages,
     OrthoMask,
     Planes,
+    PointCloud,
     PointLabels,
     Truth,
     Wall,
@@ -365,6 +366,7 @@ class InspectTruth(Method):
         walls: Walls | None = None
         planes: Planes | None = None
         labels: PointLabels | None = None
+        cloud: PointCloud | None = None
         cameras: Cameras | None = None
 
     class Out(Ports):
@@ -374,6 +376,8 @@ class InspectTruth(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare the photos, then wall by wall, then all together."""
+        if inputs.cloud is not None:
+            inputs.cloud.require_points(2)
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
@@ -413,7 +417,7 @@ class InspectTruth(Method):
         if inputs.planes is not None:
             findings += found_planes(inputs.planes, inputs.truth.planes)
         if inputs.labels is not None:
-            findings += label_findings(inputs.labels, inputs.truth)
+            findings += label_findings(inputs.labels, inputs.cloud, inputs.truth, ctx)
         numbers = {image.wall: image.number for image in orthoimages.images}
         report(findings, orthoimages.images[0].wall, numbers, ctx)
         details: dict[str, JsonValue] = {
@@ -469,7 +473,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
     if dropped:
         missing = [name for name in given[:2] if name not in dropped]
         ctx.report(NOT_COMPARED, dropped=" and ".join(dropped), missing=" and ".join(missing))
-    return inspect_planes(inputs.planes, inputs.labels, inputs.truth, ctx)
+    return inspect_planes(inputs.planes, inputs.labels, inputs.cloud, inputs.truth, ctx)
 
 
 def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:

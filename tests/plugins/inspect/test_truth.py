@@ -32,6 +32,7 @@ from orthoflow.products import (
     Orthoimages,
     OrthoMask,
     Planes,
+    PointCloud,
     PointLabels,
     SurfaceMask,
     Truth,
@@ -284,14 +285,6 @@ def test_labels_are_matched_whatever_their_numbers(tmp_path: Path, truth: Truth)
 def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, truth: Truth) -> None:
     image = rendered(truth)
     ortho, wall = painted(image), walled(image)
-    with pytest.raises(MethodError, match=r"the labels have 3 points, but the truth has \d+"):
-        inspect(
-            tmp_path,
-            truth,
-            ortho,
-            wall,
-            labels=PointLabels(plane_index=np.zeros(3, dtype=np.int16)),
-        )
     with pytest.raises(MethodError, match="is of wall 4, but the walls are 0"):
         inspect(tmp_path, truth, replace(ortho, plane_index=4), wall)
     aside = replace(
@@ -316,10 +309,14 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, trut
 
 
 def inspect_planes(
-    folder: Path, truth: Truth, planes: Planes | None, labels: PointLabels | None
+    folder: Path,
+    truth: Truth,
+    planes: Planes | None,
+    labels: PointLabels | None,
+    cloud: PointCloud | None = None,
 ) -> dict[str, float]:
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
-    inputs = InspectTruth.In(truth=truth, planes=planes, labels=labels)
+    inputs = InspectTruth.In(truth=truth, planes=planes, labels=labels, cloud=cloud)
     InspectTruth().run(inputs, InspectTruth.Params(), context)
     return {metric.name: metric.value for metric in context.metrics}
 
@@ -331,6 +328,19 @@ def test_planes_alone_are_compared_without_orthoimages(tmp_path: Path, truth: Tr
     assert metrics["worst_plane_angle_deg"] < 1e-5
     assert metrics["worst_plane_offset_mm"] < 1e-9
     assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
+
+
+def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
+    tmp_path: Path, truth: Truth
+) -> None:
+    n_points = len(truth.labels)
+    chosen = np.random.default_rng(1).permutation(n_points)[: n_points // 2]
+    x = np.zeros(n_points, dtype=np.float32)
+    whole = PointCloud(origin=np.zeros(3), up=np.array([0.0, 0.0, 1.0]), x=x, y=x, z=x)
+    labels = PointLabels(plane_index=truth.labels[chosen])
+    metrics = inspect_planes(tmp_path, truth, truth.planes, labels, whole.selected(chosen))
+    assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
+    assert "label_iou" not in inspect_planes(tmp_path, truth, truth.planes, labels)
 
 
 def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
