@@ -258,7 +258,7 @@ def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
 
 
 def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnostic:
-    """Put the names of steps into the texts of a diagnostic.
+    """Insert the names of steps into the texts of a diagnostic.
 
     Results are shared between workflows, whose steps may have other names: so they are put in when
     a result is used, not when it is made.

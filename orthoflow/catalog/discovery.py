@@ -99,7 +99,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
                 announcements.append(_announce(entry, distribution))
         except UserInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - foreign code may raise anything, even SystemExit
+        except BaseException as error:  # noqa: BLE001 - plugins may raise anything, even SystemExit
             broken.append(_describe_failure(entry, distribution, error))
     products = _collect_products(announcements)
     kinds = _collect_kinds(announcements, frozenset(products))

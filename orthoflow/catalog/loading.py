@@ -44,13 +44,13 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     except UserInterrupt:
         raise
     except BaseException as error:
-        said, way_out = describe_error(error), _way_out(error, target, distribution)
+        problem, way_out = describe_error(error), _way_out(error, target, distribution)
         lacks_it = isinstance(error, AttributeError) and error.obj is module
         if lacks_it and module is not None:
             near = did_you_mean(name, vars(module))
-            said = f"{module_name} has no {name}{near}"
+            problem = f"{module_name} has no {name}{near}"
         raise PluginError(
-            f"{what} of {distribution} cannot be loaded from {target}: {said}; {way_out}"
+            f"{what} of {distribution} cannot be loaded from {target}: {problem}; {way_out}"
         ) from error
 
 

@@ -50,7 +50,7 @@ class Session:
 
 
 def current_session() -> Session:
-    """Give the session of the running command; one of its own for a command called alone."""
+    """Return the session of the running command; one of its own for a command called alone."""
     context = click.get_current_context(silent=True)
     session = context.find_object(Session) if context is not None else None
     return session if session is not None else Session()
@@ -74,7 +74,7 @@ def command_again(output: Path) -> str:
 
 
 def debug_parameter() -> click.Option:
-    """Give the `--debug` flag, which may stand before or behind the name of a command."""
+    """Return the `--debug` flag, which may stand before or behind the name of a command."""
     return click.Option(
         ["--debug"], is_flag=True, expose_value=False, callback=_keep_debug, help=DEBUG_HELP
     )
@@ -167,7 +167,7 @@ class LazyGroup(click.Group):
         self._lazy = dict(lazy)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Give the names in the order of the table, which is the order of work."""
+        """Return the names in the order of the table, which is the order of work."""
         return list(self._lazy)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -408,7 +408,7 @@ def _sentences(error: OrthoflowError) -> list[str]:
 
 
 def error_text(error: Exception) -> str:
-    """Give the sentence of an error; `str` of an OSError without arguments would be empty."""
+    """Return the sentence of an error; `str` of an OSError without arguments would be empty."""
     return str(error) or type(error).__name__
 
 

@@ -163,7 +163,7 @@ def _print_pairs(
         echo("", f"{title}: same{whose}")
         return
     echo("", f"{title}: {_counts(rows)}{whose}")
-    told = (
+    kept = (
         alike_rows(different, id) if most is None else alike_texts(different, text, step_of or {})
     )
     echo_table(
@@ -176,10 +176,10 @@ def _print_pairs(
                     for side in (one.pair.left, one.pair.right)
                 ),
             )
-            for one in first_rows(told, most, lambda one: not one.pair.is_shared)
+            for one in first_rows(kept, most, lambda one: not one.pair.is_shared)
         ],
     )
-    echo_left_out(len(told), most)
+    echo_left_out(len(kept), most)
 
 
 # Any: rows of all kinds.
@@ -216,9 +216,9 @@ def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     if most is None:
         _print_numbers(alike_rows(different, id))
     else:
-        told = repeats_as_one(row for row in different if row.is_moved)
-        _print_numbers(told[:most])
-        echo_left_out(len(told), most)
+        kept = repeats_as_one(row for row in different if row.is_moved)
+        _print_numbers(kept[:most])
+        echo_left_out(len(kept), most)
     costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")

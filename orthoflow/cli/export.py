@@ -217,16 +217,16 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     _refuse_filled(folder)
     # These hand on the record itself, with arrays that nobody has read, or print its seal.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
-    doubt = broken_seal(opened, of_all=hands_on)
-    if doubt and hands_on:
-        raise RecordError(f"{doubt}; what was changed is not handed on: take another copy of it")
+    finding = broken_seal(opened, of_all=hands_on)
+    if finding and hands_on:
+        raise RecordError(f"{finding}; what was changed is not handed on: take another copy of it")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             summary = _export_to(FORMATS[target], opened, aside, chosen)
         else:
             summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
-    return code_for([doubt], f"rely on nothing in {folder}")
+    return code_for([finding], f"rely on nothing in {folder}")
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:

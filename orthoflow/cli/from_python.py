@@ -135,7 +135,7 @@ def _datasets(given: Any) -> str | Mapping[str, JsonValue]:
 
 
 def _as_json(value: Any, where: str) -> JsonValue:
-    """Give what a workflow file would hold of a value: paths as texts, any sequence as a list."""
+    """Return what a workflow file would hold of a value: paths as texts, any sequence as a list."""
     # Arrays and their numbers, of whatever library.
     value = value.tolist() if callable(getattr(value, "tolist", None)) else value
     if isinstance(value, Mapping):

@@ -172,7 +172,7 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
-    """Give runs as JSON, with every metric and parameter, and in what they differ from others."""
+    """Return runs as JSON, with every metric and parameter, and in what they differ from others."""
     from orthoflow.report.browsing import differing_facts, distinct_facts
 
     facts, differs = distinct_facts(found), differing_facts(found)
@@ -312,9 +312,9 @@ def _row_json(
 def _print_csv(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     from orthoflow.report.browsing import distinct_facts
 
-    told = distinct_facts(found)
+    distinct = distinct_facts(found)
     metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
-    facts = list(dict.fromkeys(name for run in kept for name in told[run.folder]))
+    facts = list(dict.fromkeys(name for run in kept for name in distinct[run.folder]))
     header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]
     rows = [
         [
@@ -325,7 +325,7 @@ def _print_csv(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
             run.run_id,
             run.reason,
             *(run.metrics.get(name) for name in metrics),
-            *(_cell(told[run.folder].get(name)) for name in facts),
+            *(_cell(distinct[run.folder].get(name)) for name in facts),
         ]
         for run in kept
     ]

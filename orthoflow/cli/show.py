@@ -192,12 +192,12 @@ def _median(one: MethodOverDatasets) -> str:
 
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
-    told = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
+    metrics = [(cell, metric) for cell in run.record.cells for metric in cell.metrics]
     steps = list(dict.fromkeys(cell.step for cell in run.record.cells))
     rows = [
         (cell.address, metric.name, number(metric.value), metric.unit if metric.unit != "1" else "")
         for cell, metric in first_rows(
-            told,
+            metrics,
             most,
             lambda one: (not one[1].headline, not one[1].better, -steps.index(one[0].step)),
         )
@@ -205,7 +205,7 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
     if rows:
         echo()
         echo_table(("step", "metric", "value", "unit"), rows)
-        echo_left_out(len(told), most)
+        echo_left_out(len(metrics), most)
 
 
 def _print_environments(run: Run) -> None:

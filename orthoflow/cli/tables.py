@@ -108,7 +108,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
         distances: of products.
         most: rows that are printed, those that differ first; all without it.
     """
-    told = first_rows(distances, most, lambda item: item.verdict == "identical")
+    rows = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(
         ("product", "type", "verdict", "largest differences"),
         [
@@ -118,10 +118,10 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
                 item.verdict,
                 ", ".join(_distance_text(distance) for distance in item.distances),
             )
-            for item in told
+            for item in rows
         ],
     )
-    for item in told:
+    for item in rows:
         if item.reason:
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
     echo_left_out(len(distances), most)
@@ -131,7 +131,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
 def first_rows(
     rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, ...]]
 ) -> Sequence[Row]:
-    """Give the rows of a table that are printed: all, or the first by their place of too many."""
+    """Return the rows of a table that are printed: all, or the first by their place of too many."""
     if most is None or len(rows) <= most:
         return rows
     return sorted(rows, key=place)[:most]

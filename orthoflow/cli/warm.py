@@ -90,7 +90,7 @@ class _Call:
 
     @classmethod
     def of(cls, cell: Cell) -> _Call:
-        """Give that of a cell."""
+        """Return the call of a cell."""
         words = [
             (name, value)
             for name, value in sorted(cell.params_set.items())

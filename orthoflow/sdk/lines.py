@@ -56,5 +56,5 @@ def text_of_path(path: Path) -> str | None:
 def _text_of(text: object) -> str:
     try:
         return str(text)
-    except Exception:  # noqa: BLE001 - an exception of a stranger's may be unable to say anything
+    except Exception:  # noqa: BLE001 - the text of a third-party exception may raise one itself
         return f"a {type(text).__name__} without words"

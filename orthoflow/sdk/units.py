@@ -24,5 +24,5 @@ def unit_of(name: str) -> str:
     ('', '1')
     """
     words = name.split("_")
-    said = next((UNITS[word] for word in reversed(words) if word in UNITS), "")
-    return said if len(words) > 1 or said == "1" else ""
+    unit = next((UNITS[word] for word in reversed(words) if word in UNITS), "")
+    return unit if len(words) > 1 or unit == "1" else ""

@@ -75,7 +75,7 @@ class ConformanceCase:
             except AssertionError as error:
                 # What stops every run says nothing of a rule about odd inputs.
                 return (error.__cause__ is not None and self._what_stops()) or str(error)
-            except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
+            except Exception as error:  # noqa: BLE001 - a third-party method may raise anything
                 return _failure(error, self.witness)
         return ""
 

@@ -189,7 +189,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
     """Working directory, home and temporary folder stay empty."""
-    _ = subject.witness.first  # what stops it everywhere is told as everywhere
+    _ = subject.witness.first  # what stops every run is reported as for every rule
     strays = subject.witness.elsewhere.strays
     require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 
@@ -217,7 +217,7 @@ def threads_do_not_show(subject: Subject) -> None:
     """One core or two give the same digest."""
     one, two = subject.witness.first.run, subject.witness.on_two_cores
     for name, digest in one.digests.items():
-        # What differs from run to run on one core says nothing of two; the rule above has told it.
+        # What differs between runs on one core says nothing about two: see the rule above.
         is_same = two.digests[name] == digest or subject.witness.again.digests[name] != digest
         require(is_same, f"output {name} depends on the number of cores")
 

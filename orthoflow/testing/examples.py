@@ -81,7 +81,7 @@ def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
                 with TemporaryDirectory(prefix="orthoflow-example-") as folder:
                     trial = Trial(method=method, inputs=inputs)
                     return run_trial(trial, Path(folder), draws=False).outputs[port]
-            except Exception:  # noqa: BLE001 - a foreign method may raise anything
+            except Exception:  # noqa: BLE001 - a third-party method may raise anything
                 continue
     raise ExampleError(
         f"there is no example of a {type_name} product, and no installed method makes one of the "

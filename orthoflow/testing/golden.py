@@ -202,7 +202,7 @@ def _read(file: Path) -> dict[str, Golden]:
 
 
 def _record(file: Path, method_id: str, golden: Golden) -> None:
-    """Put a result into the file, which processes that try other methods change meanwhile."""
+    """Write a result into the file, which processes that try other methods change meanwhile."""
     with file.open("a+", encoding="utf-8") as stream:
         lock_where_possible(stream.fileno(), is_shared=False)
         stream.seek(0)

@@ -71,10 +71,10 @@ def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
     task.write_text(json.dumps(_task(trial, world)))
     code = _server().run(task)
     if code != 0:
-        said = (world / "said.txt").read_text(errors="replace").strip().splitlines()
+        output = (world / "output.txt").read_text(errors="replace").strip().splitlines()
         raise AssertionError(
             f"in a new process the method ended with exit code {code}: "
-            f"{said[-1] if said else 'nothing'}"
+            f"{output[-1] if output else 'nothing'}"
         )
     strays = tuple(
         f"{name}/{path.relative_to(place)}"
@@ -192,9 +192,9 @@ def serve() -> None:
 def _run_forked(world: Path, task: dict[str, Any]) -> None:
     code = 1
     try:
-        said = os.open(world / "said.txt", os.O_WRONLY | os.O_CREAT)
+        output = os.open(world / "output.txt", os.O_WRONLY | os.O_CREAT)
         nothing = os.open(os.devnull, os.O_RDONLY)
-        for descriptor, replaced in ((nothing, 0), (said, 1), (said, 2)):
+        for descriptor, replaced in ((nothing, 0), (output, 1), (output, 2)):
             os.dup2(descriptor, replaced)
         os.environ.update(HOME=str(world / "home"), TMPDIR=str(world / "tmp"))
         tempfile.tempdir = None

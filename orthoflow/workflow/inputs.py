@@ -154,7 +154,7 @@ def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOpti
 def override_inputs(
     specs: Mapping[str, WorkflowInputSpec], options: Sequence[InputOption], log: ProblemLog
 ) -> dict[str, WorkflowInputSpec]:
-    """Put files from the command line over the file's inputs; several of one name add up."""
+    """Replace inputs of the file by files of the command line; several of one name add up."""
     changed = dict(specs)
     for option in options:
         name = option.name

@@ -744,7 +744,7 @@ class Workflow:
         return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
 
     def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
-        """Put other inputs, by their own names, in the place of those that are there."""
+        """Return the workflow with other inputs, by their own names."""
         datasets = {
             item.name: replace(
                 item, inputs={name: specs.get(one.name, one) for name, one in item.inputs.items()}

@@ -244,7 +244,7 @@ def overrides_of_settings(
 
 
 def joined(*several: Mapping[tuple[str, str], tuple[Override, ...]]) -> Overrides:
-    """Put overrides behind each other; later ones win."""
+    """Join overrides; later ones take precedence."""
     found: Overrides = {}
     for overrides in several:
         for call, own in overrides.items():
@@ -515,7 +515,7 @@ _Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]
 def expand_sweeps(
     steps: Sequence[DraftStep], overrides: Overrides, log: ProblemLog
 ) -> tuple[tuple[DraftStep, ...], Overrides]:
-    """Put a variant for each value in the place of every call that sweeps a parameter.
+    """Replace every call that sweeps a parameter by a variant for each value.
 
     A `--set` of a swept parameter takes the place of the sweep, and may be one itself.
 

@@ -127,10 +127,10 @@ def _input_json(spec: WorkflowInputSpec) -> JsonValue:
 def _step_json(step: WorkflowStep) -> dict[str, object]:
     variants = []
     for variant in step.variants:
-        said = asdict(variant)
-        if not said["swept"]:
-            del said["swept"]
-        variants.append({"use": said.pop("method"), **said})
+        fields = asdict(variant)
+        if not fields["swept"]:
+            del fields["swept"]
+        variants.append({"use": fields.pop("method"), **fields})
     return {
         "in": {port: [str(item) for item in items] for port, items in step.inputs.items()},
         "unless": step.unless,
