@@ -57,6 +57,7 @@ class Recognised:
         kind: what it is; `unknown` for what no method reads.
         path: as it was found.
         summary: what is in it, in words; why nothing is known of it.
+        n_points: points of a scan.
         n_photos: photos in it, also those in a scan.
         n_posed: photos in a scan whose lens and pose it states.
         fields: what the points of a scan have besides coordinates, empty fields left out.
@@ -68,6 +69,7 @@ class Recognised:
     kind: FileKind
     path: Path
     summary: str = ""
+    n_points: int = 0
     n_photos: int = 0
     n_posed: int = 0
     fields: frozenset[str] = frozenset()
@@ -185,6 +187,7 @@ def _scan(path: Path) -> Recognised:
         kind="scan",
         path=path,
         summary=", ".join(words),
+        n_points=scan.n_most,
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
         fields=seen.fields,
@@ -349,6 +352,7 @@ _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
+_FEW_SCANS: Final = 3
 # Paragraphs of a recipe's heading that are not about files of one's own: its commands, stand-ins.
 _NOT_OWN: Final = ("#   ", "# Without a scan of your own")
 
@@ -400,7 +404,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         by_kind["unknown"] = [
             *by_kind.get("unknown", []),
             *(
-                replace(scan, summary="text, left out beside scans of other formats")
+                replace(scan, summary="text, left out beside scans of other formats", advice=())
                 for scan in scans
                 if scan not in own_formats
             ),
@@ -422,7 +426,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         )
     if own_photos and "photos" not in by_kind:
         # Photos that a scanner took lie in its file, with their poses.
-        inside = [replace(scan, summary="the photos in it") for scan in own_photos]
+        inside = [replace(scan, summary="the photos in it", n_points=0) for scan in own_photos]
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
             by_kind.setdefault("cameras", [replace(inside[0], summary="the poses of its photos")])
@@ -466,6 +470,15 @@ class _Drafting:
     @property
     def _advice(self) -> list[str]:
         advice = [text for items in self.by_kind.values() for item in items for text in item.advice]
+        equals: dict[int, list[str]] = {}
+        for scan in self.by_kind["scan"]:
+            equals.setdefault(scan.n_points, []).append(scan.path.name)
+        advice += [
+            f"{_some(names)} have {n_points:,} points each: name only one of them where they are "
+            "the same scan"
+            for n_points, names in equals.items()
+            if n_points and len(names) > 1
+        ]
         photos = [item for item in self.by_kind.get("photos", ()) if item.kind == "photos"]
         without = [item.path.name for item in photos if not item.lens]
         if without and not {"calibration", "cameras"} & self.by_kind.keys():
@@ -556,8 +569,8 @@ def _holds_photos_only(folder: Path) -> bool:
 
 def _described(items: Sequence[Recognised]) -> str:
     """What some files are, in one line."""
-    if len(items) == 1:
-        return f"{_word(items[0].path.name)}, {items[0].summary}"
+    if len(items) == 1 or (len(items) <= _FEW_SCANS and all(item.n_points for item in items)):
+        return "; ".join(f"{_word(item.path.name)}, {item.summary}" for item in items)
     n_photos = sum(item.n_photos for item in items)
     if n_photos == len(items):
         lenses = Counter(item.lens for item in items if item.lens)

@@ -240,6 +240,18 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
     assert "degrees.las states geographic coordinates in degrees" in result.output
 
 
+def test_several_scans_are_described_and_one_that_is_there_twice_is_asked_about(data: Path) -> None:
+    laspy.read(data / "hall.las").write(str(data / "hall.laz"))
+    out = " ".join(said("new", data / "hall.las", data / "hall.laz").split())
+    assert "scan: hall.las, LAS/LAZ, 500 points, intensity and colours; hall.laz, LAS/LAZ" in out
+    assert "note: hall.las, hall.laz have 500 points each: name only one of them where" in out
+    # What is asked of a file that is left out is of no use.
+    (data / "K.txt").write_text("2759.5 0 1520.7\n0 2764.2 1006.8\n0 0 1\n")
+    out = said("new", data / "hall.las", data / "K.txt", "-o", "b.yaml")
+    assert "not used: K.txt" in out
+    assert "note:" not in out
+
+
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up: str) -> None:
     # Two slopes on one floor, as a roof: by no other axis they are level and upright.
