@@ -59,7 +59,6 @@ from orthoflow.products import (
     Openings,
     Orthoimage,
     Orthoimages,
-    OrthoMask,
     Planes,
     PointCloud,
     ResidualRow,
@@ -67,6 +66,7 @@ from orthoflow.products import (
     Ties,
     Wall,
     Walls,
+    is_shown,
     plane_name,
 )
 
@@ -177,9 +177,9 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         called = {image.wall: (image.number, image.name) for image in product.images}
         _write_layers(folder, product.layers, called, product.icc_profile, digest)
     for image in product.images:
-        shown = image.mask == OrthoMask.PAINTED
+        shown = np.zeros(image.mask.shape, dtype=np.bool_)
         for rows in row_bands(shown.shape):
-            shown[rows] |= image.mask[rows] == OrthoMask.FILLED
+            shown[rows] = is_shown(image.mask[rows])
         stem = f"wall_{image.number}_ortho"
         place = GridPlace.of(image.frame)
         colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
@@ -382,7 +382,7 @@ def _write_ortho_sidecars(
         "bits": 8 * image.rgb.itemsize,
         "mask": mask_meanings(ORTHO_MASK_MEANINGS),
         "mask_counts": _counts(image.mask),
-        "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
+        "dataset_mask": "255 where the mask is painted (1, 5) or filled (2), else 0",
         "mask_raster": f"{stem}_mask.tif",
         "accuracy": accuracy_json(image),
         "product_digest": digest,

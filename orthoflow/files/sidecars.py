@@ -45,6 +45,8 @@ ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
     OrthoMask.FILLED: "filled: inpainted from neighbouring cells",
     OrthoMask.OCCLUDED: "occluded: hidden in every source",
     OrthoMask.NO_SURFACE: "no surface: the scan does not know the surface here",
+    OrthoMask.CONTRADICTED: "contradicted: painted by one photo alone, and the scan has another "
+    "colour here",
 }
 
 

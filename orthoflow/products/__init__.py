@@ -27,6 +27,8 @@ from orthoflow.products.planes import (
 )
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
+    PAINTED_STATES,
+    SHOWN_STATES,
     IntensitySource,
     Layer,
     LayerMask,
@@ -37,9 +39,13 @@ from orthoflow.products.walls import (
     SurfaceMask,
     Wall,
     Walls,
+    is_painted,
+    is_shown,
 )
 
 __all__ = [
+    "PAINTED_STATES",
+    "SHOWN_STATES",
     "Array",
     "Calibration",
     "Camera",
@@ -82,5 +88,7 @@ __all__ = [
     "Truth",
     "Wall",
     "Walls",
+    "is_painted",
+    "is_shown",
     "plane_name",
 ]

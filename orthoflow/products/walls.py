@@ -64,6 +64,7 @@ class OrthoMask(IntEnum):
         FILLED: its colour comes from neighbouring cells.
         OCCLUDED: hidden from every source that could show it.
         NO_SURFACE: no depth is known there.
+        CONTRADICTED: its colour is that of one photo alone, and the scan has another one there.
     """
 
     NONE = 0
@@ -71,6 +72,22 @@ class OrthoMask(IntEnum):
     FILLED = 2
     OCCLUDED = 3
     NO_SURFACE = 4
+    CONTRADICTED = 5
+
+
+# States of cells whose colour is a source's, and those of cells that show something.
+PAINTED_STATES: Final = (OrthoMask.PAINTED, OrthoMask.CONTRADICTED)
+SHOWN_STATES: Final = (*PAINTED_STATES, OrthoMask.FILLED)
+
+
+def is_painted(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which cells of an orthoimage's mask have the colour of a source."""
+    return np.isin(mask, PAINTED_STATES)
+
+
+def is_shown(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which cells of an orthoimage's mask show something, be it filled."""
+    return np.isin(mask, SHOWN_STATES)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import InputError
 from orthoflow.files.sidecars import read_sidecar, write_json
 from orthoflow.foreign_text import parse_json
-from orthoflow.products import JsonValue, OrthoMask
+from orthoflow.products import PAINTED_STATES, JsonValue
 
 WALLS_FILE: Final = "walls.json"
 _WALLS_LARGEST_BYTES: Final = 1 << 22
@@ -128,7 +128,7 @@ def _told(
     counts = content.get("mask_counts")
     counts = counts if isinstance(counts, dict) else {}
     total = sum(counts.values()) or 1
-    painted = float(counts.get(str(int(OrthoMask.PAINTED)), 0)) / total
+    painted = sum(float(counts.get(str(int(state)), 0)) for state in PAINTED_STATES) / total
     accuracy = content.get("accuracy")
     accuracy = accuracy if isinstance(accuracy, dict) else {}
     median = accuracy.get("expected_mm_median")

@@ -22,7 +22,7 @@ from orthoflow.files.images import cells_webp
 from orthoflow.foreign_text import first_few, shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
-from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Product
+from orthoflow.products import Orthoimage, Orthoimages, Product, is_shown
 from orthoflow.records import RecordedFigure
 from orthoflow.records.comparison import Difference, RunComparison, compare_runs
 from orthoflow.records.datasets import parts_of
@@ -44,7 +44,6 @@ _THUMBNAIL_PX: Final = 640
 _FIGURES_MOST: Final = 24  # shown at once: a notebook keeps them all in its file
 _ROWS_MOST: Final = 60  # of a table of what differs
 _PARAMETERS_MOST: Final = 8
-_SHOWN: Final = (OrthoMask.PAINTED, OrthoMask.FILLED)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -361,7 +360,7 @@ class WallImage:
     @property
     def is_shown(self) -> NDArray[np.bool_]:
         """(rows, columns), where a photo, or its neighbours, gave a colour."""
-        return np.isin(self.image.mask, _SHOWN)
+        return is_shown(self.image.mask)
 
     @property
     def frame(self) -> WallFrame:
@@ -411,7 +410,7 @@ class WallImage:
     def _repr_html_(self) -> str:
         picture = cells_webp(
             self.image.mask.shape,
-            lambda part: (eight_bits(self.rgb[part]), np.isin(self.image.mask[part], _SHOWN)),
+            lambda part: (eight_bits(self.rgb[part]), is_shown(self.image.mask[part])),
             longest_side_px=_THUMBNAIL_PX,
             least_px=_THUMBNAIL_PX // 2,
         )

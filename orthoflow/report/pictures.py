@@ -16,7 +16,15 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.threads import in_order
-from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
+from orthoflow.products import (
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    SurfaceMask,
+    Wall,
+    Walls,
+    is_shown,
+)
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.cursors import CoarseDepths, coarse_depths
@@ -194,8 +202,7 @@ def _drawn(
 def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        shows = np.isin(image.mask[part], (OrthoMask.PAINTED, OrthoMask.FILLED))
-        return eight_bits(image.rgb[part]), shows
+        return eight_bits(image.rgb[part]), is_shown(image.mask[part])
 
     return _Drawing(
         draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
@@ -220,6 +227,7 @@ def _states(image: Orthoimage) -> str:
     """Return what became of the cells, so that the shares add up to all of them."""
     words = {
         OrthoMask.PAINTED: "painted",
+        OrthoMask.CONTRADICTED: "painted by one photo alone against the colours of the scan",
         OrthoMask.FILLED: "filled from neighbours",
         OrthoMask.NO_SURFACE: "with no point of the scan near enough",
         OrthoMask.OCCLUDED: "hidden from every photo",

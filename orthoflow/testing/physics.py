@@ -15,9 +15,9 @@ from orthoflow.products import (
     Layers,
     Orthoimage,
     Orthoimages,
-    OrthoMask,
     Planes,
     Product,
+    is_painted,
 )
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_room
@@ -189,7 +189,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
         require(isinstance(made, Orthoimages) and made.images, "no orthoimage was made")
         if isinstance(made, Orthoimages):
             for image in made.images:
-                painted = image.mask == OrthoMask.PAINTED
+                painted = is_painted(image.mask)
                 _check_cells(scene, image, image.name, painted)
                 require(
                     painted.mean() > _JOINED_SHARE,

@@ -256,9 +256,10 @@ def test_orthoimages_are_told_completely(
             "2": "filled: inpainted from neighbouring cells",
             "3": "occluded: hidden in every source",
             "4": "no surface: the scan does not know the surface here",
+            "5": "contradicted: painted by one photo alone, and the scan has another colour here",
         },
         "mask_counts": {"0": 1, "1": 2, "2": 1, "3": 1, "4": 1},
-        "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
+        "dataset_mask": "255 where the mask is painted (1, 5) or filled (2), else 0",
         "mask_raster": "wall_7_ortho_mask.tif",
         "accuracy": {
             "expected_mm_median": None,

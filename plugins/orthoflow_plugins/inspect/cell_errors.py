@@ -18,10 +18,17 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
-from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
+from orthoflow.products import (
+    Finding,
+    Orthoimage,
+    OrthoMask,
+    SurfaceMask,
+    Wall,
+    is_painted,
+    is_shown,
+)
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.image_quality import n_shown as n_shown_of
-from orthoflow_plugins.inspect.image_quality import shown
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
 
 if TYPE_CHECKING:
@@ -99,7 +106,7 @@ def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
         rule: how many are chosen.
         first_row: for a part, its first row within its wall, a multiple of `BLOCK_CELLS`.
     """
-    shows = shown(image)
+    shows = is_shown(image.mask)
     coloured = np.zeros(shows.shape, dtype=np.bool_)
     for i in range(-(-shows.shape[0] // BLOCK_CELLS)):
         for j in range(-(-shows.shape[1] // BLOCK_CELLS)):
@@ -198,7 +205,7 @@ def wall_errors(
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
-    painted = (image.mask == OrthoMask.PAINTED) & known
+    painted = is_painted(image.mask) & known
     filled = (image.mask == OrthoMask.FILLED) & known
     square = _square_errors(image, true, chosen.coloured & (painted | filled))
     depth = np.where(
@@ -284,7 +291,7 @@ def _square_errors(
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
     """Return displacements of patches, from known cells away from steps."""
-    painted = image.mask == OrthoMask.PAINTED
+    painted = is_painted(image.mask)
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any plausible error; larger ones are reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))

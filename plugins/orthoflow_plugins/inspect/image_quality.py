@@ -21,7 +21,16 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells, row_bands
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.levels import REC_601, eight_bits
-from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Wall
+from orthoflow.products import (
+    SHOWN_STATES,
+    Cameras,
+    Finding,
+    Orthoimage,
+    OrthoMask,
+    Wall,
+    is_painted,
+    is_shown,
+)
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
 # A pixel drawn over more cells than this, in the direction where it is widest.
@@ -58,23 +67,14 @@ class OrthoimageGrey(GreyCells):
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
         """Some rows and columns, all of them within the image."""
-        shows = _shows(self.image.mask[part])
+        shows = is_shown(self.image.mask[part])
         grey = np.where(shows, eight_bits(self.image.rgb[part]) @ REC_601, 0.0)
         return GreyImage(grey=grey, valid=shows, region=shows)
 
 
-def shown(image: Orthoimage) -> NDArray[np.bool_]:
-    """Cells that are painted or filled."""
-    return _shows(image.mask)
-
-
-def _shows(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    return np.isin(mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
-
-
 def n_shown(image: Orthoimage) -> int:
     """How many cells are painted or filled."""
-    return sum(count_cells(image.mask, state) for state in (OrthoMask.PAINTED, OrthoMask.FILLED))
+    return sum(count_cells(image.mask, state) for state in SHOWN_STATES)
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
@@ -83,7 +83,7 @@ def completeness(image: Orthoimage, wall: Wall) -> Finding:
     for rows in row_bands(image.mask.shape):
         surface = np.isfinite(wall.depth_m[rows])
         n_surface += int(np.count_nonzero(surface))
-        n_both += int(np.count_nonzero(surface & _shows(image.mask[rows])))
+        n_both += int(np.count_nonzero(surface & is_shown(image.mask[rows])))
     share = n_both / max(1, n_surface)
     return Finding(name="completeness", value=share, unit="1", wall=image.wall)
 
@@ -199,7 +199,7 @@ def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
     source, width = image.sources.index(name), image.frame.width
 
     def painted(rows: slice) -> NDArray[np.bool_]:
-        is_own: NDArray[np.bool_] = image.mask[rows] == OrthoMask.PAINTED
+        is_own = is_painted(image.mask[rows])
         is_own &= (image.source[rows] == source) & np.isfinite(wall.depth_m[rows])
         return is_own
 

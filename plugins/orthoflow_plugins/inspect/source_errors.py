@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
-from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
+from orthoflow.products import Cameras, Finding, Orthoimage, Truth, Wall, is_painted
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
@@ -138,7 +138,7 @@ def trace_sources(
     displacement = np.full((*image.frame.shape, 2), np.nan)
     traced = np.zeros(image.frame.shape, dtype=np.bool_)
     ghosts = np.zeros(image.frame.shape, dtype=np.bool_)
-    painted = (image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m)
+    painted = is_painted(image.mask) & np.isfinite(wall.depth_m)
     for source, name in enumerate(image.sources):
         if name not in known:
             continue
@@ -162,7 +162,7 @@ def trace_sources(
         steps=depth_step_band(true.depth_m),
         ghosts=ghosts,
         n_seen_by_both=_count(both),
-        n_seen_painted=_count(both & (image.mask == OrthoMask.PAINTED)),
+        n_seen_painted=_count(both & is_painted(image.mask)),
         expected_m=image.error_m,
     )
 

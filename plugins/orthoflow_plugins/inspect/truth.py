@@ -14,13 +14,13 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Band, count_cells
 from orthoflow.geometry.scenes import Viewers
 from orthoflow.products import (
+    PAINTED_STATES,
     Cameras,
     Finding,
     Inspection,
     JsonValue,
     Orthoimage,
     Orthoimages,
-    OrthoMask,
     Planes,
     PointCloud,
     PointLabels,
@@ -556,7 +556,7 @@ class _Judge:
             sources = traced.samples(self.rule.error_step)
             length_m = np.linalg.norm(traced.displacement_m[drawn], axis=2)
             is_known = np.isfinite(traced.displacement_m).all(axis=2)
-            n_painted = count_cells(image.mask, OrthoMask.PAINTED)
+            n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
             cells = np.argwhere(is_known)[:: max(1, n_painted // _TRACED_POINTS)]
             shift_m = traced.displacement_m[cells[:, 0], cells[:, 1]]
         return _Verdict(

@@ -56,12 +56,13 @@ class Consensus:
     Attributes:
         layers: the layers; cells that they must not paint are marked as hidden.
         n_outvoted: cells that a photo shows differently from the one that paints them now.
-        n_contradicted: cells that a single photo shows, and the scan differently.
+        contradicted: (rows, cols) cells that a single photo shows, and the scan differently; None
+            without colours of the scan.
     """
 
     layers: tuple[Layer, ...]
     n_outvoted: int
-    n_contradicted: int
+    contradicted: NDArray[np.bool_] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +97,10 @@ def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate)
         _regions(_contradicted(index, supports, apart, blocks)) for index in range(len(layers))
     ]
     kept, n_outvoted = _without(layers, outvoted, blocks, allocate)
-    n_alone = 0 if scan is None else _n_alone(witnesses, apart, blocks)
-    return Consensus(layers=kept, n_outvoted=n_outvoted, n_contradicted=n_alone * side * side)
+    contradicted = None
+    if scan is not None:
+        contradicted = _of_cells(_alone(witnesses, apart, blocks), blocks)
+    return Consensus(layers=kept, n_outvoted=n_outvoted, contradicted=contradicted)
 
 
 def _compared(
@@ -144,21 +147,27 @@ def _contradicted(
     return worst
 
 
-def _n_alone(
+def _alone(
     photos: Sequence[_Witness],
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
-) -> int:
-    """Count the blocks that a single photo shows, differently from the scan."""
+) -> NDArray[np.bool_]:
+    """Return the blocks that a single photo shows, differently from the scan."""
     shown = np.array([_known(item, blocks) for item in photos])
     is_alone = shown.sum(axis=0) == 1
-    count = 0
+    found = np.zeros(blocks.shape, dtype=np.bool_)
     for index, mine in enumerate(shown):
         ratio = apart.get((index, len(photos)))
         if ratio is not None:
             alone = np.where(mine & is_alone, np.nan_to_num(ratio), 0.0)
-            count += int(np.count_nonzero(_regions(alone) & mine & is_alone))
-    return count
+            found |= _regions(alone) & mine & is_alone
+    return found
+
+
+def _of_cells(region: NDArray[np.bool_], blocks: Blocks) -> NDArray[np.bool_]:
+    """Cells (rows, cols) of some blocks."""
+    by_row = np.repeat(region, np.diff(blocks.rows), axis=0)
+    return np.repeat(by_row, np.diff(blocks.columns), axis=1)
 
 
 def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Witness:

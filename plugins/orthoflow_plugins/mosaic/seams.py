@@ -16,9 +16,10 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
 from orthoflow.files.polygons import NamedPolygon
-from orthoflow.geometry.bands import Allocate, count_cells, holds_cells
+from orthoflow.geometry.bands import Allocate, count_cells, holds_cells, row_bands
 from orthoflow.geometry.levels import eight_bits, plain_tone
 from orthoflow.products import (
+    SHOWN_STATES,
     Camera,
     Cameras,
     InputFiles,
@@ -181,7 +182,7 @@ class MosaicSeams(Method):
         ),
         MetricSpec("outvoted_share", label="cells whose colour the other photos outvote"),
         MetricSpec(
-            "contradicted_share", label="cells where photos disagree and none is in the majority"
+            "contradicted_share", label="cells of one photo alone that the scan contradicts"
         ),
         # Of all checked walls together.
         MetricSpec(
@@ -317,7 +318,6 @@ class _Joined:
         untouched: the same for the unbalanced photos.
         balance: the colour balance, None if colours are unchanged.
         n_outvoted: cells that another photo showed differently from the one that paints them.
-        n_contradicted: cells that a single photo shows, and the scan differently.
     """
 
     image: Orthoimage
@@ -329,7 +329,6 @@ class _Joined:
     untouched: SeamSteps
     balance: Balance | None
     n_outvoted: int = 0
-    n_contradicted: int = 0
 
     @property
     def gains(self) -> dict[str, JsonValue]:
@@ -399,6 +398,10 @@ def _join(
         ),
     )
     mask, source = joined(painters, others, options, wall=wall, balance=balance, allocate=allocate)
+    if agreed is not None and agreed.contradicted is not None:
+        for rows in row_bands(mask.shape):
+            is_alone = agreed.contradicted[rows] & (mask[rows] == OrthoMask.PAINTED)
+            mask[rows][is_alone] = OrthoMask.CONTRADICTED
     untouched = seam_steps(source, painters)
     steps = untouched
     if balance is not None:
@@ -425,7 +428,6 @@ def _join(
         n_edge_seam=None if wall is None else n_edge_seam,
         balance=balance,
         n_outvoted=0 if agreed is None else agreed.n_outvoted,
-        n_contradicted=0 if agreed is None else agreed.n_contradicted,
     )
 
 
@@ -471,8 +473,7 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
     else:
         _report_empty(ctx, image, cameras)
         white = 255.0 if image.rgb.dtype == np.uint8 else 65535.0
-        shown = (OrthoMask.PAINTED, OrthoMask.FILLED)
-        if (plain := plain_tone(image.rgb, image.mask, shown, white=white)) is not None:
+        if (plain := plain_tone(image.rgb, image.mask, SHOWN_STATES, white=white)) is not None:
             sources = ", ".join(image.sources[:3]) + (" ..." if len(image.sources) > 3 else "")
             tone, share = plain
             ctx.report(PLAIN, subject=image.name, tone=tone, share=share, sources=sources)
@@ -571,11 +572,10 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
             ctx.metric("seam_step_untouched_delta_e", float(untouched.mean()), "1")
     n_cells = sum(item.image.mask.size for item in verdicts)
     ctx.metric("outvoted_share", sum(item.n_outvoted for item in verdicts) / n_cells, "1")
-    ctx.metric("contradicted_share", sum(item.n_contradicted for item in verdicts) / n_cells, "1")
-    for item in verdicts:
-        share = item.n_contradicted / item.image.mask.size
+    for image in images:
+        share = count_cells(image.mask, OrthoMask.CONTRADICTED) / image.mask.size
         if share >= _CONTRADICTED_WORTH_WORDS:
-            ctx.report(CONTRADICTED, subject=item.image.name, share=share)
+            ctx.report(CONTRADICTED, subject=image.name, share=share)
     _report_errors(ctx, [item.image for item in verdicts])
     _report_gains(ctx, verdicts)
 

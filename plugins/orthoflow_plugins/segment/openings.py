@@ -18,11 +18,11 @@ from orthoflow.products import (
     Openings,
     Orthoimage,
     Orthoimages,
-    OrthoMask,
     OutlineSource,
     PointCloud,
     Wall,
     Walls,
+    is_painted,
 )
 from orthoflow.sdk import (
     Determinism,
@@ -266,7 +266,7 @@ def _grey(
         return None
     step = relief.step
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, dtype=np.float32)
-    grey[image.mask[::step, ::step] != OrthoMask.PAINTED] = np.nan
+    grey[~is_painted(image.mask[::step, ::step])] = np.nan
     return np.asarray(grey, dtype=np.float32)
 
 

@@ -12,14 +12,13 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
     sharpness_findings,
-    shown,
     stretch_findings,
 )
 from orthoflow_plugins.inspect.patches import GreyImage
 from scipy.special import erf
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Orthoimage, OrthoMask, Wall
+from orthoflow.products import Orthoimage, OrthoMask, Wall, is_shown
 from orthoflow.testing import photographed as ms
 from tests import samples
 
@@ -103,9 +102,9 @@ def test_what_is_shown_is_painted_or_filled_and_the_rest_is_black() -> None:
     rgb = np.full((*FRAME.shape, 3), 200, dtype=np.uint8)
     rgb[..., 1] = 100
     made = image(masked(), rgb)
-    np.testing.assert_array_equal(shown(made)[:, 0], np.arange(SIDE) < 7)
+    np.testing.assert_array_equal(is_shown(made.mask)[:, 0], np.arange(SIDE) < 7)
     grey = OrthoimageGrey(made).cut((slice(0, SIDE), slice(0, SIDE)))
-    np.testing.assert_array_equal(grey.valid, shown(made))
+    np.testing.assert_array_equal(grey.valid, is_shown(made.mask))
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 200
     np.testing.assert_allclose(grey.grey[:7], expected, atol=0.01)
     assert not grey.grey[7:].any()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.consensus import consensus
+from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.geometry.bands import in_memory
-from orthoflow.products import Layer, LayerMask, Wall
+from orthoflow.products import Layer, LayerMask, Layers, OrthoMask, Wall, is_shown
+from orthoflow.sdk import StepContext
 from tests import samples
 
 SHAPE, GSD_M = (240, 400), 0.01
@@ -98,7 +101,7 @@ def test_two_photos_alone_cannot_say_who_is_right() -> None:
     assert all(one is other for one, other in zip(photos, found.layers, strict=True))
 
 
-def test_what_one_photo_alone_shows_stays_and_is_counted() -> None:
+def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) -> None:
     levels = painted_wall()
     photos = [
         photo("a.jpg", with_person(levels), seed=1),
@@ -106,11 +109,28 @@ def test_what_one_photo_alone_shows_stays_and_is_counted() -> None:
     ]
     found = consensus(photos, scanned(levels), allocate=in_memory)
     assert found.n_outvoted == 0
-    n_person = np.zeros(SHAPE, np.bool_)
-    n_person[PERSON] = True
-    assert found.n_contradicted == pytest.approx(np.count_nonzero(n_person), rel=0.5)
+    person = np.zeros(SHAPE, np.bool_)
+    person[PERSON] = True
+    assert found.contradicted is not None
+    # Regions are of whole blocks, so its border may be missing.
+    assert found.contradicted[person].mean() > 0.85
+    assert np.count_nonzero(found.contradicted & ~person) < 0.5 * np.count_nonzero(person)
+    # In the mask of the orthoimage they are a class of their own, and its share is reported.
+    inputs = MosaicSeams.In(
+        layers=Layers(layers=tuple(photos)), walls=samples.walls(scanned(levels))
+    )
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
+    is_alone = image.mask == OrthoMask.CONTRADICTED
+    np.testing.assert_array_equal(is_alone, found.contradicted)
+    assert (image.source[is_alone] == 0).all()
+    assert is_shown(image.mask).all()
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["contradicted_share"] == pytest.approx(is_alone.mean())
     clean = [photo("a.jpg", levels, seed=1), photos[1]]
-    assert consensus(clean, scanned(levels), allocate=in_memory).n_contradicted == 0
+    nothing = consensus(clean, scanned(levels), allocate=in_memory).contradicted
+    assert nothing is not None
+    assert not nothing.any()
 
 
 def test_light_that_changes_smoothly_is_no_contradiction() -> None:
@@ -122,7 +142,7 @@ def test_light_that_changes_smoothly_is_no_contradiction() -> None:
         photo("c.jpg", 0.8 * levels, seed=3),
     ]
     found = consensus(photos, scanned(levels), allocate=in_memory)
-    assert (found.n_outvoted, found.n_contradicted) == (0, 0)
+    assert (found.n_outvoted, found.contradicted is None or found.contradicted.any()) == (0, False)
 
 
 def test_a_scan_that_sees_other_patterns_bears_no_witness() -> None:

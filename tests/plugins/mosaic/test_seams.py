@@ -152,7 +152,7 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     assert metrics.pop("n_sources") == 2
     assert metrics.pop("n_overlap_patches") == 0
     # Colours of chance contradict each other nowhere over a region.
-    assert metrics.pop("outvoted_share") == metrics.pop("contradicted_share") == 0.0
+    assert metrics.pop("outvoted_share") == metrics["contradicted_share"] == 0.0
     n_seam, _ = count_seams(image.source, None)
     assert n_seam > 0
     assert metrics.pop("seam_share") == n_seam / np.count_nonzero(image.source >= 0)
