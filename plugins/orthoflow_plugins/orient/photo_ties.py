@@ -169,7 +169,7 @@ def tie_photos(
         near = matched.take(off <= _OFF_LINE_MOST_PX)
         links.append(np.column_stack([near.first + starts[first], near.second + starts[second]]))
     tracks = _tracks(np.vstack(links), starts)
-    return _located(cameras, features, rays, tracks[:n_most], starts)
+    return _located(cameras, features, rays, tracks[:n_most])
 
 
 def _spread(points: NDArray[np.float64], shape: tuple[int, ...], n_most: int) -> NDArray[np.intp]:
@@ -219,53 +219,49 @@ def _located(
     features: Sequence[PhotoFeatures],
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
-    starts: NDArray[np.intp],
 ) -> PhotoTies:
-    """Intersect the rays of each track, and keep those that meet."""
-    kept: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
-    points: list[NDArray[np.float64]] = []
-    for track in tracks:
-        photos = np.searchsorted(starts, track, side="right") - 1
-        own = track - starts[photos]
-        directions = np.array(
-            [
-                cameras[photo].rotation.T @ rays[photo][at]
-                for photo, at in zip(photos.tolist(), own.tolist(), strict=True)
-            ]
-        )
-        centres = np.array([cameras[photo].centre_world for photo in photos.tolist()])
-        point = _intersection(centres, directions)
-        if point is None:
-            continue
-        off = [
-            cameras[photo].project(point[None])[0, :2] - features[photo].pixels[at]
-            for photo, at in zip(photos.tolist(), own.tolist(), strict=True)
-        ]
-        if np.linalg.norm(off, axis=1).max() <= _OFF_POINT_MOST_PX:
-            kept.append((photos, own))
-            points.append(point)
+    """Intersect the rays of each track, and keep those that meet; all of one length at once."""
+    counts = [len(item.pixels) for item in features]
+    photo_of = np.repeat(np.arange(len(cameras)), counts)
+    pixels = np.vstack([item.pixels for item in features])
+    centres = np.array([camera.centre_world for camera in cameras])
+    world = np.vstack([own @ camera.rotation for camera, own in zip(cameras, rays, strict=True)])
+    kept: list[NDArray[np.intp]] = []
+    points = [np.empty((0, 3))]
+    for length in sorted({len(track) for track in tracks}, reverse=True):
+        some = np.array([track for track in tracks if len(track) == length])
+        some, found = _meeting(some, centres[photo_of[some]], world[some])
+        off = np.full(some.shape, np.inf)
+        for at, camera in enumerate(cameras):
+            row, column = np.nonzero(photo_of[some] == at)
+            seen = camera.project(found[row])[:, :2]
+            off[row, column] = np.linalg.norm(seen - pixels[some[row, column]], axis=1)
+        near = (off <= _OFF_POINT_MOST_PX).all(axis=1)
+        kept += list(some[near])
+        points.append(found[near])
     if not kept:
         return no_photo_ties()
-    photo = np.concatenate([item[0] for item in kept])
-    own = np.concatenate([item[1] for item in kept])
+    of_all = np.concatenate(kept)
     return PhotoTies(
-        photo=photo,
-        point=np.repeat(np.arange(len(kept)), [len(item[0]) for item in kept]),
-        pixels=np.array([features[p].pixels[at] for p, at in zip(photo, own, strict=True)]),
-        scale=np.array([features[p].scale for p in photo]),
-        points_world=np.array(points),
+        photo=photo_of[of_all],
+        point=np.repeat(np.arange(len(kept)), [len(track) for track in kept]),
+        pixels=pixels[of_all],
+        scale=np.array([item.scale for item in features])[photo_of[of_all]],
+        points_world=np.vstack(points),
     )
 
 
-def _intersection(
-    centres: NDArray[np.float64], directions: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Point (3,) nearest to rays; None when they are too parallel or do not meet in front."""
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    cosines = unit @ unit.T
-    if not cosines.min() < np.cos(_ANGLE_LEAST):
-        return None
-    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-    point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
-    in_front = ((point - centres) * unit).sum(axis=1) > 0.0
-    return np.asarray(point) if in_front.all() else None
+def _meeting(
+    tracks: NDArray[np.intp], centres: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Tracks (k, m) whose rays (n, m, 3) meet in front and not too flat, and where (k, 3)."""
+    unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    cosines = np.einsum("nid,njd->nij", unit, unit)
+    wide = cosines.min(axis=(1, 2)) < np.cos(_ANGLE_LEAST)
+    tracks, centres, unit = tracks[wide], centres[wide], unit[wide]
+    across = np.eye(3) - unit[:, :, :, None] * unit[:, :, None, :]
+    pulled = np.einsum("nmij,nmj->ni", across, centres)
+    points = np.linalg.solve(across.sum(axis=1), pulled[:, :, None])[:, :, 0]
+    ahead = ((points[:, None] - centres) * unit).sum(axis=2)
+    in_front = (ahead > 0.0).all(axis=1)
+    return tracks[in_front], points[in_front]

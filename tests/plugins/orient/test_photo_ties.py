@@ -167,13 +167,15 @@ def test_rays_must_meet_at_two_degrees(angle_deg: float, is_tied: bool) -> None:
 
 
 def test_points_behind_a_camera_are_none() -> None:
-    unit = np.array([[0.1, 1.0, 0.0], [-0.1, 1.0, 0.0]])
-    centres = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    point = photo_ties._intersection(centres, 3.0 * unit)
-    assert point is not None
-    np.testing.assert_allclose(point, [0.0, 10.0, 0.0], atol=1e-9)
-    # Rays that go apart meet behind both.
-    assert photo_ties._intersection(centres, unit[::-1]) is None
+    """Rays that come together meet before both photos, rays that go apart behind them."""
+    views = [camera((-1.0, 0.0, 0.0), focal_px=900.0), camera((1.0, 0.0, 0.0), focal_px=900.0)]
+    for inwards, n_points in ((0.3, 2), (-0.3, 0)):
+        features = []
+        for view, aside in zip(views, (inwards, -inwards), strict=True):
+            ways = np.array([[aside, 1.0, 0.05], [aside, 1.0, 0.1]])
+            pixels = view.project(view.centre_world + 5.0 * ways)[:, :2]
+            features.append(PhotoFeatures(pixels=pixels, scale=1.0, descriptors=described(2)))
+        assert len(tie_photos(views, features, [(0, 1)], 10).points_world) == n_points
 
 
 def test_a_track_with_two_points_of_one_photo_is_none() -> None:
