@@ -126,15 +126,17 @@ def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write `prov.json`."""
-    from orthoflow.foreign_text import json_bytes
-    from orthoflow.records.prov import count_things, prov_document
+    from prov.model import ProvActivity, ProvAgent, ProvEntity
+
+    from orthoflow.records.prov import prov_document
     from orthoflow.records.runs import creating
 
     document = prov_document(run.record)
     make_empty(folder)
     with creating(folder, "prov.json") as stream:
-        stream.write(json_bytes(document, indent=1) + b"\n")
-    counts = count_things(document)
+        stream.write((document.serialize(format="json", indent=1) or "").encode() + b"\n")
+    kinds = {"entity": ProvEntity, "activity": ProvActivity, "agent": ProvAgent}
+    counts = {name: len(list(document.get_records(kind))) for name, kind in kinds.items()}
     return f"prov.json: {', '.join(f'{name}: {count}' for name, count in counts.items())}"
 
 
