@@ -4,7 +4,8 @@ Metashape has our axes (x right, y down, z forward) and our pixels (the centre o
 (0.5, 0.5)), its principal point counts from the middle of the photo, and what it calls P1 and P2
 is p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's matrix leads
 from it to the chunk, whose own transform leads to the world: of a chunk with a geographic or
-projected coordinate system to geocentric metres, from where poses are converted into that system.
+projected coordinate system to geocentric metres of its datum, from where poses are converted into
+that system.
 The cameras of a rig other than its master have no matrix but the master's, and their sensor says
 where it stands in the master's axes.
 """
@@ -12,11 +13,12 @@ where it stands in the master's axes.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -136,11 +138,11 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
                 "the scan for the chunk in Metashape and export again"
             )
         metres = crs.axis_info[0].unit_conversion_factor
-        convert = pyproj.Transformer.from_crs(
-            pyproj.CRS.from_epsg(_GEOCENTRIC), crs, always_xy=True
-        ).transform
+        convert = _from_geocentric(crs, path).transform
     except pyproj.exceptions.ProjError as error:
         raise damaged(path, f"its coordinate system is not known ({error})") from error
+
+    heights = "" if crs.is_compound else ", heights above its ellipsoid"
 
     def to_site(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.stack(convert(*points.T), axis=-1) * [metres, metres, 1.0]
@@ -159,14 +161,50 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
             given,
             rotation=turned,
             translation=-turned @ there[0],
-            note=given.note
-            or f"poses are converted from geocentric metres to {crs.name}, heights as in there",
+            note=given.note or f"poses are converted from geocentric metres to {crs.name}{heights}",
         )
 
     return converted
 
 
-_GEOCENTRIC: Final = 4978
+# Any: pyproj has no types that strict checks accept.
+def _from_geocentric(crs: Any, path: Path) -> Any:
+    """The transformer from geocentric metres of a projected system's own datum, as Metashape has.
+
+    Raises:
+        InputError: its heights need a grid that is not there.
+    """
+    import pyproj
+
+    level = crs.sub_crs_list[0] if crs.is_compound else crs
+    if level.geodetic_crs is None:
+        raise damaged(path, f"its coordinate system {crs.name} has no place on Earth")
+    geodetic = level.geodetic_crs.to_json_dict()
+    datum = "datum_ensemble" if "datum_ensemble" in geodetic else "datum"
+    axes = [
+        {"name": axis, "abbreviation": axis, "direction": f"geocentric{axis}", "unit": "metre"}
+        for axis in "XYZ"
+    ]
+    geocentric = pyproj.CRS.from_json_dict(
+        {
+            "type": "GeodeticCRS",
+            "name": f"geocentric of {level.name}",
+            datum: geodetic[datum],
+            "coordinate_system": {"subtype": "Cartesian", "axis": axes},
+        }
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is raised here
+        group = pyproj.transformer.TransformerGroup(geocentric, crs, always_xy=True)
+    # A negative accuracy is that of heights which stay as they are.
+    if crs.is_compound and not (group.best_available and group.transformers[0].accuracy >= 0.0):
+        grids = [grid.short_name for way in group.unavailable_operations for grid in way.grids]
+        missing = f" without its grid {grids[0]} (`projsync --file {grids[0]}`)" if grids else ""
+        raise InputError(
+            f"{path.name} is in {crs.name}, whose heights PROJ cannot compute{missing}: set a "
+            "coordinate system without a vertical part for the chunk and export again"
+        )
+    return pyproj.Transformer.from_crs(geocentric, crs, always_xy=True)
 
 
 class _Similarity:

@@ -315,11 +315,28 @@ UTM = (
 )
 
 
-def test_a_georeferenced_chunk_leads_into_its_coordinate_system(tmp_path: Path) -> None:
-    # A camera at a place in zone 32, level, looking along grid north; three places that it sees.
-    place = np.array([440_123.4, 5_412_345.6, 310.5])
+@pytest.mark.parametrize(
+    ("epsg", "wkt", "ellipsoid"),
+    [(32632, UTM, "WGS84"), (31467, pyproj.CRS.from_epsg(31467).to_wkt("WKT1_GDAL"), "bessel")],
+    ids=["WGS 84", "DHDN"],
+)
+def test_a_georeferenced_chunk_leads_into_its_coordinate_system(
+    tmp_path: Path, epsg: int, wkt: str, ellipsoid: str
+) -> None:
+    # A camera at a place in the zone, level, looking along grid north; three places that it sees.
+    place = np.array([3_440_123.4 if epsg == 31467 else 440_123.4, 5_412_345.6, 310.5])
     ahead = np.array([[0.0, 20.0, 0.0], [5.0, 20.0, 1.0], [-5.0, 30.0, -2.0]])
-    geocentric = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4978", always_xy=True).transform
+    crs = pyproj.CRS.from_epsg(epsg)
+    to_degrees = pyproj.Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform
+    to_cartesian = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        f"+step +proj=cart +ellps={ellipsoid}"
+    ).transform
+
+    def geocentric(x: float, y: float, z: float) -> tuple[float, ...]:
+        """Geocentric metres of the system's own datum."""
+        return tuple(to_cartesian(*to_degrees(x, y), z))
+
     centre = np.array(geocentric(*place))
     axes = np.array([np.array(geocentric(*(place + step))) - centre for step in np.eye(3)])
     world_from_grid = np.linalg.qr(axes.T)[0] * np.sign(np.diag(np.linalg.qr(axes.T)[1]))
@@ -334,9 +351,9 @@ def test_a_georeferenced_chunk_leads_into_its_coordinate_system(tmp_path: Path) 
         "<scale>1</scale></transform>"
     )
     text = document(cameras=posed("a.jpg", matrix), chunk=transform)
-    text = text.replace("</chunk>", f"<reference>{escape(UTM)}</reference></chunk>")
+    text = text.replace("</chunk>", f"<reference>{escape(wkt)}</reference></chunk>")
     (given,) = read(tmp_path, text)
-    assert "converted from geocentric metres to WGS 84 / UTM zone 32N" in given.note
+    assert f"from geocentric metres to {crs.name}, heights above its ellipsoid" in given.note
     assert given.rotation is not None
     found = -given.rotation.T @ np.asarray(given.translation)
     np.testing.assert_allclose(found, place, atol=1e-4)
@@ -350,6 +367,10 @@ def test_a_georeferenced_chunk_leads_into_its_coordinate_system(tmp_path: Path) 
     [
         (pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), "is in degrees"),
         ("PROJCS[nonsense", "its coordinate system is not known"),
+        (
+            pyproj.CRS.from_user_input("EPSG:25832+5783").to_wkt("WKT1_GDAL"),
+            "DHHN92 height, whose heights PROJ cannot compute: set",
+        ),
     ],
 )
 def test_coordinate_systems_that_no_scan_is_in_are_refused(
