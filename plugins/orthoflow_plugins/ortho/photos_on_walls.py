@@ -13,6 +13,7 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, decode_levels
 from orthoflow.files.photo_files import icc_profile, stated_bits
+from orthoflow.foreign_text import first_few
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import DiagnosticSpec, MethodParams, Ports, StepContext
@@ -46,6 +47,14 @@ MIXED_PROFILES: Final = DiagnosticSpec(
     text="the photos have {n} different colour profiles, or some have none: the orthoimages get "
     "none, and colours may step where photos meet",
     remedy="export all photos with one colour profile",
+    rank_by="n",
+)
+WITHOUT_WALL: Final = DiagnosticSpec(
+    code="photos-show-no-wall",
+    severity="warning",
+    text="{n} of {n_photos} oriented photos show none of the walls ({names})",
+    remedy="if they show a surface to be delivered, let the plane detector find more planes "
+    "(min_share) and raster.grid take its plane (near, n_walls_max)",
     rank_by="n",
 )
 
@@ -161,6 +170,10 @@ def layers_of_photos(
     warn_of_heads(inputs.walls.up, oriented, ctx)
     profile = shared_profile([photo for photo, _ in oriented], ctx)
     layers = joined_layers(inputs.walls, painted, ctx)
+    used = {layer.source for layer in painted.layers}
+    idle = [photo.name for photo, _ in oriented if photo.name not in used]
+    if idle:
+        ctx.report(WITHOUT_WALL, n=len(idle), n_photos=len(oriented), names=first_few(idle))
     return LayersOfPhotos(layers=replace(layers, icc_profile=profile))
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
 from orthoflow.products import PointCloud, PointLabels
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.plane.candidates import (
     FoundPlane,
     fit_to_all,
@@ -91,6 +91,15 @@ class Proposer(Protocol):
 P = TypeVar("P", bound=Proposer)
 # Makes what proposes planes in a search that has taken none yet.
 ProposerOf = Callable[[Search], P]
+UNEXPLAINED: Final = DiagnosticSpec(
+    code="points-on-no-plane",
+    severity="warning",
+    text="{share:.0%} of the points lie on no plane, more than on the largest one ({largest:.0%}): "
+    "walls may be missing, unless these are vegetation, furniture or curved surfaces",
+    remedy="{step}.min_share={min_share:.2g} finds smaller planes, "
+    "{step}.tolerance_m={tolerance_m:.2g} rougher ones",
+    rank_by="share",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,6 +263,16 @@ def _products(
         n_points=len(cloud),
         n_guessed=assembly.n_guessed,
     )
+    n_on_planes = assembly.deviations.n_points
+    n_left = len(cloud) - int(n_on_planes.sum())
+    if n_left > n_on_planes.max():
+        ctx.report(
+            UNEXPLAINED,
+            share=n_left / len(cloud),
+            largest=float(n_on_planes.max()) / len(cloud),
+            min_share=search.params.min_share / 2.0,
+            tolerance_m=2.0 * search.tolerance_m,
+        )
     _report_fit(ctx, assembly, n_points=len(cloud))
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, assembly)

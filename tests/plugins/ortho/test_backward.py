@@ -400,6 +400,13 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
     # The turned camera paints the other wall: both walls have a layer.
     assert [(layer.wall, layer.source) for layer in layers.layers] == [(0, "1.png"), (1, "0.png")]
     assert layers.names == ("wall 1", "wall 0")
+    assert list(ctx.warnings) == []
+    without = dataclasses.replace(walls, walls=(wall,))
+    ctx = context(tmp_path)
+    run(dataclasses.replace(inputs, walls=without), ctx)
+    (told,) = ctx.diagnostics
+    assert (told.code, told.values["n"]) == ("photos-show-no-wall", 1)
+    assert told.values["names"] == "1.png"
     only = Cameras(
         cameras=(
             inputs.cameras.cameras[0],

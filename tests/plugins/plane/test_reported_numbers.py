@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes, PointLabels
 from orthoflow.sdk import StepContext
@@ -59,3 +60,21 @@ def test_metrics_are_those_of_the_planes_and_labels(method_id: str, tmp_path: Pa
         "next_plane_cpu_s": 10,
     }
     assert np.sqrt(np.mean(distances**2)) == pytest.approx(planes.rms_m[0], rel=1e-3)
+
+
+def test_points_on_no_plane_are_reported_where_they_are_more_than_on_any(tmp_path: Path) -> None:
+    cloud, true = example_room(n_points=N_POINTS)
+    method = discover_catalog().method("plane.hough2d").load()
+
+    def reported(**params: object) -> tuple[list[Diagnostic], float]:
+        ctx = StepContext(rng=np.random.default_rng(3), cores=1, scratch=tmp_path)
+        method().run(method.In(cloud=cloud), method.Params(**params), ctx)
+        (share,) = (item.value for item in ctx.metrics if item.name == "labelled_share")
+        return [item for item in ctx.diagnostics if item.code == "points-on-no-plane"], share
+
+    assert reported() == ([], pytest.approx(1.0, abs=0.05))
+    # The largest of several walls has less than half of the points.
+    (told,), labelled_share = reported(n_planes_max=1)
+    assert len(true) > 2
+    assert told.values["share"] == pytest.approx(1.0 - labelled_share)
+    assert told.values["largest"] == pytest.approx(labelled_share)
