@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
 
 from orthoflow.catalog.distributions import (
     DistributionInfo,
-    may_define,
     package_path,
     source_files,
 )
 from orthoflow.catalog.wording import did_you_mean, nearest
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec
+from orthoflow.version import DISTRIBUTION
 
 if TYPE_CHECKING:
     from orthoflow.products.product import Product
@@ -134,12 +134,11 @@ class MethodEntry(Announced):
         )
 
     def looked_at(self) -> MethodEntry:
-        """Return the entry, `broken` where its class is not in its source and does not load.
+        """Return the entry, `broken` where its class does not load.
 
-        Of a class that seems to be there nothing is loaded, so listings may state what later
-        proves wrong.
+        Our own are loaded by the tests of every release, and a listing takes half a second.
         """
-        if self.state != "fine" or may_define(self.spec.target):
+        if self.state != "fine" or self.distribution.name == DISTRIBUTION:
             return self
         try:
             self.load()

@@ -40,6 +40,7 @@ from orthoflow.sdk.hooks import (
     PluginHooks,
     ProductSpec,
 )
+from orthoflow.version import DISTRIBUTION
 
 # Windows takes the first ones for devices; addresses and files are named after names.
 NAME_PATTERN: Final = (
@@ -48,9 +49,6 @@ NAME_PATTERN: Final = (
 _METHOD_ID: Final = re.compile(rf"{NAME_PATTERN}\.{NAME_PATTERN}")
 _KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-
-# Whose names nobody else takes away.
-OWN: Final = "orthoflow-tls"
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
 
@@ -229,7 +227,9 @@ def _by_name(
 ) -> dict[str, list[_Claim[_Spec]]]:
     """Who claims each name: orthoflow itself first, then by the names of distributions."""
     claims: dict[str, list[_Claim[_Spec]]] = {}
-    for announcement in sorted(announcements, key=lambda item: item.distribution.name != OWN):
+    for announcement in sorted(
+        announcements, key=lambda item: item.distribution.name != DISTRIBUTION
+    ):
         for spec in specs_of(announcement):
             claim = _Claim(spec=spec, distribution=announcement.distribution)
             claims.setdefault(_name(spec), []).append(claim)
@@ -343,7 +343,7 @@ def _collect_methods(
             entries[name] = first
             continue
         named = [f"{canonical_name(claim.distribution.name)}/{name}" for claim in claims]
-        if claims[0].distribution.name == OWN:
+        if claims[0].distribution.name == DISTRIBUTION:
             entries[name] = first
         else:
             problem = _contested(f"method {name}", claims, f"write {' or '.join(named)}")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, requires
-from importlib.util import cache_from_source, find_spec
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -93,42 +92,6 @@ def package_path(module: str) -> Path | None:
             return None
         head, _, rest = rest.partition(".")
         name = f"{name}.{head}"
-
-
-def may_define(target: str) -> bool:
-    """Whether a module's source seems to have what `package.module:Name` names, without running it.
-
-    False where the source is missing, is no Python, or does not contain the name; True of what is
-    not source.
-    """
-    module, _, name = target.partition(":")
-    path = _module_file(module)
-    if path is None or path.suffix != ".py":
-        return path is not None
-    try:
-        text = path.read_bytes()
-        if not _was_compiled(path):
-            ast.parse(text)
-    except (OSError, SyntaxError, ValueError):
-        return False
-    return re.search(rf"\b{re.escape(name)}\b".encode(), text) is not None
-
-
-def _module_file(module: str) -> Path | None:
-    package = package_path(module)
-    if package is None or package.is_file():
-        return package
-    inner = module.split(".")
-    inside = package.joinpath(*inner[inner.index(package.name) + 1 :])
-    return inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
-
-
-def _was_compiled(path: Path) -> bool:
-    """Whether Python has read the source as it is: parsing all of them takes longer than a list."""
-    try:
-        return Path(cache_from_source(path)).stat().st_mtime >= path.stat().st_mtime
-    except OSError:
-        return False
 
 
 def canonical_name(name: str) -> str:

@@ -52,6 +52,7 @@ LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
     "lazrs": ("lazrs", "compressed LAZ files: read.scan, --to laz"),
     "pye57": ("pye57", "E57 files: read.scan, --to e57"),
     "pyproj": ("pyproj", "coordinate systems: read.scan, cameras of Metashape"),
+    "plyfile": ("plyfile", "PLY files with lists: read.scan"),
     "pandas": ("pandas", "text files of points: read.scan"),
     "pillow": ("PIL", "EXIF data of photos: read.photos, ortho"),
     "simplejpeg": ("simplejpeg", "damage in JPEG files: read.photos"),

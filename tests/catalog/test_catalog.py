@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from orthoflow.catalog import loading
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import OWN, discover_catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
@@ -22,6 +22,7 @@ from orthoflow.products.planes import Planes
 from orthoflow.products.product import Product
 from orthoflow.products.walls import Walls
 from orthoflow.sdk.methods import PortSpec
+from orthoflow.version import DISTRIBUTION
 from tests.laboratories import (
     LABORATORY,
     entry_points_in,
@@ -92,7 +93,7 @@ def test_listing_plugins_loads_no_heavy_library() -> None:
     program = textwrap.dedent(
         """
         import sys, json
-        from orthoflow.catalog.discovery import OWN, discover_catalog
+        from orthoflow.catalog.discovery import discover_catalog
         catalog = discover_catalog()
         heavy = {"numpy", "pydantic", "networkx", "h5py", "ruamel.yaml"} & set(sys.modules)
         print(json.dumps([sorted(catalog.methods), sorted(heavy)]))
@@ -258,7 +259,7 @@ def test_orthoflows_own_names_stay_its_own(tmp_path: Path, monkeypatch: pytest.M
     write_distribution(tmp_path, "impostor", {"impostor_hooks.py": text})
     monkeypatch.syspath_prepend(tmp_path)
     catalog = discover_catalog()
-    assert catalog.method("plane.hough2d").distribution.name == OWN
+    assert catalog.method("plane.hough2d").distribution.name == DISTRIBUTION
     assert catalog.methods["impostor/plane.hough2d"].distribution.name == "impostor"
 
 
@@ -433,16 +434,6 @@ def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
     assert catalog.method("plane.mine").load().id == "plane.mine"
 
 
-def test_a_class_that_its_source_does_not_name_is_loaded_to_be_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = hooks(methods=method("plane.mine", "made_class:Mine"))
-    source = f"{CLASS.replace('class Mine', 'class Other')}\nglobals()['Mi' + 'ne'] = Other\n"
-    catalog = with_plugin("made", text, tmp_path, monkeypatch, made_class=source)
-    entry = catalog.method("plane.mine")
-    assert entry.looked_at() is entry
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -603,15 +594,15 @@ def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     announced = (
-        ("plane.good", "named.method:Good"),
-        ("plane.case", "named.method:GoodPlane"),
-        ("plane.lost", "named.methods:Good"),
+        ("plane.mine", "named.method:Mine"),
+        ("plane.case", "named.method:Minee"),
+        ("plane.lost", "named.methods:Mine"),
         ("plane.indented", "named.odd:Odd"),
     )
     sources = {
         "named_hooks.py": hooks(methods=", ".join(method(*one) for one in announced)),
         "named/__init__.py": "",
-        "named/method.py": "class Good: pass\n",
+        "named/method.py": CLASS,
         "named/odd.py": "class Odd:\npass\n",
     }
     folder = write_distribution(tmp_path, "named", sources)
@@ -622,10 +613,8 @@ def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(
     rows = [line.split() for line in listed.stdout.splitlines()]
     states = {row[0]: row[1] for row in rows if len(row) > 1}
     assert [states[name] for name, _ in announced] == ["fine", "broken", "broken", "broken"]
-    # Only what was not in its source is loaded.
-    assert "plane.good of named" not in listed.stdout
     for said in (
-        "from named.method:GoodPlane: named.method has no GoodPlane (did you mean Good?); mend its",
+        "from named.method:Minee: named.method has no Minee (did you mean Mine?); mend its",
         "ModuleNotFoundError: No module named 'named.methods'; mend its source, or the hooks",
         "class definition on line 1 (odd.py, line 2); mend its source, or the hooks",
     ):

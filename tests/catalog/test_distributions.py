@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from importlib.metadata import EntryPoint
-from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,6 @@ import pytest
 from orthoflow.catalog.distributions import (
     DistributionInfo,
     describe_distribution,
-    may_define,
     package_path,
     required_distributions,
     source_files,
@@ -72,55 +69,6 @@ def test_an_entry_point_of_no_distribution_is_known_by_its_own_name(
 
 def test_modules_built_into_python_have_no_place() -> None:
     assert package_path("sys") is None
-
-
-def write(path: Path, text: str, *, hour: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    os.utime(path, (3600.0 * hour, 3600.0 * hour))
-
-
-@pytest.mark.parametrize(
-    ("target", "defines"),
-    [
-        ("regular:Top", True),
-        ("regular:Hooks", False),
-        ("regular.inner:Inner", True),
-        ("regular.inner.hooks:Hooks", True),
-        ("regular.inner.hooks:Hook", False),
-        ("regular.inner.hooks:hooks", False),
-        ("alone:Alone", True),
-        ("alone:Lone", False),
-        ("spaced.part.deep:Deep", True),
-        ("regular.gone:Gone", False),
-        ("nowhere_to_be_found:Any", False),
-    ],
-)
-def test_a_module_is_asked_for_a_name_where_it_lies(
-    folder: Path, target: str, defines: bool
-) -> None:
-    write(folder / "regular/__init__.py", "class Top: ...\n", hour=1)
-    write(folder / "regular/inner/__init__.py", "Inner = 1\n", hour=1)
-    write(folder / "regular/inner/hooks.py", "class Hooks:\n    x = 'Hooked'\n", hour=1)
-    write(folder / "alone.py", "from elsewhere import Alone\n", hour=1)
-    write(folder / "spaced/part/deep.py", "Deep = 1\n", hour=1)
-    assert may_define(target) is defines
-
-
-@pytest.mark.parametrize(
-    ("compiled_at", "defines"),
-    [(None, False), (1, False), (2, True), (3, True)],
-    ids=["never", "before", "at once", "since"],
-)
-def test_what_python_has_compiled_is_not_looked_at_again(
-    folder: Path, compiled_at: int | None, defines: bool
-) -> None:
-    """Of source that is no Python nothing is found, unless it was compiled as it is."""
-    write(folder / "alone.py", "class Alone:\n\nno python\n", hour=2)
-    if compiled_at is not None:
-        write(Path(cache_from_source(folder / "alone.py")), "", hour=compiled_at)
-    assert may_define("alone:Alone") is defines
-    assert may_define("alone:Lone") is False
 
 
 def test_python_files_of_packages_and_modules_are_listed_once(folder: Path) -> None:
