@@ -13,7 +13,7 @@ from typing import Final
 
 from orthoflow.engine.durability import exclusive_lock, shared_lock, size_of
 from orthoflow.engine.objects import WHOLE
-from orthoflow.engine.store import Failures, Store, is_store, require_store
+from orthoflow.engine.store import Store, is_store, require_store
 from orthoflow.errors import ArgumentError
 
 
@@ -162,7 +162,7 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
         if path.stem in gone or not (store.results / path.name).exists()
     )
     damaged = _children(store.damaged)
-    failures = _children(Failures.of_store(store.folder).folder)
+    failures = _children(store.failures)
     rest = (
         *damaged,
         *failures,

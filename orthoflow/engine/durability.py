@@ -7,7 +7,6 @@ import hashlib
 import os
 import re
 import shutil
-import stat
 import subprocess
 import uuid
 from collections.abc import Iterator
@@ -117,21 +116,6 @@ def write_whole(path: Path, content: bytes) -> None:
             aside.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
-
-
-def read_whole(path: Path, most_bytes: int) -> str:
-    """Read a small file of ours in a place where a method, or somebody else, may leave anything.
-
-    Raises:
-        OSError: there is no file, or a link, a device or something larger than we write.
-        UnicodeDecodeError: it is no text.
-    """
-    descriptor = os.open(path, flags("O_RDONLY", "O_NOFOLLOW", "O_NONBLOCK"))
-    with os.fdopen(descriptor, "rb") as stream:
-        state = os.fstat(descriptor)
-        if not stat.S_ISREG(state.st_mode) or state.st_size > most_bytes:
-            raise OSError(f"{path.name} is none of ours")
-        return stream.read().decode("utf-8")
 
 
 def place_folder(aside: Path, final: Path) -> bool:

@@ -22,7 +22,7 @@ from orthoflow.engine.keys import (
     read_preimage,
 )
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.store import Failures, Preimage, Store
+from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.foreign_text import first_few
 from orthoflow.products.input_files import InputFiles
@@ -321,7 +321,7 @@ class _Planner:
         )
 
     def _why(self, cell: Cell, key: CellKey) -> str:
-        failure = Failures.of_store(self.store.folder).sentence(key.key)
+        failure = self.store.last_failure(key.key)
         if failure:
             return f"failed last time: {failure}"
         return explain(key, cell.step, self._before(cell.method))

@@ -51,7 +51,7 @@ from orthoflow.engine.plan import (
     remember_places,
 )
 from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
-from orthoflow.engine.store import Failures, Store
+from orthoflow.engine.store import Store
 from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import (
     ArgumentError,
@@ -212,7 +212,6 @@ class _Run:
         self._tasks = tasks
         self._plan = tasks.plan
         self._store = tasks.store
-        self._failures = Failures.of_store(tasks.store.folder)
         self._journal = journal
         self._listen = listen
         self._results: dict[str, CellResult] = {}
@@ -402,14 +401,14 @@ class _Run:
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
             self._store.trust(result)
-            self._failures.forget(task.key)
+            self._store.forget_failure(task.key)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
             changed = _CODE_CHANGED.of("", {})
             self._listen(CellReported(address=cell.address, diagnostic=changed))
             result = _reporting(result, changed)
         elif result.exit_code != CancelledStepError.exit_code:
-            self._failures.remember(task.key, result.error_message)
+            self._store.remember_failure(task.key, result.error_message)
         if self._has_other_inputs_now(cell, task):
             # What it took was damaged and came out differently when it was computed again.
             self._waiting[cell.address] = planned

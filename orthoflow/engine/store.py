@@ -7,7 +7,7 @@ Layout below the store's folder:
     results/<key>.json              what a cell gave, naming objects
     damaged/                        what was set aside; garbage
     preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
-    failures/<key>.json             how cells failed last time (`failures`); disposable
+    failures/<key>                  how cells failed last time; disposable
     digests.json                    memory of input files' digests; disposable
     scratch/<run id>/               work in progress; removed with its run
     lock                            shared by runs, exclusive for garbage collection
@@ -41,14 +41,11 @@ from orthoflow_provenance.document import (
 
 from orthoflow.engine.durability import (
     folder_size,
-    is_checked,
     place_folder,
-    read_whole,
     remove_tree,
     shared_lock,
     sync_tree,
     taking_turns,
-    with_digest,
     write_whole,
     writing_to,
 )
@@ -70,7 +67,7 @@ from orthoflow.engine.objects import (
 )
 from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
-from orthoflow.foreign_text import parse_json
+from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products.product import Payload, Product
 from orthoflow.sdk.lines import one_line
 
@@ -137,6 +134,8 @@ __all__ = [
 ]
 
 _READ_RETRY_S: Final = 0.05
+# A reason stands in one column of a table; the record of the run has the whole sentence.
+_LONGEST_FAILURE: Final = 400
 
 ProductT = TypeVar("ProductT", bound=Product)
 
@@ -191,6 +190,7 @@ class Store:
         self.objects = self.folder / "objects"
         self.preimages = self.folder / "preimages"
         self.damaged = self.folder / "damaged"
+        self.failures = self.folder / "failures"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
         self._checked = CheckedFiles()
@@ -461,6 +461,27 @@ class Store:
         found = (_read_preimage(Path(path)) for _, path in sorted(dated, reverse=True)[:limit])
         return tuple(preimage for preimage in found if preimage is not None)
 
+    # Failures -----------------------------------------------------------------------------------
+
+    def remember_failure(self, key: str, sentence: str) -> None:
+        """Keep the sentence with which a cell failed, if the disk lets us."""
+        with contextlib.suppress(OSError, StoreError):
+            self.failures.mkdir(parents=True, exist_ok=True)
+            write_whole(self.failures / key, one_line(sentence, _LONGEST_FAILURE).encode())
+
+    def forget_failure(self, key: str) -> None:
+        """Take back what was remembered: the cell has a result now."""
+        with contextlib.suppress(OSError):
+            (self.failures / key).unlink()
+
+    def last_failure(self, key: str) -> str:
+        """State how a cell failed; empty when it did not, or when nobody knows any more."""
+        with contextlib.suppress(OSError), open_file(self.failures / key) as stream:
+            # Twice, for letters that no terminal shows are longer when they are written out.
+            text = stream.read(4 * _LONGEST_FAILURE).decode(errors="replace")
+            return one_line(text, 2 * _LONGEST_FAILURE)
+        return ""
+
     # Private ------------------------------------------------------------------------------------
 
     def _object(self, digest: str) -> Path:
@@ -624,49 +645,3 @@ def list_results(store: Store) -> tuple[StoredResult, ...]:
             )
         )
     return tuple(sorted(found, key=lambda item: (item.last_used, item.key), reverse=True))
-
-
-# A reason stands in one column of a table; the record of the run has the whole sentence.
-_LONGEST_SENTENCE: Final = 400
-_LARGEST_FILE: Final = 16 << 10
-
-
-@dataclass(frozen=True)
-class Failures:
-    """The sentences with which cells failed.
-
-    Attributes:
-        folder: where they lie; made when something fails.
-    """
-
-    folder: Path
-
-    @classmethod
-    def of_store(cls, store_folder: Path) -> Failures:
-        """Return those that a store keeps."""
-        return cls(store_folder / "failures")
-
-    def remember(self, key: str, sentence: str) -> None:
-        """Keep the sentence of a cell that failed, if the disk lets us."""
-        text = with_digest(json.dumps({"error": one_line(sentence, _LONGEST_SENTENCE)}))
-        with contextlib.suppress(OSError, StoreError):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_whole(self._file(key), text.encode())
-
-    def forget(self, key: str) -> None:
-        """Take back what was remembered: the cell has a result now."""
-        with contextlib.suppress(OSError):
-            self._file(key).unlink()
-
-    def sentence(self, key: str) -> str:
-        """State how the cell failed; empty when it did not, or when nobody knows any more."""
-        try:
-            text = read_whole(self._file(key), _LARGEST_FILE)
-            content = parse_json(text) if is_checked(text) else None
-        except (OSError, ValueError):
-            return ""
-        found = content.get("error") if isinstance(content, dict) else None
-        return one_line(found, 2 * _LONGEST_SENTENCE) if isinstance(found, str) else ""
-
-    def _file(self, key: str) -> Path:
-        return self.folder / f"{key}.json"

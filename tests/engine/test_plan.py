@@ -13,10 +13,10 @@ import pytest
 
 from orthoflow.engine import keys, method_versions
 from orthoflow.engine.cleaning import collect_garbage
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
-from orthoflow.engine.results import ProductRef, RecordedFile
-from orthoflow.engine.store import Failures, Preimage, Store
+from orthoflow.engine.results import ProductRef
+from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.system import usable_cores
 from orthoflow.workflow.expand import Cell, WorkflowInput
@@ -176,19 +176,6 @@ def test_a_key_is_the_digest_of_what_is_said_of_a_cell() -> None:
     }
 
 
-def test_an_input_is_known_by_names_sizes_and_contents_of_its_files_in_their_order() -> None:
-    files = [
-        RecordedFile(name=name, size_bytes=size, sha256=name * 64)
-        for name, size in (("b", 7), ("a", 9))
-    ]
-    listing = [
-        f'{{"name":"{name}","sha256":"{name * 64}","size_bytes":{size}}}'
-        for name, size in (("b", 7), ("a", 9))
-    ]
-    text = f'{{"files":[{",".join(listing)}],"v":1,"what":"orthoflow/files"}}'
-    assert input_digest(files) == f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
-
-
 def test_whatever_decides_a_result_changes_the_key() -> None:
     assert len(set(DIFFERENT.values())) == len(DIFFERENT)
 
@@ -245,19 +232,6 @@ NOW = cell_key(CELL, FACTS, INPUTS)
 )  # fmt: skip
 def test_the_changed_ingredient_is_named(earlier: Preimage, reason: str) -> None:
     assert explain(NOW, "step", [earlier]) == reason
-
-
-def test_changed_inputs_are_named_by_port() -> None:
-    before = cell_key(CELL, FACTS, {"left": RIGHT, "third": RIGHT})
-    reason = explain(NOW, "step", [Preimage(key=before.key, step="step", text=before.preimage)])
-    assert reason == "input left changed, input right added, input third removed"
-
-
-def test_many_changes_are_counted() -> None:
-    cell = dataclasses.replace(CELL, params=dict.fromkeys("abcdef", 1))
-    before = cell_key(cell, FACTS, INPUTS)
-    reason = explain(NOW, "step", [Preimage(key=before.key, step="step", text=before.preimage)])
-    assert reason.endswith(" and 3 more")
 
 
 def test_the_nearest_earlier_result_of_the_same_step_is_compared() -> None:
@@ -470,33 +444,17 @@ def test_the_plan_says_what_failed_last_time_until_garbage_is_collected(world: W
 
 
 def test_a_result_takes_back_the_failure_before_it(world: World) -> None:
-    failures = Failures.of_store(world.store.folder)
+    store = world.store
     key = next(item.key for item in world.plan(CHAIN).cells if item.key is not None)
-    failures.remember(key.key, "no\x1b[2J room")
-    assert world.status(CHAIN)["first"] == ("will run", "failed last time: no\\x1b[2J room")
+    store.remember_failure(key.key, "no\x1b[2J " + "room " * 100_000)
+    said = world.status(CHAIN)["first"][1]
+    assert said.startswith("failed last time: no\\x1b[2J room")
+    assert len(said) < 500
     run(world, CHAIN)
-    assert failures.sentence(key.key) == ""
-    assert list(failures.folder.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b'{"error":"forged"}', b"no json", b"\xff", b"[" * 100_000, b'{"sha256":"0","error":1}'],
-    ids=["without digest", "text", "bytes", "too large", "wrong digest"],
-)
-def test_a_memory_of_failures_that_is_not_ours_says_nothing(tmp_path: Path, content: bytes) -> None:
-    failures = Failures(tmp_path)
-    (tmp_path / "key.json").write_bytes(content)
-    assert failures.sentence("key") == ""
-
-
-def test_the_memory_of_a_failure_is_short_and_no_link_is_followed(tmp_path: Path) -> None:
-    failures = Failures(tmp_path / "failures")
-    failures.remember("long", "no " * 100_000)
-    assert len(failures.sentence("long")) < 500
-    (tmp_path / "failures" / "link.json").symlink_to(tmp_path / "failures" / "long.json")
-    assert failures.sentence("link") == ""
-    assert failures.sentence("unknown") == ""
+    assert store.last_failure(key.key) == ""
+    # What somebody else put there keeps nobody waiting.
+    os.mkfifo(store.failures / key.key)
+    assert store.last_failure(key.key) == ""
 
 
 # How long it takes --------------------------------------------------------------------------------

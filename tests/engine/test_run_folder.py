@@ -210,3 +210,17 @@ def test_names_of_files_have_two_hundred_bytes_and_stay_apart(letter: str) -> No
     for name in (one, other):
         assert 195 <= len(name.encode()) <= 200
         assert name.startswith(letter * 90)
+
+
+def test_a_file_is_called_after_its_cell_in_two_hundred_bytes() -> None:
+    longest = "a" * 200
+    assert cell_file_name(longest) == longest
+    for address in ("a" * 201, "ä" * 101, "é" * 150 + "x"):
+        name = cell_file_name(address)
+        assert len(name.encode()) <= 200
+        # As much of it as there is room for, and what tells it from others that begin alike.
+        begin, _, digest = name.rpartition("-")
+        assert address.startswith(begin)
+        assert len(begin.encode()) >= 186
+        assert len(digest) == 12
+        assert cell_file_name(address + "b") != name
