@@ -66,6 +66,7 @@ LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
     "open3d-cpu": ("open3d", "comparators of open3d; the default methods work without it"),
     "fonttools": ("fontTools", "fonts of the system in sheets"),
     "ezdxf": ("ezdxf", "CAD drawings: --to dxf"),
+    "prov": ("prov", "PROV documents: --to prov"),
     "reportlab": ("reportlab", "sheets: --to sheet"),
     "cryptography": ("cryptography", "signatures of records: sign, verify --signer"),
     "distributed": ("distributed", "clusters: --executor dask"),

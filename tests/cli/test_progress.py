@@ -117,9 +117,9 @@ def test_a_log_shows_a_long_step_again(
         time.sleep(0.7)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["run r1: 2 steps, about 2 min 00 s left", "plane: started"]
-    assert 2 <= len(lines[2:]) <= 3
+    assert 1 <= len(lines[2:]) <= 3
     for line in lines[2:]:
-        assert re.fullmatch(r"plane: 25 %, peeling, 0\.\d\d s so far, about 1 min 00 s left", line)
+        assert re.fullmatch(r"plane: 25 %, peeling, \d\.\d+ s so far, about 1 min 00 s left", line)
 
 
 # The table ----------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         for event in EVENTS[4:]:
             progress.take(event)
     (written,) = outputs
-    assert any("\nplane: 50 %, peeling, 0." in text for text in written[:-1])
+    assert any("\nplane: 50 %, peeling, " in text for text in written[:-1])
     assert written[-1].splitlines() == [
         "run r1: 5 steps",
         "cloud: cached",
@@ -259,7 +259,8 @@ def test_long_work_outside_of_cells_is_shown(
         time.sleep(0.3)
     with working_on("reading", every_s=5.0):
         pass
-    assert re.fullmatch(r"writing the record, 0\.2\d s so far\n", capsys.readouterr().err)
+    lines = set(re.sub(r"\d\.\d+ s", "T", capsys.readouterr().err).splitlines())
+    assert lines == {"writing the record, T so far"}
     outputs = request.getfixturevalue("outputs")
 
     @working_on("writing", every_s=0.1)
@@ -271,11 +272,11 @@ def test_long_work_outside_of_cells_is_shown(
     work(None)
     with pytest.raises(OSError, match="full"):
         work(OSError("full"))
-    assert [re.sub(r"\d\.\d\d s", "T", written[-1]) for written in outputs] == [
+    assert [re.sub(r"\d\.\d+ s", "T", written[-1]) for written in outputs] == [
         "writing: done in T",
         "writing: stopped after T",
     ]
-    assert re.fullmatch(r"writing, 0\.\d\d s so far", outputs[0][0])
+    assert re.fullmatch(r"writing, \d\.\d+ s so far", outputs[0][0])
 
 
 # Forecasts ----------------------------------------------------------------------------------------
