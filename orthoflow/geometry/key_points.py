@@ -76,8 +76,8 @@ class Window:
         second_log_size: (m,) float32, as expected in the first's frame.
         first_angle_deg: (n,) float32.
         second_angle_deg: (m,) float32, as expected in the first's frame.
-        log_size_most: largest difference of log2 sizes.
-        angle_most_deg: largest difference of angles.
+        max_log_size: largest difference of log2 sizes.
+        max_angle_deg: largest difference of angles.
     """
 
     first: NDArray[np.float32]
@@ -87,8 +87,8 @@ class Window:
     second_log_size: NDArray[np.float32]
     first_angle_deg: NDArray[np.float32]
     second_angle_deg: NDArray[np.float32]
-    log_size_most: float
-    angle_most_deg: float
+    max_log_size: float
+    max_angle_deg: float
 
     def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Possible pairs: indices into the first set and into the second."""
@@ -101,7 +101,7 @@ class Window:
         log_size = np.abs(self.first_log_size[i] - self.second_log_size[j])
         turn = np.abs(self.first_angle_deg[i] - self.second_angle_deg[j]) % 360.0
         turn = np.minimum(turn, 360.0 - turn)
-        possible = (log_size <= self.log_size_most) & (turn <= self.angle_most_deg)
+        possible = (log_size <= self.max_log_size) & (turn <= self.max_angle_deg)
         return i[possible], j[possible]
 
 

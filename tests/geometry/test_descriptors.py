@@ -58,8 +58,8 @@ def window(
         second_log_size=of("second_log_size", len(second_at)),
         first_angle_deg=of("first_angle_deg", len(first_at)),
         second_angle_deg=of("second_angle_deg", len(second_at)),
-        log_size_most=0.5,
-        angle_most_deg=20.0,
+        max_log_size=0.5,
+        max_angle_deg=20.0,
     )
 
 

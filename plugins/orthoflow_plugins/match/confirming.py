@@ -33,12 +33,12 @@ _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
 # So many key points, in parts that both places show, tell whether the places agree; fewer may be a
 # repeated motif.
-_SHARED_LEAST: Final = 24
+_MIN_SHARED: Final = 24
 # Both places put a shared key point on one spot of the wall, up to so many coarse cells, and more
 # where one photo is known by a homography that ignores relief.
 _APART_CELLS: Final = 3.0
 _APART_ROUGHLY_CELLS: Final = 6.0
-_AGREEING_LEAST: Final = 0.6
+_MIN_AGREEING: Final = 0.6
 # Places overlap where they share so many coarse cells.
 _OVERLAP_CELLS: Final = 200
 # Photos that agree are right when so many do, or one of them is clear by itself.
@@ -227,12 +227,12 @@ def _agree(one: _Laid, other: _Laid, shared: NDArray[np.float64]) -> bool:
     here, there = one.pixels[both], other.pixels[both]
     distance, nearest = (np.asarray(found) for found in cKDTree(here).query(shared[:, 0]))
     is_shown = distance <= one.cell_px
-    if int(is_shown.sum()) < _SHARED_LEAST:
+    if int(is_shown.sum()) < _MIN_SHARED:
         return False
     off = there[nearest[is_shown]] - shared[is_shown, 1]
     off_cells = np.linalg.norm(off, axis=1) / other.cell_px
     limit = max(one.apart_cells, other.apart_cells)
-    return bool((off_cells <= limit).mean() >= _AGREEING_LEAST)
+    return bool((off_cells <= limit).mean() >= _MIN_AGREEING)
 
 
 def _chosen(laid: Sequence[_Laid], agreeing: Sequence[tuple[int, int]]) -> dict[int, Placed]:

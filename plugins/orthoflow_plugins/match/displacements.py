@@ -25,11 +25,11 @@ from orthoflow_plugins.match.patch_kernels import (
 )
 
 # Patches of which less is known than this say nothing.
-_KNOWN_LEAST: Final = 0.6
+_MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
 """Neighbouring residuals of smoothed pictures agree: independent ones are this much fewer."""
-_DRIFT_MOST_CELLS: Final = 1.5
-_DISAGREEMENT_MOST_CELLS: Final = 0.5
+_MAX_DRIFT_CELLS: Final = 1.5
+_MAX_DISAGREEMENT_CELLS: Final = 0.5
 # About patches that are cut out: as far as they drift, and what interpolates there.
 _CUT_MARGIN_CELLS: Final = 6
 
@@ -154,7 +154,7 @@ def _well_known(
     places = places[inside]
     side = 2 * HALF_PATCH_CELLS + 1
     share = cv2.blur(first.known * second.known, (side, side))
-    known = share[places[:, 1], places[:, 0]] >= _KNOWN_LEAST
+    known = share[places[:, 1], places[:, 0]] >= _MIN_KNOWN
     return np.ascontiguousarray(places[known])
 
 
@@ -174,8 +174,8 @@ def _refined(
     disagreement = np.abs(forward.shifts + back.shifts).max(axis=1, initial=0.0)
     sigma = np.sqrt(0.5 * (forward.sigma**2 + back.sigma**2) + (0.5 * disagreement) ** 2)
     good = (
-        (np.abs(shifts - begun).max(axis=1, initial=0.0) < _DRIFT_MOST_CELLS)
-        & (disagreement < _DISAGREEMENT_MOST_CELLS)
+        (np.abs(shifts - begun).max(axis=1, initial=0.0) < _MAX_DRIFT_CELLS)
+        & (disagreement < _MAX_DISAGREEMENT_CELLS)
         & (forward.score >= search.min_score)
         & np.isfinite(sigma)
     )

@@ -27,7 +27,7 @@ _TILE_PX: Final = 2048
 _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
 # Smaller pictures have no key points.
-_SIDE_LEAST_PX: Final = 16
+_MIN_SIDE_PX: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +159,7 @@ def _in_tile(
         slice(low[1], ends[1] + _TILE_OVERLAP_PX),
     )
     view = np.ascontiguousarray(picture[part])
-    found = sift.detect(view, None) if min(view.shape) >= _SIDE_LEAST_PX else ()
+    found = sift.detect(view, None) if min(view.shape) >= _MIN_SIDE_PX else ()
     points = np.array(
         [(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64
     ).reshape(-1, 5)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.warping import Before
 
 # Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
-_POINTS_LEAST = 6
+_MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
@@ -253,7 +253,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         [camera.viewing() for camera in cameras],
         spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
-        n_least=_POINTS_LEAST,
+        n_least=_MIN_POINTS,
         # Photos share the processors already.
         threads=1,
     )

@@ -43,8 +43,8 @@ _LOG_SCALE_APART: Final = 0.35
 _CLEARLY_MIRRORED: Final = 24
 _MIRRORED_OVER: Final = 2
 # In the second look, a key point's size (log2) and direction are those expected, up to so much.
-_LOG_SIZE_MOST: Final = 0.7
-_ANGLE_MOST_DEG: Final = 30.0
+_MAX_LOG_SIZE: Final = 0.7
+_MAX_ANGLE_DEG: Final = 30.0
 _VOID_MARGIN_CELLS: Final = 3
 MIN_AGREEING: Final = 8
 """Matches that agree with one homography where a photo shows a wall."""
@@ -71,7 +71,7 @@ CLEARLY: Final = 24
 # A mixture is there to find the place, not to measure it.
 _LONGEST_SIDE_PX: Final = 2000
 # A photo without colours has but one mixture.
-_GREY_LEVELS_LEAST: Final = 8.0
+_MIN_GREY_LEVELS: Final = 8.0
 
 
 class PairingParams(MethodParams):
@@ -236,7 +236,7 @@ def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
     """
     mixture = rgb.astype(np.float32) @ np.array(MIXTURES[name], dtype=np.float32)
     low, high = np.percentile(mixture[::4, ::4], (0.5, 99.5))
-    if high - low < _GREY_LEVELS_LEAST:
+    if high - low < _MIN_GREY_LEVELS:
         return None
     stretched = (mixture - np.float32(low)) * np.float32(255.0 / (high - low))
     return np.asarray(np.rint(np.clip(stretched, 0.0, 255.0)), dtype=np.uint8)
@@ -321,8 +321,8 @@ def rematched(
         second_log_size=(np.log2(wall.sizes_px[near]) + np.median(log_size)).astype(np.float32),
         first_angle_deg=photo.angles_deg.astype(np.float32),
         second_angle_deg=(wall.angles_deg[near] + turn_deg).astype(np.float32),
-        log_size_most=_LOG_SIZE_MOST,
-        angle_most_deg=_ANGLE_MOST_DEG,
+        max_log_size=_MAX_LOG_SIZE,
+        max_angle_deg=_MAX_ANGLE_DEG,
     )
     found = mutual_matches_within(photo.descriptors, wall.descriptors[near], window, ratio=ratio)
     new = ~np.isin(found.first, matches.first)

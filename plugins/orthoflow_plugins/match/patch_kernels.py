@@ -17,8 +17,8 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 _STRIDE: Final = 2
 _ITERATIONS: Final = 12
 _CONVERGED_CELLS: Final = 0.002
-_STEP_MOST_CELLS: Final = 0.7
-_KNOWN_SHARE_LEAST: Final = 0.3
+_MAX_STEP_CELLS: Final = 0.7
+_MIN_KNOWN_SHARE: Final = 0.3
 _RIDGE: Final = 1e-3
 # Of the cells that a search looks at, which are every second: neighbours still agree somewhat.
 _INDEPENDENT: Final = 1.5
@@ -213,7 +213,7 @@ def match_patches(
     least = 0.0
     for y in range(len(window)):
         for x in range(len(window)):
-            least += _KNOWN_SHARE_LEAST * window[y, x]
+            least += _MIN_KNOWN_SHARE * window[y, x]
     for i in range(places.shape[0]):
         place = (places[i, 1], places[i, 0])
         found[i, 2], found[i, 3] = math.inf, 0.0
@@ -229,8 +229,8 @@ def match_patches(
             found[i, 2], found[i, 3] = sigma, score
             if not math.isfinite(sigma):
                 break
-            found[i, 0] -= min(_STEP_MOST_CELLS, max(-_STEP_MOST_CELLS, step_across))
-            found[i, 1] -= min(_STEP_MOST_CELLS, max(-_STEP_MOST_CELLS, step_down))
+            found[i, 0] -= min(_MAX_STEP_CELLS, max(-_MAX_STEP_CELLS, step_across))
+            found[i, 1] -= min(_MAX_STEP_CELLS, max(-_MAX_STEP_CELLS, step_down))
             if max(abs(step_across), abs(step_down)) < _CONVERGED_CELLS:
                 break
 

@@ -26,8 +26,8 @@ _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
 # Depths about a point that differ by more than this many cells are an edge of the relief.
 _SMOOTH_CELLS: Final = 1.0
 # Of how many cells, on an even surface, the usual spread of points is told.
-_SPREADS_MOST: Final = 100_000
-_SPREADS_LEAST: Final = 100
+_MAX_SPREADS: Final = 100_000
+_MIN_SPREADS: Final = 100
 # A wall whose spread in depth is unknown is taken as this accurate, in cells.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
@@ -250,10 +250,10 @@ def usual_spread_m(wall: Wall) -> float:
     """
     gsd_m = wall.frame.gsd_m
     rows, columns = np.nonzero(np.isfinite(wall.sigma_m))
-    every = max(1, len(rows) // _SPREADS_MOST)
+    every = max(1, len(rows) // _MAX_SPREADS)
     rows, columns = rows[::every], columns[::every]
     is_even = _spread_about(wall, rows, columns) < _SMOOTH_CELLS * gsd_m
-    if is_even.sum() < _SPREADS_LEAST:
+    if is_even.sum() < _MIN_SPREADS:
         return _UNKNOWN_SIGMA_CELLS * gsd_m
     return float(np.median(wall.sigma_m[rows[is_even], columns[is_even]]))
 

@@ -54,17 +54,17 @@ _APART_CELLS: Final = 5
 _MIN_SCORE: Final = 0.3
 _MIN_DISTINCT: Final = 0.03
 # Ties of a round, to go on with the pose that they give.
-_FIT_LEAST: Final = 8
+_MIN_FIT: Final = 8
 # Ties of a place that photos beside it may confirm.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
 # At wrong places in simulated rooms leads were up to 6.1 where 0.15 of all patches agreed; at right
 # ones 6.2 and more, or 0.3 and more of all patches agreed at leads of 5.5 and more.
-_LEAD_LEAST: Final = 6.5
-_LEAD_LEAST_OF_MANY: Final = 5.5
+_MIN_LEAD: Final = 6.5
+_MIN_LEAD_OF_MANY: Final = 5.5
 _MANY_SHARE: Final = 0.25
-_TIES_LEAST: Final = 40
-_SHARE_LEAST: Final = 0.08
+_MIN_TIES: Final = 40
+_MIN_SHARE: Final = 0.08
 _OVER_NEXT: Final = 1.5
 # How well a patch fixes a place, in coarse cells.
 _SIGMA_CELLS: Final = 0.5
@@ -282,9 +282,9 @@ def _judged(found: Sequence[Placed]) -> list[Placed]:
     best = kept[0]
     is_clear = (
         all(best.share >= _OVER_NEXT * other.share for other in kept[1:])
-        and len(best.piece) >= _TIES_LEAST
-        and best.share >= _SHARE_LEAST
-        and best.lead >= (_LEAD_LEAST_OF_MANY if best.share >= _MANY_SHARE else _LEAD_LEAST)
+        and len(best.piece) >= _MIN_TIES
+        and best.share >= _MIN_SHARE
+        and best.lead >= (_MIN_LEAD_OF_MANY if best.share >= _MANY_SHARE else _MIN_LEAD)
     )
     return [replace(best, is_clear=is_clear), *(replace(one, is_clear=False) for one in kept[1:])]
 
@@ -369,7 +369,7 @@ def _tied(
         own = structure.channels.part(projection.part)
         moved = _measured(own, other, radius)
         piece = _piece(at, structure, moved, projection)
-        if len(piece) < _FIT_LEAST:
+        if len(piece) < _MIN_FIT:
             return None
         seen = SeenPoints(
             pixels_photo=piece.pixels_photo,

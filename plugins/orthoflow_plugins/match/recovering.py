@@ -26,7 +26,7 @@ from orthoflow_plugins.match.tracing import Desk, estimated_lens, lens_by_ties, 
 from orthoflow_plugins.match.warping import View, view_of
 
 # Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
-_AGREEING_LEAST: Final = 24
+_MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _SEED: Final = 1
@@ -161,7 +161,7 @@ def recovered_pose(
     """
     pairs = pair_photo(grey, [each.features for each in painted], _PARAMS)
     pixels, points = _agreeing(pairs, painted)
-    if len(pixels) < _AGREEING_LEAST:
+    if len(pixels) < _MIN_AGREEING:
         return None
     return _pose(pixels, points, lens, _POSE_LIMIT_SHARE * max(grey.shape))
 
@@ -233,7 +233,7 @@ def _pose(
     found, _, turn, shift, agreed = call(
         points - middle, straight[:, 0], matrix, None, params=params
     )
-    if not found or agreed is None or len(agreed) < _AGREEING_LEAST:
+    if not found or agreed is None or len(agreed) < _MIN_AGREEING:
         return None
     rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
     pose = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())

@@ -46,8 +46,8 @@ from orthoflow_plugins.match.pictures import (
 # wall is no larger than key points are found on at once.
 _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
-_CELLS_MOST: Final = 4_000_000
-_POINTS_LEAST: Final = 3
+_MAX_CELLS: Final = 4_000_000
+_MIN_POINTS: Final = 3
 # So many matches over all photos must agree on a side, and so many times as many as on the other: a
 # front that is symmetric agrees with its mirror image in part.
 _MIN_AGREEING: Final = 16
@@ -103,7 +103,7 @@ class FaceByPhotos(Method):
         del params
         planes, cloud = inputs.planes, inputs.cloud
         require_photos(inputs.photos)
-        cloud.require_points(_POINTS_LEAST)
+        cloud.require_points(_MIN_POINTS)
         ctx.progress(0.0, "planes whose side was guessed")
         asked = [index for index in range(len(planes)) if _is_asked(planes, index)]
         ctx.metric("n_planes_guessed", len(asked), "1")
@@ -203,7 +203,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
         np.linalg.norm(corners[3] - corners[0]) * np.linalg.norm(corners[1] - corners[0])
     )
     spacing_m = math.sqrt(area_m2 / max(1, int(planes.n_points[index])))
-    cell_m = max(_SPACINGS_PER_CELL * spacing_m, math.sqrt(area_m2 / _CELLS_MOST))
+    cell_m = max(_SPACINGS_PER_CELL * spacing_m, math.sqrt(area_m2 / _MAX_CELLS))
     frame = frame_over(corners, planes.normal[index], gsd_m=cell_m)
     grey = _grey_on(frame, planes.tolerance_m, cloud, cores)
     known = np.isfinite(grey)

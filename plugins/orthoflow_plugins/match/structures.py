@@ -29,20 +29,20 @@ _CELLS: Final = 200.0
 # photo from the first, its shorter side up to the second.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
-_PART_MOST_CELLS: Final = 250
-_PART_LEAST_CELLS: Final = 16
+_MAX_PART_CELLS: Final = 250
+_MIN_PART_CELLS: Final = 16
 # How far a part may slip, as a share of the photo's width.
 _SLIP_SHARE: Final = 0.03
 # A step of the relief of so much counts as a step from black to white.
 _STEP_M: Final = 0.5
-_KNOWN_LEAST: Final = 0.8
+_MIN_KNOWN: Final = 0.8
 _NOISE_SIGMA_CELLS: Final = 1.0
 _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
 # Parts that lie mostly beside the wall must not win by what little they show.
-_ENERGY_LEAST: Final = 0.25
+_MIN_ENERGY: Final = 0.25
 # Another place begins so far off, as a share of the photo's width, or at such another size (log).
 _ELSEWHERE: Final = (0.25, 0.25)
 # A photo's longer side has so many cells at most where it is compared, finely or roughly: larger
@@ -52,7 +52,7 @@ _ROUGH_CELLS: Final = 160
 # What is pooled so broadly is as well seen in every second cell.
 _SAMPLE_CELLS: Final = 2
 _LEVELS: Final = 3
-PHOTO_SIDE_PX: Final = 2 * _PART_MOST_CELLS
+PHOTO_SIDE_PX: Final = 2 * _MAX_PART_CELLS
 """Longer side to which a photo is shrunk first: no size needs more."""
 
 
@@ -123,7 +123,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
         return None
     factor = max(1, round(min(wall.frame.shape) / _CELLS))
     coarse = _coarser(wall, factor)
-    if min(coarse.frame.shape) < 2 * _PART_LEAST_CELLS or coarse.intensity is None:
+    if min(coarse.frame.shape) < 2 * _MIN_PART_CELLS or coarse.intensity is None:
         return None
     channels = _wall_channels(coarse.intensity, coarse.depth_m)
     levels = [(channels, coarse.frame.gsd_m)]
@@ -159,7 +159,7 @@ def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def _halved_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """One of each 2 x 2 depths, NaN where fewer than most of them are known."""
-    known = _halved(np.isfinite(depth_m)) >= _KNOWN_LEAST
+    known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
     rows, columns = known.shape
     one = depth_m[: 2 * rows : 2, : 2 * columns : 2]
     return np.where(known, one, np.float32(np.nan)).astype(np.float32)
@@ -230,7 +230,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
 
     one = slice(factor // 2, None, factor)
     depth = wall.depth_m[one, one][:height, :width].copy()
-    depth[mean(known) < _KNOWN_LEAST] = np.nan
+    depth[mean(known) < _MIN_KNOWN] = np.nan
     return replace(
         wall,
         frame=replace(wall.frame, gsd_m=wall.frame.gsd_m * factor, width=width, height=height),
@@ -288,9 +288,9 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
     # Each part has half of the photo's sides.
     most = min(
         _SIZES[1] * min(wall) * width / min(height, width),
-        2.0 * (_PART_MOST_CELLS - 1) * width / max(height, width),
+        2.0 * (_MAX_PART_CELLS - 1) * width / max(height, width),
     )
-    least = max(least, 2.0 * _PART_LEAST_CELLS * width / min(height, width))
+    least = max(least, 2.0 * _MIN_PART_CELLS * width / min(height, width))
     count = max(0, math.floor(math.log(max(most / least, 1e-9)) / math.log(_STEP)) + 1)
     return [round(least * _STEP**nth) for nth in range(count)]
 
@@ -369,7 +369,7 @@ def _part_map(
     spectra = _spectrum(part, wall.padded)
     spectrum = np.multiply(spectra, wall.layers, out=spectra).sum(axis=0)
     cross = fft.irfft2(np.conj(spectrum, out=spectrum), wall.padded)
-    norm = np.sqrt(max(own, 1e-9) * np.maximum(under, max(_ENERGY_LEAST * own, 1e-9)))
+    norm = np.sqrt(max(own, 1e-9) * np.maximum(under, max(_MIN_ENERGY * own, 1e-9)))
     return np.asarray(cross / norm, dtype=np.float32)
 
 

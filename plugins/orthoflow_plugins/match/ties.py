@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 # How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
 # and growing with their size.
-_SIGMA_LEAST_PX: Final = 0.35
+_MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
 # At an edge of the relief a key point belongs to neither side.
-_SIGMA_MOST_CELLS: Final = 3.0
+_MAX_SIGMA_CELLS: Final = 3.0
 BY_HAND_ALONE: Final = DiagnosticSpec(
     code="scan-without-texture",
     severity="warning",
@@ -119,7 +119,7 @@ def key_point_ties(
         sigma_m=np.hypot(points.sigma_m, wall_sigma_m),
         role=role,
     )
-    return piece.take(points.known & (piece.sigma_m < _SIGMA_MOST_CELLS * wall.frame.gsd_m))
+    return piece.take(points.known & (piece.sigma_m < _MAX_SIGMA_CELLS * wall.frame.gsd_m))
 
 
 def ties_of(
@@ -254,4 +254,4 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
 
 
 def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)
+    return np.maximum(_MIN_SIGMA_PX, _SIGMA_PER_SIZE * sizes_px)

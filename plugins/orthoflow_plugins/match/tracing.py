@@ -38,19 +38,19 @@ _MEDIAN_TOLERANCE_CELLS: Final = 0.6
 _REJECTION: Final = 3.5
 _HELD_OUT: Final = 4
 _LEAST: Final = 12
-_SIGMA_MOST_CELLS: Final = 2.0
+_MAX_SIGMA_CELLS: Final = 2.0
 # What no refinement gets below: the raster's own interpolation.
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
 # How far a place is searched in the first round; halved in every next, down to the least.
 _FIRST_RADIUS_CELLS: Final = 8
-_RADIUS_LEAST: Final = 2
+_MIN_RADIUS: Final = 2
 # Photos are warped and measured at most so often.
 _MAX_ROUNDS: Final = 4
 # Warping again by a pose that moves the photo less than this on the walls changes nothing.
 _SETTLED_CELLS: Final = 0.3
 # Held-out error has to fall by this share for another round.
-_GAIN_LEAST: Final = 0.03
+_MIN_GAIN: Final = 0.03
 # Compared only where what came before leaves doubts.
 _LAST: Final = "colours"
 _FEW_SHARE: Final = 0.25
@@ -134,7 +134,7 @@ def trace_photo(
         if content == _LAST and found is not None and not _is_doubtful(found[0], desk):
             continue
         # What one content found out about the pose is the next one's start.
-        start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _RADIUS_LEAST)
+        start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, desk, content, lens)
         if found is None or _is_better(tried[0], found[0]):
             found = tried
@@ -209,14 +209,14 @@ def _traced(
             # A round that finds too little does not spoil the one before.
             best = best or found
             break
-        improved = not history or fit.held_out_px < (1.0 - _GAIN_LEAST) * min(history)
+        improved = not history or fit.held_out_px < (1.0 - _MIN_GAIN) * min(history)
         history.append(fit.held_out_px)
         if fit.held_out_px <= min(history):
             best, free = found, fit.free
         if not improved or _moved_cells(found, view, fit.camera) < _SETTLED_CELLS:
             break
         view = view.posed(fit.camera, desk.walls)
-        radius = max(_RADIUS_LEAST, radius // 2)
+        radius = max(_MIN_RADIUS, radius // 2)
     result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
     cleaned = _without_misfits(result.pieces, view.camera, free)
     n_kept = sum(len(piece) for piece in cleaned)
@@ -318,9 +318,7 @@ def _piece(
     )
     gsd_m = wall.frame.gsd_m
     return piece.take(
-        points.known
-        & np.isfinite(pixels).all(axis=1)
-        & (points.sigma_m < _SIGMA_MOST_CELLS * gsd_m)
+        points.known & np.isfinite(pixels).all(axis=1) & (points.sigma_m < _MAX_SIGMA_CELLS * gsd_m)
     )
 
 
@@ -347,7 +345,7 @@ def _refitted(
         # Outliers that are left must not decide whether to go on.
         kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
         tried = _Refitted(camera=fitted, held_out_px=float(np.sqrt(np.mean(kept**2))), free=free)
-        if best is None or tried.held_out_px < (1.0 - _GAIN_LEAST) * best.held_out_px:
+        if best is None or tried.held_out_px < (1.0 - _MIN_GAIN) * best.held_out_px:
             best = tried
     return best
 

@@ -31,7 +31,7 @@ _ROWS_AT_ONCE: Final = 256
 _BESIDE_CELLS: Final = 3
 # Which part of a wall a photo shows is found on every so many cells first.
 _COARSE: Final = 8
-_CELLS_LEAST: Final = 100
+_MIN_CELLS: Final = 100
 # Where OpenCV samples what is not shown; the value is not used.
 _OUTSIDE_PX: Final = -10.0
 
@@ -263,7 +263,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
         return None
     u, v, distance = _project_cells(near, wall, part, 1)
     per_cell = _pixels_per_cell(u, v)
-    if np.isfinite(u).sum() < _CELLS_LEAST or per_cell is None:
+    if np.isfinite(u).sum() < _MIN_CELLS or per_cell is None:
         return None
     return Projection(part=part, u=u, v=v, distance=distance, pixels_per_cell=per_cell)
 

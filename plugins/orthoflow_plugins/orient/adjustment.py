@@ -46,10 +46,10 @@ _CHANCE: Final = 1e-3
 # A camera has one lens. A series that zoomed differs by more than this share of the focal length;
 # what errors of the scan that neighbouring ties have in common do to the focal length of one photo
 # is less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
-_ZOOM_LEAST: Final = 0.02
+_MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
 # Those that contradict most bend the lens, so that others contradict it, too: these leave first.
-_OF_MOST: Final = 0.5
+_SHARE_OF_WORST: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +168,9 @@ def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
         if _zoomed(photos[at].estimate.resection, adjusted.estimates[at].resection)
     }
     most = max(excesses.values(), default=0.0)
-    return frozenset(at for at, excess in excesses.items() if excess > max(1.0, _OF_MOST * most))
+    return frozenset(
+        at for at, excess in excesses.items() if excess > max(1.0, _SHARE_OF_WORST * most)
+    )
 
 
 def _start(
@@ -371,7 +373,7 @@ def _estimate(
 def _zoomed(alone: Resection, shared: Resection) -> bool:
     """Whether a photo's own ties ask for another focal length than the shared one, by far."""
     off = abs(math.log(alone.camera.fx / shared.camera.fx))
-    return off > max(_ZOOM_LEAST, _ZOOM_SIGMAS * focal_sigma(alone))
+    return off > max(_MIN_ZOOM, _ZOOM_SIGMAS * focal_sigma(alone))
 
 
 def _excess(item: Trusted, shared: Estimate, usual_widening: float) -> float:

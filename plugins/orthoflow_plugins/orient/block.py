@@ -31,7 +31,7 @@ from orthoflow_plugins.orient.parameters import Note
 from orthoflow_plugins.orient.pose import PLACES_A_SIDE, places_in_photo
 
 # A known point is never exact: an adjustment divides by its variance.
-SIGMA_LEAST_M: Final = 1e-6
+MIN_SIGMA_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
@@ -471,7 +471,7 @@ def _without_point(block: Block, point: int, parts: list[_Equations]) -> _Rows:
         jacobian[own, np.searchsorted(columns, part.columns)] = part.by_camera
         by_point[own], residuals[own] = part.by_point, part.residuals
     if n_known:
-        least = max(sigma_m, SIGMA_LEAST_M)
+        least = max(sigma_m, MIN_SIGMA_M)
         by_point[-3:] = np.eye(3) / least
         residuals[-3:] = (block.points.known[point] - block.points.now[point]) / least
     across = np.linalg.qr(by_point, mode="complete").Q[:, 3:]

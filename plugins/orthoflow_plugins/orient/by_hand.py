@@ -26,10 +26,10 @@ from orthoflow_plugins.orient.lenses import LensPrior, lens_prior
 from orthoflow_plugins.orient.parameters import Note
 from orthoflow_plugins.orient.pose import Estimate, Start, TiedPhoto, undistorted_pixels
 
-TIES_LEAST: Final = 6
-_WRONG_MOST: Final = 2
+MIN_TIES: Final = 6
+_MAX_WRONG: Final = 2
 # So many ways to leave ties out are tried: two of 24 ties, one of any number.
-_TRIALS_MOST: Final = 300
+_MAX_TRIALS: Final = 300
 # Right ties are called contradictory once in a thousand photos.
 _CONTRADICTION: Final = 1e-3
 # Of the longest length of a residual that is left over: 3.5 standard deviations of a coordinate.
@@ -83,7 +83,7 @@ def pose_by_hand(tied: TiedPhoto) -> PoseByHand | str:
     """Orient a photo by the ties that a person measured, or say why not.
 
     Args:
-        tied: the photo; of its ties at least `TIES_LEAST` are measured by a person.
+        tied: the photo; of its ties at least `MIN_TIES` are measured by a person.
     """
     seen = tied.seen
     prior, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
@@ -126,8 +126,8 @@ def pose_by_hand(tied: TiedPhoto) -> PoseByHand | str:
 
 def _consistent(hand: SeenPoints, prior: LensPrior) -> tuple[NDArray[np.intp], _Fit] | str:
     """Find the ties that fit together: all, or all but one or two that are plainly wrong."""
-    n_most = min(_WRONG_MOST, len(hand) - TIES_LEAST)
-    if math.comb(len(hand), n_most) > _TRIALS_MOST:
+    n_most = min(_MAX_WRONG, len(hand) - MIN_TIES)
+    if math.comb(len(hand), n_most) > _MAX_TRIALS:
         n_most = 1
     for n_wrong in range(n_most + 1):
         fitting: list[tuple[NDArray[np.intp], _Fit]] = []
@@ -153,7 +153,7 @@ def _consistent(hand: SeenPoints, prior: LensPrior) -> tuple[NDArray[np.intp], _
             )
     return (
         f"its {len(hand)} ties measured by hand contradict each other by more than their sigma_px "
-        f"says, and leaving out up to {n_most} of them does not help ({TIES_LEAST} must stay): "
+        f"says, and leaving out up to {n_most} of them does not help ({MIN_TIES} must stay): "
         "measure them again, or add more"
     )
 

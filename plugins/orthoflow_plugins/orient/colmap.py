@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow_plugins.orient.block import SIGMA_LEAST_M, Block, pixel_covariances
+from orthoflow_plugins.orient.block import MIN_SIGMA_M, Block, pixel_covariances
 from orthoflow_plugins.orient.lenses import Lens
 
 _ITERATIONS: Final = 60
@@ -146,7 +146,7 @@ def _add_observations(
     for point, values in joint.items():
         sigma_m = float(block.points.sigma_m[point])
         if math.isfinite(sigma_m):
-            covariance = np.eye(3) * max(sigma_m, SIGMA_LEAST_M) ** 2
+            covariance = np.eye(3) * max(sigma_m, MIN_SIGMA_M) ** 2
             prior = ceres.factors.NormalPrior(block.points.known[point], covariance)
             colmap.problem.add_residual_block(prior, whole, [values])
 

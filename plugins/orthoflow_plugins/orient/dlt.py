@@ -66,9 +66,9 @@ _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 # Relief below this many standard deviations of the points is mostly their noise.
 _RELIEF_SIGMAS: Final = 10.0
 # Flatter control leaves the eleven parameters to the rounding of its coordinates.
-_CONDITION_MOST: Final = 5000.0
+_MAX_CONDITION: Final = 5000.0
 # Ties that deviate so many times more than they should show what the lens model lacks.
-_SIGMA0_MOST: Final = 1.5
+_MAX_SIGMA0: Final = 1.5
 # Points per side of the grid over a photo on which lens models are compared.
 _FRAME: Final = 12
 DLT_MISFIT: Final = DiagnosticSpec(
@@ -230,7 +230,7 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
     size_px = (tied.photo.width, tied.photo.height)
     try:
         linear = direct_linear(control.pixels_photo, control.points_world, size_px)
-        if linear.condition > _CONDITION_MOST:
+        if linear.condition > _MAX_CONDITION:
             return _flat(control, f"the equations have condition {linear.condition:.0f}")
         camera = linear.camera if params.skew else replace(linear.camera, skew=0.0)
         start = Start(
@@ -321,7 +321,7 @@ def _too_flat(control: SeenPoints) -> str:
             f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
             f"{_RELIEF_SIGMAS:g} times as much relief",
         )
-    if depth.rms_m < depth.extent_m / _CONDITION_MOST:
+    if depth.rms_m < depth.extent_m / _MAX_CONDITION:
         return _flat(control, "a DLT needs relief")
     return ""
 
@@ -430,7 +430,7 @@ def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
 
 def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[Note, ...]:
     sigma0 = estimate.resection.sigma0
-    if sigma0 <= _SIGMA0_MOST and factor <= _SIGMA0_MOST**2:
+    if sigma0 <= _MAX_SIGMA0 and factor <= _MAX_SIGMA0**2:
         return ()
     moved_px, wider = math.sqrt(missing_px2), math.sqrt(factor)
     return ((DLT_MISFIT, {"sigma0": sigma0, "moved_px": moved_px, "factor": wider}),)

@@ -29,7 +29,7 @@ _ROLE_RGB: Final = {
     TieRole.CONTROL: (40, 200, 60),
     TieRole.CHECK: (250, 220, 40),
 }
-_FIGURES_MOST: Final = 24
+_MAX_FIGURES: Final = 24
 _SUB_PIXEL_BITS: Final = 4
 # Cells along the longer side of a map of predicted errors, and pixels per cell.
 _MAP_CELLS: Final = 90
@@ -39,13 +39,13 @@ _UNSEEN_BGR: Final = (60, 40, 20)
 _BARS: Final = 40
 _BARS_OF_A_PHOTO: Final = 25
 # Rows of the picture of single photos, and how much of a row its highest bar takes.
-_PHOTOS_MOST: Final = 30
+_MAX_PHOTOS: Final = 30
 _ROW_SHARE: Final = 0.8
 _BAR_COLOUR: Final = "#9db8d2"
 _CURVE_COLOUR: Final = "#b03a2e"
 # Of the plan of photos: length of an arrow, and points of a photo's control.
 _VIEW_M: Final = 0.4
-_CONTROL_MOST: Final = 300
+_MAX_CONTROL: Final = 300
 _PERCENTILE: Final = 99.5
 # Width of a letter of the names of photos, inches.
 _LETTER_IN: Final = 0.065
@@ -82,7 +82,7 @@ def draw_ties(
     """Draw a photo's ties on it: control green, check yellow, rejected red."""
     import cv2
 
-    if len(ctx.figures) >= _FIGURES_MOST:
+    if len(ctx.figures) >= _MAX_FIGURES:
         return
     name = _figure_name(photo.name)
     if any(figure.name == name for figure in ctx.figures):
@@ -117,7 +117,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     for index in sorted(walls):
         wall = walls[index]
-        if len(ctx.figures) >= _FIGURES_MOST:
+        if len(ctx.figures) >= _MAX_FIGURES:
             return
         across, down = np.linalg.norm(wall.corners_world[[3, 1]] - wall.corners_world[0], axis=1)
         cell_m = max(across, down) / _MAP_CELLS
@@ -201,7 +201,7 @@ def _draw_position(
     """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
     camera = candidate.estimate.resection.camera
     control = (candidate.seen.points_world[candidate.control] - origin) @ shown
-    step = max(1, len(control) // _CONTROL_MOST)
+    step = max(1, len(control) // _MAX_CONTROL)
     axes.plot(*control[::step].T, ".", markersize=1.0, color="#30a040")
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
@@ -262,7 +262,7 @@ def _draw_each(
     """Draw a row per photo, a column per role and coordinate, all bars up to its height."""
     from matplotlib.figure import Figure
 
-    shown = photos[:_PHOTOS_MOST]
+    shown = photos[:_MAX_PHOTOS]
     columns = [(kind, axis) for kind in pooled for axis in (0, 1)]
     figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)))
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]

@@ -14,7 +14,7 @@ from orthoflow.geometry.resection import SeenPoints, misfit
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, TieWall, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.by_hand import TIES_LEAST
+from orthoflow_plugins.orient.by_hand import MIN_TIES
 from orthoflow_plugins.orient.parameters import (
     NOT_ORIENTED,
     ORIENTATION_METRICS,
@@ -111,7 +111,7 @@ def _oriented(
     photo: Photo, camera: Camera, ties: Ties, params: OrientGiven.Params, ctx: StepContext
 ) -> Oriented:
     tied = tied_photo(photo, ties, params, ctx.rng)
-    if tied.by_hand.sum() >= TIES_LEAST:
+    if tied.by_hand.sum() >= MIN_TIES:
         return oriented_by_hand(tied, ties, params)[0]
     residuals_px = np.full((len(tied.chosen), 2), np.nan)
     notes: tuple[Note, ...] = ()
@@ -136,7 +136,7 @@ def _disagreement(
         return ()
     longest = float(np.nanmax(np.linalg.norm(residuals_px[off], axis=1), initial=0.0))
     values = {"n": int(off.sum()), "n_ties": len(seen), "longest_px": longest}
-    return ((POSE_DISAGREES, {**values, "n_least": TIES_LEAST}),)
+    return ((POSE_DISAGREES, {**values, "n_least": MIN_TIES}),)
 
 
 def _on_walls(ties: Ties, walls: Walls | None) -> Ties:

@@ -19,15 +19,15 @@ from orthoflow_plugins.orient.lenses import camera_rays
 
 # Larger photos are shrunk: SIFT takes 0.23 GB per million pixels, and thousands of key points at
 # half the resolution tie photos as well as more at full.
-_SIDE_MOST_PX: Final = 1600
+_MAX_SIDE_PX: Final = 1600
 _CONTRAST_THRESHOLD: Final = 0.02
 _SPREAD_CELLS: Final = 16
-_RATIO_MOST: Final = 0.85
-_PARTNERS_MOST: Final = 8
+_MAX_RATIO: Final = 0.85
+_MAX_PARTNERS: Final = 8
 # The poses are known to a few pixels already.
-_OFF_LINE_MOST_PX: Final = 6.0
-_OFF_POINT_MOST_PX: Final = 8.0
-_ANGLE_LEAST: Final = np.radians(2.0)
+_MAX_OFF_LINE_PX: Final = 6.0
+_MAX_OFF_POINT_PX: Final = 8.0
+_MIN_ANGLE: Final = np.radians(2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
 
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
     grey = rgb if rgb.ndim == 2 else cv2.cvtColor(rgb[:, :, :3], cv2.COLOR_RGB2GRAY)
-    scale = max(1.0, max(grey.shape) / _SIDE_MOST_PX)
+    scale = max(1.0, max(grey.shape) / _MAX_SIDE_PX)
     if scale > 1.0:
         size = (round(grey.shape[1] / scale), round(grey.shape[0] / scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
@@ -133,7 +133,7 @@ def overlapping_pairs(
     both = np.minimum(shares, shares.T)
     pairs = set()
     for first in range(len(cameras)):
-        for second in np.argsort(-both[first], kind="stable")[:_PARTNERS_MOST].tolist():
+        for second in np.argsort(-both[first], kind="stable")[:_MAX_PARTNERS].tolist():
             if both[first, second] >= least_share:
                 pairs.add((min(first, second), max(first, second)))
     return sorted(pairs)
@@ -160,13 +160,13 @@ def tie_photos(
     links = [np.empty((0, 2), dtype=np.intp)]
     for first, second in pairs:
         matched = mutual_matches(
-            features[first].descriptors, features[second].descriptors, ratio=_RATIO_MOST
+            features[first].descriptors, features[second].descriptors, ratio=_MAX_RATIO
         )
         off = _off_line_px(
             (cameras[first], rays[first][matched.first]),
             (cameras[second], rays[second][matched.second]),
         )
-        near = matched.take(off <= _OFF_LINE_MOST_PX)
+        near = matched.take(off <= _MAX_OFF_LINE_PX)
         links.append(np.column_stack([near.first + starts[first], near.second + starts[second]]))
     tracks = _tracks(np.vstack(links), starts)
     return _located(cameras, features, rays, tracks[:n_most])
@@ -236,7 +236,7 @@ def _located(
             row, column = np.nonzero(photo_of[some] == at)
             seen = camera.project(found[row])[:, :2]
             off[row, column] = np.linalg.norm(seen - pixels[some[row, column]], axis=1)
-        near = (off <= _OFF_POINT_MOST_PX).all(axis=1)
+        near = (off <= _MAX_OFF_POINT_PX).all(axis=1)
         kept += list(some[near])
         points.append(found[near])
     if not kept:
@@ -257,7 +257,7 @@ def _meeting(
     """Tracks (k, m) whose rays (n, m, 3) meet in front and not too flat, and where (k, 3)."""
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     cosines = np.einsum("nid,njd->nij", unit, unit)
-    wide = cosines.min(axis=(1, 2)) < np.cos(_ANGLE_LEAST)
+    wide = cosines.min(axis=(1, 2)) < np.cos(_MIN_ANGLE)
     tracks, centres, unit = tracks[wide], centres[wide], unit[wide]
     across = np.eye(3) - unit[:, :, :, None] * unit[:, :, None, :]
     pulled = np.einsum("nmij,nmj->ni", across, centres)

@@ -14,7 +14,7 @@ from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import DiagnosticSpec, StepContext
-from orthoflow_plugins.orient.by_hand import TIES_LEAST, PoseByHand, pose_by_hand
+from orthoflow_plugins.orient.by_hand import MIN_TIES, PoseByHand, pose_by_hand
 from orthoflow_plugins.orient.gates import (
     GATES_BEFORE_BLOCK,
     Candidate,
@@ -26,7 +26,7 @@ from orthoflow_plugins.orient.parameters import (
     OrientParams,
 )
 from orthoflow_plugins.orient.pose import (
-    EXIF_OFF_LEAST,
+    MIN_EXIF_OFF,
     Estimate,
     Estimator,
     TiedPhoto,
@@ -283,7 +283,7 @@ def _focal_of_others(
     if len(others) < _MIN_OTHERS or max(others) > _SAME_FOCAL * min(others):
         return None
     focal_px = float(np.median(others))
-    is_far = abs(math.log(focal_px / photo.exif_focal_px)) > EXIF_OFF_LEAST
+    is_far = abs(math.log(focal_px / photo.exif_focal_px)) > MIN_EXIF_OFF
     return focal_px if is_far else None
 
 
@@ -297,7 +297,7 @@ def by_itself(
     """
     alone, kept = None, np.zeros(len(tied.seen), dtype=np.bool_)
     reason = too_few(len(tied.seen))
-    if tied.by_hand.sum() >= TIES_LEAST:
+    if tied.by_hand.sum() >= MIN_TIES:
         alone, pose = oriented_by_hand(tied, ties, params)
         # What a person measured is never withheld, so that the others have to check the pose.
         too_few_others = too_few(int((~tied.by_hand).sum()))

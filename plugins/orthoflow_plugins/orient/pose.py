@@ -27,7 +27,13 @@ from orthoflow.geometry.resection import (
 )
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Intrinsics, Photo, Ties
-from orthoflow_plugins.orient.lenses import UNKNOWN, focal_sigma, intrinsics_of, lens_prior
+from orthoflow_plugins.orient.lenses import (
+    UNKNOWN,
+    camera_rays,
+    focal_sigma,
+    intrinsics_of,
+    lens_prior,
+)
 from orthoflow_plugins.orient.parameters import (
     Note,
     OrientParams,
@@ -54,18 +60,18 @@ _MAX_TRIALS: Final = 20_000
 # A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
-_CHANCE_SHARE_MOST: Final = 0.1
+_MAX_CHANCE_SHARE: Final = 0.1
 _TIGHTENING: Final = 0.8
-_TIGHTENED_MOST: Final = 7
+_MAX_TIGHTENED: Final = 7
 # What is known of a lens beforehand keeps it in bounds; so many ties make the equations solvable.
 _LEAST_FOR_LENS: Final = 8
 # A calibration that is off by more than both is another lens's.
-_FOCAL_OFF_LEAST: Final = 0.03
+_MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
 # A first step far below that saves the rest of the adjustment.
-_FOCAL_STEP_LEAST: Final = 0.5 * _FOCAL_OFF_LEAST
+_MIN_FOCAL_STEP: Final = 0.5 * _MIN_FOCAL_OFF
 _LEAST_FOR_FOCAL: Final = 25
-EXIF_OFF_LEAST: Final = 0.15
+MIN_EXIF_OFF: Final = 0.15
 """EXIF is off by some percent at most where it is right (of ln f).
 
 A focal length farther from it that many more ties agree with shows that it is wrong.
@@ -189,7 +195,7 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
         return None
     off = abs(math.log(found.camera.fx / exif_px))
     sigma = focal_sigma(found)
-    return found.camera.fx if off > max(EXIF_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma) else None
+    return found.camera.fx if off > max(MIN_EXIF_OFF, _FOCAL_OFF_SIGMAS * sigma) else None
 
 
 def no_pose(seen: SeenPoints) -> str:
@@ -289,9 +295,9 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     times the limit has eight times the area within it and tells how many to expect.
     """
     lengths = np.sort(normalised[np.isfinite(normalised)])
-    for tightened in limit * _TIGHTENING ** np.arange(_TIGHTENED_MOST):
+    for tightened in limit * _TIGHTENING ** np.arange(_MAX_TIGHTENED):
         inside, around = np.searchsorted(lengths, [tightened, 3.0 * tightened], side="right")
-        if (around - inside) / 8.0 <= _CHANCE_SHARE_MOST * inside:
+        if (around - inside) / 8.0 <= _MAX_CHANCE_SHARE * inside:
             return float(tightened)
     return float(tightened)
 
@@ -327,15 +333,7 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
     """Pixels (n, 2) as without distortion and skew; NaN where the lens model cannot be undone."""
     if not (lens.distortion.any() or lens.skew):
         return pixels
-    try:
-        rays = lens.rays_camera(pixels)
-    except GeometryError:
-        rays = np.full((len(pixels), 3), np.nan)
-        for index in range(len(pixels)):
-            try:
-                rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
-            except GeometryError:
-                continue
+    rays = camera_rays(lens, pixels)
     return rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
@@ -349,7 +347,7 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
         return ""
     try:
         step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
-        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
+        if abs(step[POSE_PARAMETERS]) < _MIN_FOCAL_STEP:
             return ""
         cells = places_in_photo(control.pixels_photo, camera)
         free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
@@ -357,7 +355,7 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
         return ""
     off = abs(math.log(free.camera.fx / camera.fx))
     sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
-    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
+    if off < max(_MIN_FOCAL_OFF, _FOCAL_OFF_SIGMAS * sigma):
         return ""
     return (
         f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "

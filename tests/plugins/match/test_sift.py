@@ -155,8 +155,8 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
         second_log_size=sizes[1],
         first_angle_deg=angles[0],
         second_angle_deg=angles[1],
-        log_size_most=0.7,
-        angle_most_deg=90.0,
+        max_log_size=0.7,
+        max_angle_deg=90.0,
     )
     found = mutual_matches_within(first, second, window, ratio=0.95)
     distance = cdist(first.astype(np.float64), second.astype(np.float64))

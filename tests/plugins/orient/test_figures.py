@@ -128,7 +128,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
     # No more pictures than enough.
     drawings.clear()
-    monkeypatch.setattr(figures, "_FIGURES_MOST", 0)
+    monkeypatch.setattr(figures, "_MAX_FIGURES", 0)
     draw_wall_errors(context, candidates)
     assert not drawings
 
