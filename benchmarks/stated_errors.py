@@ -249,7 +249,9 @@ def read_camera(written: dict[str, Any]) -> ViewingCamera:
 def reference_camera(folder: Path, name: str, lens: list[float]) -> ViewingCamera:
     """A camera as the benchmark of Strecha et al. has it; `lens` is K row by row."""
     lines = (folder / "images" / f"{name}.jpg.camera").read_text().splitlines()
-    rotation = np.array([[float(word) for word in line.split()] for line in lines[4:7]]).T
+    # Written with few digits: the nearest rotation.
+    left, _, right = np.linalg.svd([[float(word) for word in row.split()] for row in lines[4:7]])
+    rotation = (left @ right).T
     centre = np.array([float(word) for word in lines[7].split()])
     return ViewingCamera(
         width=3072,
