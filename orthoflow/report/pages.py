@@ -31,6 +31,7 @@ from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.records.deliverables import DeliveredWall, delivered_walls
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.runs import FIGURES_FOLDER, Run, figure_files
+from orthoflow.records.tables import CommonPoints, common_points
 from orthoflow.records.verification import sealed_page
 from orthoflow.records.wall_results import UncountedPoints, uncounted_points
 from orthoflow.report.combinations import baseline_cells, is_missing
@@ -134,6 +135,7 @@ class _Section:
     results: Mapping[str, tuple[str, ...]]
     comparison: ComparisonTable | None
     curves: tuple[Curve, ...]
+    common_points: tuple[CommonPoints, ...]
     main: _Part
     earlier: frozenset[str]
     ways: tuple[tuple[Way, _Part], ...]
@@ -436,6 +438,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         results=results(run),
         comparison=comparison,
         curves=curves(run) if comparison else (),
+        common_points=common_points(run) if comparison else (),
         main=every.of(main),
         earlier=improved_on(run, main),
         ways=tuple((way, every.of(way.cells)) for way in shown_ways) if comparison else (),

@@ -53,6 +53,17 @@ def run(*cells: object, **more: object) -> Run:
     return Run(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
 
 
+def test_a_comparison_shows_its_inspections_over_common_points(run: Run, tmp_path: Path) -> None:
+    write_report([run], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (table,) = re.findall(r'aria-label="over common check points".*?</table>', page, re.DOTALL)
+    cells = re.findall(r'<th scope="row">(.*?)</th>', table)
+    assert {re.sub("<wbr>", "", name) for name in cells} == {
+        "check@plane=fine",
+        "check@plane=coarse",
+    }
+
+
 def test_the_page_needs_no_network_and_escapes_what_methods_say(
     compared: Run, tmp_path: Path
 ) -> None:

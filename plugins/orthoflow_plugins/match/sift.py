@@ -50,8 +50,10 @@ BY_EDGES: Final = DiagnosticSpec(
 MIRRORED: Final = DiagnosticSpec(
     code="photo-mirrored",
     severity="warning",
-    text="photo {subject}: the walls show it mirrored, so it gets no ties",
-    remedy="turn it back",
+    text="photo {subject}: its mirror image agrees with the walls and it does not, so it gets no "
+    "ties",
+    remedy="turn it back if it is mirrored; else the sides of the planes may be wrong (view_from "
+    "of read.scan)",
 )
 AMBIGUOUS: Final = DiagnosticSpec(
     code="photo-ambiguous",
