@@ -53,8 +53,10 @@ def run(*cells: object, **more: object) -> Run:
     return Run(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
 
 
-def test_a_comparison_shows_its_inspections_over_common_points(run: Run, tmp_path: Path) -> None:
-    write_report([run], tmp_path / "report.html")
+def test_a_comparison_shows_its_inspections_over_common_points(
+    compared: HeldRun, tmp_path: Path
+) -> None:
+    write_report([compared], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     (table,) = re.findall(r'aria-label="over common check points".*?</table>', page, re.DOTALL)
     cells = re.findall(r'<th scope="row">(.*?)</th>', table)
