@@ -44,16 +44,6 @@ _PLAN_CELL_M: Final = 0.5
 # Candidates in a row that turned out to be none, after which the search gives up.
 _REJECTED_MOST: Final = 30
 
-# Furniture and clutter of rooms take 5 to 9 % of the points.
-_UNEXPLAINED_SHARE: Final = 0.3
-UNEXPLAINED: Final = DiagnosticSpec(
-    code="points-on-no-plane",
-    severity="warning",
-    text="{share:.0%} of the points lie on none of the {n_planes} planes, so no wall shows them",
-    remedy="if walls are missing, try {step}.{setting}",
-    rank_by="share",
-)
-
 _NO_PLANE: Final = (
     "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
     "{share:.2%}: {why}; {advice}{small} ({method})"
@@ -284,13 +274,6 @@ def _products(
             tolerance_m=2.0 * search.tolerance_m,
         )
     _report_fit(ctx, assembly, n_points=len(cloud))
-    params = search.params
-    share = 1.0 - float(assembly.deviations.n_points.sum()) / len(cloud)
-    if share > _UNEXPLAINED_SHARE and params.constraint == "any":
-        is_full = len(found) >= params.n_planes_max
-        more = f"n_planes_max={2 * params.n_planes_max}"
-        setting = more if is_full else f"min_share={params.min_share / 5.0:g}"
-        ctx.report(UNEXPLAINED, share=share, n_planes=len(found), setting=setting)
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, assembly)
     # The last of the labels is for points on no plane: a claim of -1 picks it.
