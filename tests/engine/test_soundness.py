@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -13,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.engine.cleaning import Aside, Damage, Soundness, check_store
-from orthoflow.engine.objects import PRODUCT
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.store import Store
 from orthoflow.products.product import Product
@@ -54,35 +52,6 @@ def test_what_is_sound_is_counted_and_left(store: Store) -> None:
     )
     assert store.result(key) is not None
     assert store.is_sound(ref.digest)
-
-
-def test_what_is_damaged_is_named_and_set_aside_with_the_results_that_need_it(
-    store: Store,
-) -> None:
-    key, ref = kept(store, "one", 1.0)
-    other, _ = kept(store, "other", 2.0)
-    name = ref.digest.removeprefix("sha256:")
-    path = store.objects / name / PRODUCT
-    content, times = bytearray(path.read_bytes()), path.stat()
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    # Nobody would see it who goes by size and time.
-    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
-    found = check_store(store)
-    assert (found.n_results, found.n_objects) == (1, 1)
-    first, second = found.damaged
-    assert (first.name, second.name) == (f"objects/{name}", f"results/{key}.json")
-    assert first.what
-    assert second.what
-    assert found.aside.count == 2
-    assert found.aside.size_bytes >= len(content)
-    assert not (store.objects / name).exists()
-    assert store.result(other) is not None
-    assert store.result(key) is None
-    # Once is enough.
-    again = check_store(store)
-    assert (again.n_results, again.n_objects, again.damaged) == (1, 1, ())
-    assert again.aside == found.aside
 
 
 def test_a_result_whose_product_is_gone_is_the_damage(store: Store) -> None:

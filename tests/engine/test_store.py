@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.durability import with_digest
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.objects import files_of
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,
@@ -127,6 +126,10 @@ def publish_pipe(product: Product, folder: Path, digest: str, /) -> None:
     os.mkfifo(folder / "pipe")
 
 
+def publish_reserved(product: Product, folder: Path, digest: str, /) -> None:
+    (folder / "con").write_text(digest)
+
+
 def publish_control(product: Product, folder: Path, digest: str, /) -> None:
     (folder / "a\x1b[2J.txt").write_text(digest)
 
@@ -136,6 +139,7 @@ def publish_control(product: Product, folder: Path, digest: str, /) -> None:
     [
         (publish_link, "a heights publishes 'link.txt', which is a link or a device"),
         (publish_pipe, "a heights publishes 'pipe', which is a link or a device"),
+        (publish_reserved, "publishes 'con', which "),
         (publish_control, r"publishes 'a\\x1b\[2J.txt', which holds a control character"),
     ],
 )
@@ -248,33 +252,6 @@ def test_a_result_says_what_is_wrong_with_it() -> None:
         wrong = with_digest(json.dumps({"format": "orthoflow/result/1", field: value}))
         with pytest.raises(StoreError, match=rf"^x\.json is damaged: {field}: Input should be "):
             result_from_json(wrong, "x.json")
-
-
-def test_a_link_in_the_place_of_an_object_is_none(store: Store) -> None:
-    ref = store.put_product(heights())
-    folder = object_folder(store, ref)
-    assert "product.h5" in files_of(folder)
-    link = folder.with_name("0" * 64)
-    link.symlink_to(folder)
-    assert files_of(link) == {}
-
-
-def test_only_what_is_there_and_damaged_is_set_aside(store: Store) -> None:
-    ref = store.put_product(heights())
-    folder = object_folder(store, ref)
-    # Another run may have put a sound one there meanwhile.
-    assert store._set_aside(folder, lambda: False) is False
-    assert store._set_aside(folder.with_name("0" * 64), lambda: True) is False
-    assert not store.damaged.exists()
-    # Who asks a store that is not there makes none.
-    nowhere = Store(store.folder.with_name("nowhere"))
-    assert nowhere._set_aside(object_folder(nowhere, ref), lambda: True) is False
-    assert not nowhere.folder.exists()
-    assert store._set_aside(folder, lambda: True) is True
-    assert not folder.exists()
-    (aside,) = store.damaged.iterdir()
-    assert aside.name.startswith(f"{folder.name}-")
-    assert (aside / "product.h5").exists()
 
 
 def test_a_disk_that_cannot_be_read_is_no_damage(
@@ -480,31 +457,10 @@ def settled_file(path: Path, content: bytes) -> Path:
     return path
 
 
-def test_file_digests_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
-    memo = tmp_path / "digests.json"
-    digests = FileDigests(memo)
-    first = digests.digest(file)
-    digests.save()
-    monkeypatch.setattr(
-        "orthoflow.engine.file_digests.file_sha256", lambda path: pytest.fail("read")
-    )
-    assert FileDigests(memo).digest_all([file, file]) == (first, first)
-    assert (first.name, first.size_bytes) == ("scan.xyz", 6)
-
-
 def test_a_changed_file_has_another_digest(tmp_path: Path) -> None:
     digests = FileDigests(tmp_path / "digests.json")
     first = digests.digest(settled_file(tmp_path / "scan.xyz", b"1 2 3\n"))
     assert digests.digest(settled_file(tmp_path / "scan.xyz", b"1 2 4\n")).sha256 != first.sha256
-
-
-def test_a_file_changed_just_now_is_not_remembered(tmp_path: Path) -> None:
-    (tmp_path / "scan.xyz").write_bytes(b"1 2 3\n")
-    digests = FileDigests(tmp_path / "digests.json")
-    digests.digest(tmp_path / "scan.xyz")
-    digests.save()
-    assert not (tmp_path / "digests.json").exists()
 
 
 def test_where_a_file_lay_is_remembered_until_it_lies_elsewhere(tmp_path: Path) -> None:
