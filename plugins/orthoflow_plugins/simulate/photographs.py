@@ -27,7 +27,7 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.building import SceneDraft, Side
-from orthoflow_plugins.simulate.room_model import main_wall_axes, wall_sides
+from orthoflow_plugins.simulate.room_model import DESIGNED, Geometry, main_wall_axes
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
@@ -76,11 +76,13 @@ class ShotPlan:
         layout: which walls, and how many photos.
         gsd_m: side of a pixel on the wall.
         obliquity_deg: largest intended angle between optical axis and wall normal.
+        geometry: where the walls stand.
     """
 
     layout: PhotoLayout
     gsd_m: float
     obliquity_deg: float
+    geometry: Geometry = DESIGNED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +155,7 @@ def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
     if plan.layout == "none":
         return ()
     layout = _LAYOUTS[plan.layout]
-    sides = wall_sides(SceneDraft())
+    sides = plan.geometry.sides(SceneDraft())
     lens = _lens(layout, plan.gsd_m, rng)
     return tuple(
         _shot(f"photo_{place:02d}.jpg", layout, target, sides, lens, plan.obliquity_deg, rng)
@@ -175,7 +177,7 @@ def with_passers_by(
     drawn = rng.spawn(1)[0]
     clothes = drawn.uniform(15.0, 240.0, (count, 2, 3))
     along, towards = main_wall_axes()
-    side = wall_sides(SceneDraft())[0]
+    side = DESIGNED.sides(SceneDraft())[0]
     scenes = []
     for _ in range(n_photos):
         rows: dict[str, list[object]] = {name: [] for name in _OF_PEOPLE}

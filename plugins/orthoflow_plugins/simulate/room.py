@@ -24,8 +24,10 @@ from orthoflow_plugins.simulate.photographs import (
     with_passers_by,
 )
 from orthoflow_plugins.simulate.room_model import (
+    DESIGNED,
     MOST_TEXTILE,
     TEXTILE_BY_DESIGN,
+    Geometry,
     Room,
     RoomPlan,
     build_room,
@@ -147,7 +149,7 @@ class SimulateRoom(Method):
         decoration: Literal["designed", "drawn"] = Field(
             "designed",
             description="drawn: cornices, pilasters, niches, panels and doors set back differ from "
-            "seed to seed, relief up to 0.3 m, recesses up to 0.45 m; no cloth hangs there.",
+            "seed to seed, relief up to 0.3 m, recesses up to 0.45 m.",
         )
         design_seed: int | None = Field(
             default=None,
@@ -170,11 +172,12 @@ class SimulateRoom(Method):
             description="Share of the inverted contrast in what the laser sees; by default 1 for "
             "`inverted`, else 0. Gains, signs and powers are drawn per material.",
         )
-        textile_share: float = Field(
-            TEXTILE_BY_DESIGN,
+        textile_share: float | None = Field(
+            None,
             ge=0.0,
             le=MOST_TEXTILE,
-            description="Share of the main wall covered by cloth with one repeated motif.",
+            description="Share of the main wall covered by cloth with one repeated motif; by "
+            "default 0.095 of the designed wall and none of a drawn one.",
         )
         photo_layout: PhotoLayout = Field(
             "none",
@@ -220,11 +223,13 @@ class SimulateRoom(Method):
             "on vertical edges.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
-        turn_deg: float | Literal["drawn"] = Field(
-            0.0,
-            description="Turns the room about up, degrees; drawn: by an angle of the seed, so that "
-            "no wall lies on the steps of a search.",
+        geometry: Literal["designed", "drawn"] = Field(
+            "designed",
+            description="drawn: directions, leans and distances of all planes, where the stations "
+            "stand and how the room is turned differ from seed to seed, so that nothing lies on "
+            "the steps of a search.",
         )
+        turn_deg: float = Field(0.0, description="Turns the room about up, degrees.")
         shift_world_m: tuple[float, float, float] = Field(
             (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
         )
@@ -266,25 +271,35 @@ class SimulateRoom(Method):
             report_room,
             truth_of,
         )
+        from orthoflow_plugins.simulate.scanning import station_positions
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
         if params.design_seed is not None:
             wall_rng = np.random.default_rng(params.design_seed)
+        textile_share = params.textile_share
+        if textile_share is None:
+            textile_share = 0.0 if params.decoration == "drawn" else TEXTILE_BY_DESIGN
+        # Of a stream of their own: noise and photos are those of the room as designed.
+        place_rng = ctx.rng.spawn(1)[0] if params.geometry == "drawn" else None
+        geometry = DESIGNED if place_rng is None else Geometry.drawn(place_rng)
         room = build_room(
             RoomPlan(
                 relief=params.relief_scale,
                 obstacle=params.obstacle,
                 spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
-                textile_share=params.textile_share,
+                textile_share=textile_share,
+                geometry=geometry,
             ),
             wall_rng if params.decoration == "drawn" else None,
         )
         turn_deg = params.turn_deg
-        if turn_deg == "drawn":
-            turn_deg = float(ctx.rng.spawn(1)[0].uniform(0.0, 360.0))
+        if place_rng is not None:
+            turn_deg += float(place_rng.uniform(0.0, 360.0))
         delivery = Delivery(
             room=room,
-            scan=_scan(room, params, scan_rng, ctx),
+            scan=_scan(
+                room, params, station_positions(params.n_stations, place_rng), scan_rng, ctx
+            ),
             world_from_room=basis_from_up(up_vector(params.up)).T @ _turn_about_up(turn_deg),
             shift_world_m=np.array(params.shift_world_m),
         )
@@ -293,6 +308,7 @@ class SimulateRoom(Method):
                 layout=params.photo_layout,
                 gsd_m=params.photo_gsd_m,
                 obliquity_deg=params.photo_obliquity_deg,
+                geometry=geometry,
             ),
             photo_rng,
         )
@@ -314,9 +330,11 @@ class SimulateRoom(Method):
             "photo_exposure_share": 0.0,
             "n_passers_by": 0,
             "turn_deg": 0.0,
+            "geometry": "designed",
         }
         left_out = {name for name, before in added.items() if getattr(params, name) == before}
         settings = params.model_dump(mode="json", exclude=left_out)
+        settings["textile_share"] = textile_share
         truth = truth_of(delivery, cloud, shots, settings)
         report_room(truth, cloud, ctx)
         report_photos(photos, shots, ctx)
@@ -338,12 +356,16 @@ def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
 
 
 def _scan(
-    room: Room, params: SimulateRoom.Params, rng: np.random.Generator, ctx: StepContext
+    room: Room,
+    params: SimulateRoom.Params,
+    stations: NDArray[np.float64],
+    rng: np.random.Generator,
+    ctx: StepContext,
 ) -> Scan:
     from orthoflow_plugins.simulate.scanning import SweepPlan, planned_sweeps, scan_scene
 
     plan = SweepPlan(
-        n_stations=params.n_stations,
+        stations=stations,
         scan_step_m=params.scan_step_m,
         panorama_step_m=params.panorama_step_m or _PANORAMA_FACTOR * params.scan_step_m,
     )

@@ -2,7 +2,7 @@
 
 Room frame: metres, z up, origin in the middle of the room 1.5 m above the floor. The main wall is
 that of markiewicz2015: omega 102 deg, leaning by 0.8 deg. Other rooms have walls drawn from a
-family: cornices, pilasters, niches, panels, and recessed doors.
+family: cornices, pilasters, niches, panels, and recessed doors; where all planes lie may be drawn.
 """
 
 from __future__ import annotations
@@ -29,8 +29,16 @@ from orthoflow_plugins.simulate.building import (
 
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
-_MAIN_WALL_M: Final = 2.4
 _MAIN_OMEGA_DEG: Final = 102.0
+# Ranges of where the planes of a drawn geometry lie, degrees and metres: hidden parts of surfaces
+# reach beyond the corners of every such room.
+_DRAWN_OMEGA_DEG: Final = 0.5
+_DRAWN_PHI_DEG: Final = 1.0
+_DRAWN_DISTANCE_M: Final = 0.08
+_DRAWN_SLOPE: Final = 0.008
+# The floor only rises, so that furniture stands on it.
+_DRAWN_FLOOR_M: Final = (0.03, 0.07)
+_DRAWN_CEILING_M: Final = (-0.05, 0.05)
 # Visible area of the main wall, and the share of textile on it: at most, and by design.
 _MAIN_WALL_M2: Final = 16.7
 MOST_TEXTILE: Final = 0.35
@@ -61,6 +69,9 @@ _BLUE = Paint(
     kind=TextureKind.FRESCO, rgb=(150, 170, 178), reflectance=0.5, period_m=0.34, seed=301
 )
 _RED = Paint(kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.5, period_m=0.34, seed=401)
+_DAMASK = Paint(
+    kind=TextureKind.TEXTILE, rgb=(150, 62, 58), reflectance=0.4, period_m=0.15, seed=102
+)
 # Drawn walls: name, ground, and from corner to corner.
 _DRAWN: Final = (
     ("main wall", _OCHRE, (-2.7, 2.7)),
@@ -76,6 +87,60 @@ _BESIDE_M: Final = 0.12
 
 
 @dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """Where the planes of a room lie, in its frame.
+
+    Attributes:
+        walls: omega and phi in degrees and distance in metres of the main wall, the one opposite,
+            the right and the left one.
+        floor: normal and height of the floor; ceiling likewise.
+        ceiling: see floor.
+    """
+
+    walls: tuple[tuple[float, float, float], ...] = (
+        (_MAIN_OMEGA_DEG, 0.8, 2.4),
+        (282.4, -0.2, 2.0),
+        (12.2, 0.3, 2.7),
+        (191.7, -0.3, 2.7),
+    )
+    floor: tuple[tuple[float, float, float], float] = ((0.0017, 0.0, 1.0), FLOOR_M)
+    ceiling: tuple[tuple[float, float, float], float] = ((0.003, 0.002, -1.0), CEILING_M)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Geometry:
+        """Draw a room about as large as the designed one, with planes in other places."""
+
+        def about(value: float, width: float) -> float:
+            return value + float(rng.uniform(-width, width))
+
+        def level(up: float) -> tuple[float, float, float]:
+            return about(0.0, _DRAWN_SLOPE), about(0.0, _DRAWN_SLOPE), up
+
+        return cls(
+            walls=tuple(
+                (
+                    about(omega_deg, _DRAWN_OMEGA_DEG),
+                    about(0.0, _DRAWN_PHI_DEG),
+                    about(distance_m, _DRAWN_DISTANCE_M),
+                )
+                for omega_deg, _, distance_m in DESIGNED.walls
+            ),
+            floor=(level(1.0), FLOOR_M + float(rng.uniform(*_DRAWN_FLOOR_M))),
+            ceiling=(level(-1.0), CEILING_M + float(rng.uniform(*_DRAWN_CEILING_M))),
+        )
+
+    def sides(self, draft: SceneDraft) -> list[Side]:
+        """Begin the main wall, the one opposite, the right and the left one."""
+        return [
+            wall_side(draft, omega_deg=omega_deg, phi_deg=phi_deg, distance_m=distance_m)
+            for omega_deg, phi_deg, distance_m in self.walls
+        ]
+
+
+DESIGNED: Final = Geometry()
+
+
+@dataclass(frozen=True, kw_only=True)
 class RoomPlan:
     """The properties of the room.
 
@@ -84,12 +149,14 @@ class RoomPlan:
         obstacle: an object stands free in front of the main wall.
         spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
         textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
+        geometry: where its planes lie.
     """
 
     relief: float
     obstacle: bool
     spectral_gap: float
     textile_share: float = TEXTILE_BY_DESIGN
+    geometry: Geometry = DESIGNED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +180,7 @@ def build_room(plan: RoomPlan, rng: np.random.Generator | None = None) -> Room:
         rng: draws the four walls from a family; without it they are as designed.
     """
     draft = SceneDraft()
-    sides = wall_sides(draft)
+    sides = plan.geometry.sides(draft)
     if rng is None:
         main, opposite, right, left = sides
         _build_main_wall(main, plan)
@@ -122,28 +189,21 @@ def build_room(plan: RoomPlan, rng: np.random.Generator | None = None) -> Room:
         _build_left_wall(left, plan)
     else:
         _draw_walls(sides, plan, rng)
-    _build_floor_and_ceiling(draft)
+    _build_floor_and_ceiling(draft, plan.geometry)
     _furnish(draft, plan)
     return Room(scene=draft.finished(spectral_gap=plan.spectral_gap), planes=_clipped(draft.planes))
 
 
-def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
-    """Begin the main wall, the one opposite, the right and the left one."""
-    return (
-        wall_side(draft, omega_deg=_MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=_MAIN_WALL_M),
-        wall_side(draft, omega_deg=282.4, phi_deg=-0.2, distance_m=2.0),
-        wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7),
-        wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7),
-    )
-
-
-def _draw_walls(sides: tuple[Side, ...], plan: RoomPlan, rng: np.random.Generator) -> None:
+def _draw_walls(sides: list[Side], plan: RoomPlan, rng: np.random.Generator) -> None:
+    # Of a stream of their own: walls with and without a cloth are otherwise the same.
+    cloth = _drawn_cloth(plan.textile_share, rng.spawn(1)[0])
     for side, (name, ground, (a0, a1)) in zip(sides, _DRAWN, strict=True):
         drawing = WallDrawing(
             full=_FULL,
             shown=(a0, a1, FLOOR_M, CEILING_M),
             relief=plan.relief,
             paints=WallPaints(ground=ground, relief=_STUCCO, panel=_GILT, door=_OAK),
+            cloth=cloth if side is sides[0] else None,
         )
         draw_wall(side, name, drawing, rng)
 
@@ -160,9 +220,6 @@ def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
     fresco = Paint(
         kind=TextureKind.FRESCO, rgb=(206, 180, 138), reflectance=0.5, period_m=0.32, seed=101
     )
-    damask = Paint(
-        kind=TextureKind.TEXTILE, rgb=(150, 62, 58), reflectance=0.4, period_m=0.15, seed=102
-    )
     niche: Extent = (-1.95, -1.15, -1.1, 0.75)
     door: Extent = (1.22, 2.12, FLOOR_M - 0.1, 0.65)
     cloths = _cloths(plan.textile_share)
@@ -176,7 +233,7 @@ def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
     ]
     wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
     for cloth in cloths:
-        wall.place(cloth, 0.0, damask, SurfaceRole.WALL, plane=full)
+        wall.place(cloth, 0.0, _DAMASK, SurfaceRole.WALL, plane=full)
     wall.bars((-0.53, 0.73, -0.53, 1.08), 0.08, 0.03 * plan.relief, _GILT)
     wall.bars((-0.53, 0.73, -1.2, -0.7), 0.06, 0.025 * plan.relief, _STUCCO)
     wall.bars((1.10, 2.24, FLOOR_M - 0.1, 0.77), 0.12, 0.04 * plan.relief, _STUCCO)
@@ -290,7 +347,7 @@ def _build_left_wall(wall: Side, plan: RoomPlan) -> None:
     _add_cornice(wall, plan)
 
 
-def _build_floor_and_ceiling(draft: SceneDraft) -> None:
+def _build_floor_and_ceiling(draft: SceneDraft, geometry: Geometry) -> None:
     tiles = Paint(
         kind=TextureKind.TILES, rgb=(150, 138, 122), reflectance=0.35, period_m=0.35, seed=501
     )
@@ -298,10 +355,11 @@ def _build_floor_and_ceiling(draft: SceneDraft) -> None:
         kind=TextureKind.FRESCO, rgb=(206, 206, 210), reflectance=0.8, period_m=0.5, seed=502
     )
     wide: Extent = (-3.4, 3.4, -3.2, 3.2)
-    for name, side, paint in (
-        ("floor", flat_side(draft, normal=(0.0017, 0.0, 1.0), height_m=FLOOR_M), tiles),
-        ("ceiling", flat_side(draft, normal=(0.003, 0.002, -1.0), height_m=CEILING_M), painted),
+    for name, (normal, height_m), paint in (
+        ("floor", geometry.floor, tiles),
+        ("ceiling", geometry.ceiling, painted),
     ):
+        side = flat_side(draft, normal=normal, height_m=height_m)
         plane = side.true_plane(name, wide)
         side.place(wide, 0.0, paint, SurfaceRole.WALL, plane=plane)
 
@@ -413,12 +471,14 @@ class WallDrawing:
         shown: extent between the adjoining walls, the floor and the ceiling.
         relief: scale of all relief.
         paints: its textures.
+        cloth: extent of a cloth with a repeated motif; openings in the wall open it too.
     """
 
     full: Extent
     shown: Extent
     relief: float
     paints: WallPaints
+    cloth: Extent | None = None
 
 
 def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Generator) -> None:
@@ -440,7 +500,22 @@ def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Genera
         for bay in bays
         for hole in _draw_bay(wall, f"{name} {len(wall.draft.planes)}", (bay, drawing), rng)
     ]
+    cloths = [] if drawing.cloth is None else [drawing.cloth]
+    for cloth in cloths:
+        wall.place(cloth, 0.0, _DAMASK, SurfaceRole.WALL, plane=plane, holes=holes)
+    holes = [*holes, *cloths]
     wall.place(drawing.full, 0.0, drawing.paints.ground, SurfaceRole.WALL, plane=plane, holes=holes)
+
+
+def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
+    """Hang one cloth over a share of the main wall, anywhere on it; None hangs none."""
+    if share <= 0.0:
+        return None
+    _, _, (a0, a1) = _DRAWN[0]
+    width_m = math.sqrt(share * _MAIN_WALL_M2 * rng.uniform(1.2, 2.0))
+    height_m = share * _MAIN_WALL_M2 / width_m
+    left_m, low_m = rng.uniform(a0, a1 - width_m), rng.uniform(FLOOR_M, CEILING_M - height_m)
+    return (left_m, left_m + width_m, low_m, low_m + height_m)
 
 
 def _draw_cornice(wall: Side, drawing: WallDrawing, rng: np.random.Generator) -> float:

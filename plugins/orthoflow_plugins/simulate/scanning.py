@@ -43,6 +43,8 @@ _PLACES_M: Final = (
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
+# Largest distance of a drawn station from there, along the same axes.
+_PLACES_DRAWN_M: Final = (0.3, 0.3, 0.15)
 # Ranges of the values drawn per material: reflectance of black, decrease with red, increase with
 # green.
 _BLACK: Final = (0.75, 0.9)
@@ -161,21 +163,25 @@ class SweepPlan:
     """How finely to scan.
 
     Attributes:
-        n_stations: number of stations.
+        stations: (s, 3) in the room frame, metres.
         scan_step_m: spacing of the detail scan of the main wall at the foot of the perpendicular.
         panorama_step_m: likewise of the panorama.
     """
 
-    n_stations: int
+    stations: NDArray[np.float64]
     scan_step_m: float
     panorama_step_m: float
 
 
-def station_positions(n_stations: int) -> NDArray[np.float64]:
-    """Stations (s, 3) in the room frame, metres."""
-    along, towards = main_wall_axes()
-    up = np.array([0.0, 0.0, 1.0])
-    return np.array([a * along + t * towards + h * up for a, t, h in _PLACES_M[:n_stations]])
+def station_positions(
+    n_stations: int, rng: np.random.Generator | None = None
+) -> NDArray[np.float64]:
+    """Return stations (s, 3) in the room frame, metres; a generator moves each a little."""
+    places = np.array(_PLACES_M[:n_stations])
+    if rng is not None:
+        places += rng.uniform(-1.0, 1.0, places.shape) * _PLACES_DRAWN_M
+    axes = np.vstack([main_wall_axes(), [0.0, 0.0, 1.0]])
+    return np.asarray(places @ axes)
 
 
 def planned_sweeps(
@@ -193,7 +199,7 @@ def planned_sweeps(
         seeds: two per station.
     """
     sweeps = []
-    for index, station in enumerate(station_positions(plan.n_stations)):
+    for index, station in enumerate(plan.stations):
         distance_m = float(main_wall.distances_m(station[None])[0])
         panorama = _panorama(station, plan.panorama_step_m / distance_m, int(seeds[2 * index]))
         detail = _detail(station, outline, plan.scan_step_m / distance_m, int(seeds[2 * index + 1]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from orthoflow_plugins.simulate import deliverables
 from orthoflow_plugins.simulate.building import SceneDraft
-from orthoflow_plugins.simulate.room_model import RoomPlan, build_room, wall_sides
+from orthoflow_plugins.simulate.room_model import DESIGNED, RoomPlan, build_room
 from orthoflow_plugins.simulate.scanning import station_positions
 
 from orthoflow.geometry.scene_views import SceneCameras
@@ -126,7 +126,7 @@ def test_points_of_the_room_lie_on_its_main_wall_and_on_corners_of_its_mouldings
     assert found.names == tuple(f"{kind}{k:02d}" for kind in "FV" for k in range(8))
     assert (found.wall == -1).all()
     assert np.isnan(found.pixels_wall).all()
-    main = wall_sides(SceneDraft())[0]
+    main = DESIGNED.sides(SceneDraft())[0]
     off = (found.points_world - main.foot) @ main.normal
     np.testing.assert_allclose(off[:8], 0.0, atol=1e-9)
     # Mouldings stand out by two to fifteen centimetres.

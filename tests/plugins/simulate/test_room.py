@@ -10,7 +10,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import UpDirection, wall_axes
-from orthoflow.geometry.scenes import SurfaceRole
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
@@ -94,13 +94,44 @@ def test_a_turned_room_is_where_its_truth_says(tmp_path: Path, up: UpDirection) 
     walls = np.abs(plain.truth.planes.normal @ plain.cloud.up) < 0.5
     cosines = np.sum(plain.truth.planes.normal * turned.truth.planes.normal, axis=1)[walls]
     np.testing.assert_allclose(cosines, np.cos(np.radians(33.3)), atol=1e-3)
-    # Each seed has an angle of its own.
+
+
+def test_a_drawn_geometry_moves_planes_and_stations_and_keeps_the_truth(tmp_path: Path) -> None:
+    designed = simulate(tmp_path / "designed", **CLEAN)
     drawn = [
-        simulate(tmp_path / str(seed), seed=seed, **CLEAN, turn_deg="drawn") for seed in (1, 2)
+        simulate(tmp_path / str(seed), seed=seed, **CLEAN, geometry="drawn") for seed in (1, 2)
     ]
-    place = int(np.argmax(walls))
-    first, second = (out.truth.planes.normal[place] for out in drawn)
-    assert abs(float(first @ second)) < np.cos(np.radians(1.0))
+    for out in drawn:
+        assert set(out.truth.planes.names) == set(designed.truth.planes.names)
+        for plane in range(len(out.truth.planes)):
+            np.testing.assert_allclose(distances_m(out.cloud, out.truth, plane), 0.0, atol=2e-6)
+    for name in ("main wall", "left wall", "niche", "floor", "ceiling"):
+        rooms = [designed, *drawn]
+        places = [out.truth.planes.names.index(name) for out in rooms]
+        normals = [out.truth.planes.normal[at] for out, at in zip(rooms, places, strict=True)]
+        offsets = [out.truth.planes.offset[at] for out, at in zip(rooms, places, strict=True)]
+        leans = [np.degrees(np.arcsin(normal[2])) for normal in normals]
+        # Degrees and metres: far above rounding.
+        assert np.diff(sorted(leans)).min() > 0.005, name
+        assert np.diff(sorted(offsets)).min() > 0.0005, name
+    stations = [out.truth.stations for out in (designed, *drawn)]
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        apart = [np.ptp(at, axis=0) @ np.ptp(at, axis=0) for at in (stations[one], stations[other])]
+        assert abs(apart[0] - apart[1]) > 0.001
+
+
+def test_a_cloth_may_hang_on_drawn_walls(tmp_path: Path) -> None:
+    drawn = {**COARSE, "decoration": "drawn"}
+    bare = simulate(tmp_path / "bare", **drawn)
+    hung = simulate(tmp_path / "hung", **drawn, textile_share=0.2)
+    areas = []
+    for out in (bare, hung):
+        scene = out.truth.scene
+        cloth = scene.extent[scene.texture == TextureKind.TEXTILE]
+        areas.append(float(np.sum((cloth[:, 1] - cloth[:, 0]) * (cloth[:, 3] - cloth[:, 2]))))
+    assert areas == pytest.approx([0.0, 0.2 * 16.7])
+    # The cloth lies in the wall; openings go through it.
+    np.testing.assert_array_equal(bare.truth.labels, hung.truth.labels)
 
 
 def test_points_are_on_the_rays_of_their_rows_and_columns(tmp_path: Path) -> None:

@@ -13,13 +13,13 @@ from orthoflow_plugins.simulate import room_model
 from orthoflow_plugins.simulate.building import Extent, SceneDraft
 from orthoflow_plugins.simulate.room_model import (
     CEILING_M,
+    DESIGNED,
     FLOOR_M,
     MOST_TEXTILE,
     Room,
     RoomPlan,
     build_room,
     main_wall_axes,
-    wall_sides,
 )
 
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
@@ -47,7 +47,7 @@ class Along:
 
 def along(built: Room, name: str) -> Along:
     """Rectangles of a room along a wall, their extents from the wall's own foot."""
-    side = wall_sides(SceneDraft())[WALLS.index(name)]
+    side = DESIGNED.sides(SceneDraft())[WALLS.index(name)]
     scene = built.scene
     parallel = np.abs(scene.normal @ side.normal) > 1.0 - 1e-9
     parallel &= np.isclose(np.abs(scene.axis_a @ side.axis_a), 1.0)
@@ -91,7 +91,7 @@ def test_whoever_stands_in_the_room_sees_no_way_out() -> None:
 
 
 def test_no_wall_is_quite_square_to_the_next_and_the_main_one_leans() -> None:
-    sides = wall_sides(SceneDraft())
+    sides = DESIGNED.sides(SceneDraft())
     main = sides[0]
     assert np.degrees(np.arctan2(*-main.normal[1::-1])) == pytest.approx(102.0)
     assert np.degrees(np.arcsin(-main.normal[2])) == pytest.approx(0.8)
@@ -304,11 +304,11 @@ def test_what_stands_in_the_room_stands_on_the_floor_and_apart(has_obstacle: boo
     for block in blocks:
         assert block[:, 2].min() == pytest.approx(FLOOR_M)
         assert 0.5 < np.ptp(block[:, 2]) < 1.5
-        for side in wall_sides(SceneDraft()):
+        for side in DESIGNED.sides(SceneDraft()):
             assert ((block - side.foot) @ side.normal).min() > 0.1
     for one, other in itertools.combinations(blocks, 2):
         assert np.linalg.norm(one[:, None, :2] - other[None, :, :2], axis=2).min() > 0.3
-    main = wall_sides(SceneDraft())[0]
+    main = DESIGNED.sides(SceneDraft())[0]
     if has_obstacle:
         screen = blocks[0]
         assert ((screen - main.foot) @ main.normal).mean() == pytest.approx(0.6, abs=0.05)
@@ -365,7 +365,7 @@ def test_true_planes_reach_as_far_as_they_are_seen() -> None:
 def test_what_is_drawn_on_a_wall_lies_between_the_corners_of_the_room(
     name: str, corners: tuple[float, float]
 ) -> None:
-    sides = wall_sides(SceneDraft())
+    sides = DESIGNED.sides(SceneDraft())
     own = sides[WALLS.index(name)]
     beside = sorted(
         float(side.foot @ own.axis_a) for side in sides if abs(side.normal @ own.normal) < 0.5

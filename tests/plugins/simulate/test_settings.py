@@ -82,11 +82,13 @@ def test_records_of_rooms_as_they_always_were_do_not_change(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     _, _, usual, _ = planned(monkeypatch, tmp_path)
-    later = {"decoration", "design_seed", "photo_exposure_share", "n_passers_by", "turn_deg"}
+    later = {"decoration", "design_seed", "geometry", "photo_exposure_share"}
+    later |= {"n_passers_by", "turn_deg"}
     assert set(usual) == set(Params.model_fields) - later
     changed = {
         "decoration": "drawn",
         "design_seed": 7,
+        "geometry": "drawn",
         "photo_exposure_share": 0.2,
         "n_passers_by": 3,
         "turn_deg": 12.0,
@@ -125,45 +127,3 @@ def test_photos_are_planned_and_developed_as_asked(
         4,
         0.2,
     )
-
-
-@pytest.mark.parametrize(("panorama_m", "step_m"), [(None, 0.03), (0.05, 0.05)])
-def test_a_scan_is_planned_with_two_seeds_per_station(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, panorama_m: float | None, step_m: float
-) -> None:
-    got: dict[str, Any] = {}
-
-    def sweeps(plan: Any, wall: Any, outline: Any, seeds: Any) -> str:
-        got.update(plan=plan, wall=wall, outline=outline, seeds=seeds)
-        return "sweeps"
-
-    def scan(scene: Any, of: Any, errors: Any, ctx: Any) -> tuple[Any, ...]:
-        return scene, of, errors
-
-    monkeypatch.setattr("orthoflow_plugins.simulate.scanning.planned_sweeps", sweeps)
-    monkeypatch.setattr("orthoflow_plugins.simulate.scanning.scan_scene", scan)
-    params = Params.model_validate(
-        {
-            "scan_step_m": 0.01,
-            "panorama_step_m": panorama_m,
-            "n_stations": 3,
-            "noise_m": 0.002,
-            "outlier_share": 0.03,
-            "beam_m": 0.004,
-            "colour_noise_grey": 1.5,
-        }
-    )
-    main = SimpleNamespace(plane="plane", outline="outline")
-    of: Any = SimpleNamespace(scene="scene", planes=[main, "other"])
-    ctx = StepContext(rng=np.random.default_rng(5), cores=1, scratch=tmp_path)
-    found: Any = room._scan(of, params, np.random.default_rng(8), ctx)
-    scene, made, errors = found
-    assert (scene, made, got["wall"], got["outline"]) == ("scene", "sweeps", "plane", "outline")
-    plan = got["plan"]
-    assert (plan.n_stations, plan.scan_step_m) == (3, 0.01)
-    # Three times as coarse unless it is said.
-    assert plan.panorama_step_m == pytest.approx(step_m)
-    assert len(set(got["seeds"].tolist())) == 6
-    assert errors.band_seed == got["seeds"][0]
-    assert (errors.noise_m, errors.outlier_share) == (0.002, 0.03)
-    assert (errors.beam_m, errors.colour_noise) == (0.004, 1.5)

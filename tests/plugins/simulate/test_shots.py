@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.simulate import photographs
 from orthoflow_plugins.simulate.building import SceneDraft
 from orthoflow_plugins.simulate.photographs import Film, ShotPlan, planned_shots, take_photos
-from orthoflow_plugins.simulate.room_model import main_wall_axes, wall_sides
+from orthoflow_plugins.simulate.room_model import DESIGNED, main_wall_axes
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import looking_at
@@ -123,7 +123,7 @@ def test_lenses_of_a_layout_hold_its_footprint_and_differ_a_little(
 
 @pytest.mark.parametrize("layout", ["quick", "variant2"])
 def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
-    sides = wall_sides(SceneDraft())
+    sides = DESIGNED.sides(SceneDraft())
     plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=8.0)
     rolls, tilts = [], []
     columns, rows = LATTICES[layout]

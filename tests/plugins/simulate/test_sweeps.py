@@ -33,7 +33,7 @@ def test_panoramas_close_and_detail_scans_just_hold_the_main_wall(n_stations: in
         [middle + a * along + h * UP for a, h in ((-3, 1.6), (-3, -1.4), (3, -1.4), (3, 1.6))]
     )
     wall = Plane(normal=-towards, offset_m=-4.0)
-    plan = SweepPlan(n_stations=n_stations, scan_step_m=0.02, panorama_step_m=0.05)
+    plan = SweepPlan(stations=station_positions(n_stations), scan_step_m=0.02, panorama_step_m=0.05)
     seeds = np.arange(100, 110)
     sweeps = planned_sweeps(plan, wall, outline, seeds)
     assert [sweep.seed for sweep in sweeps] == list(range(100, 100 + 2 * n_stations))
