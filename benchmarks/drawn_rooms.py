@@ -203,7 +203,7 @@ def matched_pair(
     shift = views[1].translation - turn @ views[0].translation
     size = (views[0].width, views[0].height)
     r1, r2, p1, p2, back, _, _ = cv2.stereoRectify(
-        matrices[0], lenses[0], matrices[1], lenses[1], size, turn, shift, alpha=-1
+        matrices[0], lenses[0], matrices[1], lenses[1], size, turn, shift[:, None], alpha=-1
     )
     rectified = [
         cv2.remap(
