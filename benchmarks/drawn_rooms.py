@@ -105,6 +105,8 @@ def surfaces(seed: int) -> Iterator[tuple[str, str, float]]:
         panorama_step_m=0.03,
         photo_layout="variant2",
         photo_gsd_m=0.004,
+        # Of oblique neighbours one may stand above the other, which the matching of rows excludes.
+        photo_obliquity_deg=3.0,
         check_points_most=20,
     )
     cameras = room.truth.cameras
