@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +68,22 @@ _FIT_POINTS: Final = 20_000
 _SPREAD_POINTS: Final = 5_000
 # Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
 _FITTED_MOST: Final = 12_000_000
+# No plane of the size asked for lies in the cells of candidates that were refused so.
+_SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 # Rectangles that one plane is cut into at most: a frame has four sides. Claims are bytes.
 _RECTANGLES_MOST: Final = 8
 _SLABS_MOST: Final = 127
+
+
+class Refusal(NamedTuple):
+    """Why a candidate is no plane, and the cells that it has."""
+
+    criterion: Criterion
+    support: Support | None
+
+
+# The cells that belong to a plane and how it fits them, or why it is none.
+Verdict = tuple[Support, AdjustedPlane] | Refusal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +106,7 @@ class FoundPlane:
 
     def claim(self, tolerance_m: float) -> Claim:
         """What it takes: points within the tolerance of its plane and of its rectangle."""
-        grown = self.support.bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
-        return Claim(self.raster.slab(), np.concatenate([[tolerance_m], grown]))
+        return _claim_of(self.raster, self.support, tolerance_m)
 
     def as_proposed(self, up: NDArray[np.float64]) -> FoundPlane:
         """Return it back as its detector proposed it, with the rectangle that was found for it."""
@@ -125,7 +137,9 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
         verdict = _verdict(
             raster, sums, search, freedom, search.least_points, settled_m=_SETTLED_ON_SAMPLE_M
         )
-        if isinstance(verdict, str):
+        if isinstance(verdict, Refusal):
+            if verdict.support is not None and verdict.criterion in _SET_ASIDE:
+                search.set_aside(_claim_of(raster, verdict.support, search.tolerance_m))
             return None
         support, adjusted = verdict
         plane, cell_m = adjusted.plane, raster.cell_m
@@ -141,6 +155,11 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
     )
 
 
+def _claim_of(raster: SurfaceRaster, support: Support, tolerance_m: float) -> Claim:
+    grown = support.bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
+    return Claim(raster.slab(), np.concatenate([[tolerance_m], grown]))
+
+
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
     """Fit planes of the sample to all points; those that these do not bear out are left out."""
     cloud = search.cloud
@@ -153,14 +172,14 @@ def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
         verdicts = _verdicts(found, rasters, sums, is_open, search, least_points)
         kept, moves = [], []
         for item, raster, verdict in zip(found, rasters, verdicts, strict=True):
-            if not isinstance(verdict, str):
+            if verdict is None:
+                kept.append(item)
+                moves.append(False)
+            elif not isinstance(verdict, Refusal):
                 support, adjusted = verdict
                 moved = raster.moved_to(adjusted.plane, cloud.up)
                 kept.append(replace(item, raster=moved, support=support, adjusted=adjusted))
                 moves.append(adjusted.moved_m > _SETTLED_SHARE * search.fit_tolerance_m)
-            elif verdict == "settled":
-                kept.append(item)
-                moves.append(False)
         found, is_open = kept, moves
         if not any(is_open):
             break
@@ -286,12 +305,12 @@ def _verdict(
     least_points: float,
     *,
     settled_m: float = SETTLED_M,
-) -> tuple[Support, AdjustedPlane] | str:
+) -> Verdict:
     """The cells that belong to a plane and how it fits them, or the criterion that refuses it."""
     support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
     if support is None:
         search.refuse("scattered")
-        return "scattered"
+        return Refusal("scattered", None)
     adjusted = None
     criterion: Criterion | None = None
     u, v = raster.centres_m()
@@ -300,6 +319,8 @@ def _verdict(
         criterion = "few"
     elif min(right - left, bottom - top) < _STRIP_CELLS * raster.cell_m:
         criterion = "strip"
+    elif support.area_m2 < search.min_area_m2:
+        criterion = "small"
     elif support.n_points < _CROWDED_LEAST * int(
         sums.n_near[(u > left) & (u < right) & (v > top) & (v < bottom)].sum()
     ):
@@ -323,7 +344,7 @@ def _verdict(
     # As a share of all points, however many of them were asked.
     share = search.params.min_share * support.n_points / max(least_points, 1e-9)
     search.refusals.append((criterion or "bent", share))
-    return criterion or "bent"
+    return Refusal(criterion or "bent", support)
 
 
 def _verdicts(
@@ -333,9 +354,9 @@ def _verdicts(
     is_open: list[bool],
     search: Search,
     least_points: float,
-) -> list[tuple[Support, AdjustedPlane] | str]:
+) -> list[Verdict | None]:
     """What the sums say of each plane that is open, several planes at a time."""
-    verdicts: list[tuple[Support, AdjustedPlane] | str] = ["settled"] * len(found)
+    verdicts: list[Verdict | None] = [None] * len(found)
     parts = search.cloud.parts
 
     def judge(first: int) -> None:

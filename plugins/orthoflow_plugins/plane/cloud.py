@@ -53,9 +53,13 @@ _FLAT_LEAST: Final = 20
 _QUARTER: Final = 0.25
 
 
-# What may refuse a candidate: too few points, none that crowd about it, a strip as narrow as a
-# line, points that only pass through, a rounded surface, or a tilt that was not asked for.
-Criterion = Literal["few", "scattered", "strip", "smear", "bent", "tilt"]
+# What may refuse a candidate: too few points, too little surface, none that crowd about it, a strip
+# as narrow as a line, points that only pass through, a rounded surface, or a tilt not asked for.
+Criterion = Literal["few", "small", "scattered", "strip", "smear", "bent", "tilt"]
+# In a small cloud a plane need not show more than this share of the largest side of its box.
+_SIDE_SHARE: Final = 0.02
+# Claims are bytes.
+_CLAIMS_MOST: Final = 127
 
 
 class Claim(NamedTuple):
@@ -175,6 +179,12 @@ class Search:
         self.box_corners_m = self.cloud.box_corners()
 
     @property
+    def min_area_m2(self) -> float:
+        """Surface that a plane must show."""
+        _, middle, high = np.sort(np.ptp(self.box_corners_m @ self.cloud.grid.basis.T, axis=0))
+        return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
+
+    @property
     def least_points(self) -> float:
         """Points of the sample that a plane must hold."""
         return self.params.min_share * len(self.claims)
@@ -192,6 +202,16 @@ class Search:
         slabs = np.array([item.slab for item in self.taken])
         self.n_points -= claim_slab(self.cloud.sample.points, self.claims, slabs, claim.bounds_m)
         self._free = None
+
+    def set_aside(self, claim: Claim) -> None:
+        """Let the points of a candidate that is no plane propose no other.
+
+        Clutter near the scanner holds more points than a wall far away: its candidates, a little
+        different each time, would hide that wall. Points that lie on a plane are given to it in the
+        end, when all points are labelled.
+        """
+        if len(self.taken) < _CLAIMS_MOST - self.params.n_planes_max:
+            self.claim(claim)
 
     def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
         """Note what refused a candidate that holds so many points of the sample."""

@@ -129,15 +129,21 @@ class DetectorParams(MethodParams):
         "plane lean as its points say.",
     )
     n_planes_max: int = Field(16, ge=1, le=100, description="Stop after so many planes.")
+    min_area_m2: float = Field(
+        1.0,
+        ge=0.0,
+        description="Surface that a plane must show, square metres; the search ends where no "
+        "candidate has as much. Less in a cloud with no side of 50 times that.",
+    )
     min_share: float = Field(
-        0.005, gt=0.0, lt=1.0, description="Share of all points that a plane must hold."
+        0.001, gt=0.0, lt=1.0, description="Share of all points that a plane must hold."
     )
     stop_unclassified_share: float = Field(
-        0.05,
+        0.0,
         ge=0.0,
         lt=1.0,
-        description="Stop when a smaller share of the points is on no plane yet; markiewicz2015 "
-        "takes 0.1, at which mirror ghosts can end the search before a small wall.",
+        description="Stop when a smaller share of the points is on no plane yet. markiewicz2015 "
+        "takes 0.1, at which walls far from the scanner are missed. 0 never stops.",
     )
     stop_rest_share: float = Field(
         0.0,

@@ -42,7 +42,7 @@ from orthoflow_plugins.plane.thickness import measure_thickness, report_thicknes
 # Steps of the robust box of detectors that do not look at the plan.
 _PLAN_CELL_M: Final = 0.5
 # Candidates in a row that turned out to be none, after which the search gives up.
-_REJECTED_MOST: Final = 30
+_REJECTED_MOST: Final = 60
 
 _NO_PLANE: Final = (
     "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
@@ -50,6 +50,8 @@ _NO_PLANE: Final = (
 )
 _CRITERIA: Final[Mapping[Criterion, str]] = {
     "few": "the largest candidate holds {share:.2%} of the points",
+    "small": "the largest candidate, which holds {share:.2%} of the points, shows less than "
+    "{area:.2g} m2",
     "scattered": "no points crowd about any candidate",
     "strip": "the candidates are strips too narrow for a plane",
     "smear": "most points near the largest candidate, which holds {share:.2%} of all, only pass "
@@ -59,8 +61,8 @@ _CRITERIA: Final[Mapping[Criterion, str]] = {
 }
 _NO_CANDIDATE: Final = "no candidate was proposed"
 _ADVICE: Final = (
-    "wider tolerances up to {wider:.3g} m were tried and find none either: lower min_share for "
-    "small planes, or raise max_tilt_deg"
+    "wider tolerances up to {wider:.3g} m were tried and find none either: lower min_area_m2 for "
+    "small planes, min_share for sparse ones, or raise max_tilt_deg"
 )
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
 # Tolerances that are tried for the message, as multiples of the one that found nothing.
@@ -305,7 +307,7 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
     why = _NO_CANDIDATE
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
-        why = _CRITERIA[criterion].format(share=share)
+        why = _CRITERIA[criterion].format(share=share, area=search.min_area_m2)
     advice = _ADVICE.format(wider=_WIDER[-1] * search.tolerance_m)
     for times in _WIDER:
         wider = replace(

@@ -133,6 +133,12 @@ class Support:
     bounds_m: NDArray[np.float64]
     n_points: int
 
+    @property
+    def area_m2(self) -> float:
+        """Area of the rectangles about its parts: cells may be empty where points are sparse."""
+        sides_m = self.parts_m[:, 1::2] - self.parts_m[:, ::2]
+        return float(np.prod(sides_m, axis=1).sum())
+
 
 def slab_of(
     plane: Plane, axes: NDArray[np.float64], low_m: NDArray[np.float64]

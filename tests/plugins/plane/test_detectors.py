@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +36,6 @@ DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
 }
 STATION = np.array([[0.3, -0.2, 0.1]])
 SURVEY = (634512.347, 486215.781, 112.193)
-# Finds the table too, which holds 3 % of the points.
-TO_THE_END = {"stop_unclassified_share": 0.0}
 
 # Half of a room's points fix its planes as well: errors are a fourth of what is asserted, or less,
 # but for the table's, which has the fewest. A fourth of them shows which planes are left.
@@ -80,20 +77,14 @@ def errors(planes: Planes, truth: Rectangle, turn: NDArray[np.float64]) -> tuple
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     cloud = cloud_of(sampled()[HALF], stations=STATION)
-    return {
-        name: detect(name, cloud, tmp_path_factory.mktemp(name), **TO_THE_END)[0]
-        for name in DETECTORS
-    }
+    return {name: detect(name, cloud, tmp_path_factory.mktemp(name))[0] for name in DETECTORS}
 
 
 @pytest.fixture(scope="module")
 def halves(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What is found in every other of the points of `rooms`."""
     cloud = cloud_of(sampled()[FEW], stations=STATION)
-    return {
-        name: detect(name, cloud, tmp_path_factory.mktemp(name), **TO_THE_END)[0]
-        for name in DETECTORS
-    }
+    return {name: detect(name, cloud, tmp_path_factory.mktemp(name))[0] for name in DETECTORS}
 
 
 def same_planes(planes: Planes, expected: Planes, turn: NDArray[np.float64]) -> None:
@@ -154,7 +145,7 @@ def test_shuffled_points_give_the_same_planes(
 ) -> None:
     points = np.random.default_rng(7).permutation(sampled()[HALF])
     cloud = cloud_of(points, stations=STATION)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     same_planes(out.planes, rooms[detector].planes, np.eye(3))
 
 
@@ -163,7 +154,7 @@ def test_survey_coordinates_of_a_million_metres_lose_nothing(
     detector: str, halves: dict[str, Any], tmp_path: Path
 ) -> None:
     cloud = cloud_of(sampled()[FEW], stations=STATION, origin=SURVEY)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     expected = halves[detector].planes
     np.testing.assert_array_equal(out.planes.normal, expected.normal)
     np.testing.assert_allclose(
@@ -178,7 +169,7 @@ def test_a_turned_room_gives_the_turned_planes(
 ) -> None:
     turn = turned(angle_deg)
     cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -191,7 +182,7 @@ def test_ten_other_turns_give_the_turned_planes(
     for angle_deg in (7.0, 18.5, 41.0, 57.3, 77.0, 103.0, 131.7, 168.0, 212.4, 299.9):
         turn = turned(angle_deg)
         cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
-        out, _ = detect(detector, cloud, tmp_path / str(angle_deg), **TO_THE_END)
+        out, _ = detect(detector, cloud, tmp_path / str(angle_deg))
         same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -203,7 +194,7 @@ def test_a_room_turned_any_way_gives_the_turned_planes(
     cross = np.cross(np.eye(3), axis)
     turn = np.eye(3) + np.sin(1.0) * cross + (1.0 - np.cos(1.0)) * cross @ cross
     cloud = cloud_of(sampled()[HALF] @ turn.T, stations=STATION @ turn.T)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     same_planes(out.planes, rooms[detector].planes, turn)
 
 
@@ -247,7 +238,7 @@ def test_recesses_of_different_depth_are_not_joined_by_a_plane_that_leans(
     door = Rectangle("door", (1.7, 2.12, -0.4), (0.45, 0, 0), (0, 0, 1.1), 12_000)
     niche = Rectangle("niche", (-1.5, 2.25, -0.2), (0.4, 0, 0), (0, 0, 0.9), 10_000)
     cloud = cloud_of(sampled((*ROOM, door, niche))[HALF], stations=STATION)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     for truth in (door, niche):
         angle_deg, miss_m = errors(out.planes, truth, np.eye(3))
         assert angle_deg < 0.03
@@ -276,7 +267,7 @@ def test_mirror_ghosts_and_furniture_neither_hide_nor_move_the_walls(
         )
     )
     points = np.concatenate([room, ghosts, sampled(boxes, seed=6)[HALF]])
-    planes = detect(detector, cloud_of(points, stations=STATION), tmp_path, **TO_THE_END)[0].planes
+    planes = detect(detector, cloud_of(points, stations=STATION), tmp_path)[0].planes
     for truth in ROOM[:6]:
         angle_deg, miss_m = errors(planes, truth, np.eye(3))
         assert angle_deg < 0.03
@@ -298,7 +289,7 @@ def test_a_constraint_leaves_only_its_planes(
     detector: str, constraint: str, count: int, tmp_path: Path
 ) -> None:
     cloud = cloud_of(sampled()[FEW], stations=STATION)
-    few = {"constraint": constraint, **TO_THE_END}
+    few = {"constraint": constraint}
     planes = detect(detector, cloud, tmp_path, **few)[0].planes
     rises = np.abs(planes.normal @ planes.up)
     assert len(planes) == count
@@ -360,22 +351,6 @@ def test_thinning_finds_the_same_planes_and_labels_every_point(
 
 
 @every_detector
-def test_stop_rules_end_the_search(detector: str, tmp_path: Path) -> None:
-    cloud = cloud_of(sampled()[HALF], stations=STATION)
-    number = detect(detector, cloud, tmp_path, n_planes_max=2)[0].planes
-    few = partial(detect, detector, cloud, tmp_path)
-    support = few(min_share=0.15, **TO_THE_END)[0].planes
-    rest = few(stop_rest_share=0.25, **TO_THE_END)[0]
-    unclassified = few(stop_unclassified_share=0.6)[0]
-    assert len(number) == 2
-    assert len(support) == 3  # front, floor and ceiling hold 17 % and more
-    # front 34 % of all, floor 28 % of the rest, ceiling 36 %; the back wall 34 %, then the sides.
-    assert len(rest.planes) >= 4
-    left = np.mean(unclassified.labels.plane_index < 0)
-    assert left < 0.6 <= left + unclassified.planes.n_points[-1] / len(cloud)
-
-
-@every_detector
 def test_the_raw_detection_is_kept_beside_the_common_fit(
     detector: str, rooms: dict[str, Any]
 ) -> None:
@@ -422,7 +397,7 @@ def test_coordinates_that_are_no_numbers_are_refused(detector: str, tmp_path: Pa
 @every_detector
 def test_duplicate_points_do_no_harm(detector: str, rooms: dict[str, Any], tmp_path: Path) -> None:
     cloud = cloud_of(np.repeat(sampled()[FEW], 2, axis=0), stations=STATION)
-    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    out, _ = detect(detector, cloud, tmp_path)
     for truth in ROOM:
         assert errors(out.planes, truth, np.eye(3))[1] < 2e-4
 

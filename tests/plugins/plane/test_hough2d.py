@@ -49,7 +49,7 @@ def nearest(planes: Planes, normal: NDArray[np.float64], centre: NDArray[np.floa
 def room(tmp_path_factory: pytest.TempPathFactory) -> Hough2d.Out:
     # To the last point: by the paper's rule the table, 3 % of the points, would be left.
     cloud = cloud_of(sampled(), stations=STATION)
-    return detect(cloud, tmp_path_factory.mktemp("room"), stop_unclassified_share=0.0)
+    return detect(cloud, tmp_path_factory.mktemp("room"))
 
 
 @pytest.mark.parametrize("truth", ROOM, ids=lambda truth: truth.name)
@@ -127,7 +127,7 @@ def test_a_turned_room_gives_the_turned_planes(
 ) -> None:
     turn = turned(angle_deg)
     cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
-    moved = detect(cloud, tmp_path, stop_unclassified_share=0.0).planes
+    moved = detect(cloud, tmp_path).planes
     assert len(moved) == len(room.planes)
     for normal, corners in zip(room.planes.normal, room.planes.corners, strict=True):
         middle = turn @ corners.mean(axis=0)
@@ -139,7 +139,7 @@ def test_a_turned_room_gives_the_turned_planes(
 
 def test_survey_coordinates_lose_nothing(room: Hough2d.Out, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(), stations=STATION, origin=SURVEY)
-    moved = detect(cloud, tmp_path, stop_unclassified_share=0.0).planes
+    moved = detect(cloud, tmp_path).planes
     np.testing.assert_array_equal(moved.normal, room.planes.normal)
     shifted = room.planes.offset + room.planes.normal @ np.array(SURVEY)
     np.testing.assert_allclose(moved.offset, shifted, atol=1e-8)  # metres; 0.05 mm are allowed
@@ -161,7 +161,7 @@ def test_another_origin_of_the_offsets_gives_the_same_plane(
 def test_shuffled_points_give_the_same_planes(room: Hough2d.Out, tmp_path: Path) -> None:
     order = np.random.default_rng(7).permutation(len(sampled()))
     cloud = cloud_of(sampled()[order], stations=STATION)
-    planes = detect(cloud, tmp_path, stop_unclassified_share=0.0).planes
+    planes = detect(cloud, tmp_path).planes
     np.testing.assert_allclose(planes.normal, room.planes.normal, atol=3e-5)  # 0.002 degrees
     np.testing.assert_allclose(planes.offset, room.planes.offset, atol=1e-4)
 
@@ -178,7 +178,7 @@ def test_the_number_of_threads_does_not_change_a_bit(tmp_path: Path) -> None:
 def test_up_may_be_another_axis(room: Hough2d.Out, tmp_path: Path) -> None:
     swap = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])  # (x, y, z) -> (y, z, x): up is y
     cloud = cloud_of(sampled() @ swap.T, up=(0.0, 1.0, 0.0), stations=STATION @ swap.T)
-    moved = detect(cloud, tmp_path, stop_unclassified_share=0.0).planes
+    moved = detect(cloud, tmp_path).planes
     assert angle_between_deg(moved.normal[0], swap @ room.planes.normal[0]) < 0.005
     assert set(moved.names) == set(room.planes.names)
 
@@ -290,7 +290,6 @@ def test_recesses_of_different_depth_are_not_joined_by_a_plane_that_leans(tmp_pa
     planes = detect(
         cloud_of(sampled((*ROOM, door, niche)), stations=STATION),
         tmp_path,
-        stop_unclassified_share=0.0,
     ).planes
     for truth in (door, niche):
         index = nearest(planes, truth.normal, np.array(truth.centre))

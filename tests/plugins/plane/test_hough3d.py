@@ -47,12 +47,12 @@ def has(planes: Planes, truth: Rectangle) -> bool:
 )
 def test_other_ways_to_vote_find_the_same_room(options: dict[str, Any], tmp_path: Path) -> None:
     cloud = cloud_of(sampled(), stations=STATION)
-    planes = detect(cloud, tmp_path, stop_unclassified_share=0.0, **options).planes
+    planes = detect(cloud, tmp_path, **options).planes
     assert all(has(planes, truth) for truth in ROOM)
 
 
 def test_floor_and_ceiling_are_found_once_each(tmp_path: Path) -> None:
-    planes = detect(cloud_of(sampled(ROOM[4:6])), tmp_path, stop_unclassified_share=0.0).planes
+    planes = detect(cloud_of(sampled(ROOM[4:6])), tmp_path).planes
     assert sorted(planes.names) == ["ceiling 1", "floor 0"]
 
 
