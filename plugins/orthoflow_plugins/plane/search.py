@@ -41,6 +41,9 @@ from orthoflow_plugins.plane.thickness import measure_thickness, report_thicknes
 
 # Steps of the robust box of detectors that do not look at the plan.
 _PLAN_CELL_M: Final = 0.5
+# Four times the share of the points that may lie outside the box on each side. Mirror ghosts and
+# stray points, 0.4 % in simulated rooms, would else make it several times as large as the scene.
+_STRAY_SHARE: Final = 0.005
 # Candidates in a row that turned out to be none, after which the search gives up.
 _REJECTED_MOST: Final = 60
 
@@ -158,7 +161,7 @@ def detect(
             points,
             basis_from_up(cloud.up),
             cell_m=cell_m,
-            least_share=params.min_share,
+            least_share=_STRAY_SHARE,
             parts=ctx.cores,
             counts_plan=plan_cell_m is not None,
         )
