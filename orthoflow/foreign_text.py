@@ -136,7 +136,7 @@ def json_bytes(value: object, *, indent: int | None) -> bytes:
 
 
 def _refuse_constant(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -171,7 +171,7 @@ def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Ite
         yield
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path.name} is no UTF-8 text: expected {what}; save it as UTF-8"
+            f"{path.name} is not UTF-8 text: expected {what}; save it as UTF-8"
         ) from error
     except OSError as error:
         raise InputError(f"{path.name} cannot be read: {error.strerror}") from error

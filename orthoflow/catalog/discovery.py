@@ -254,7 +254,7 @@ def _collect_products(announcements: Iterable[_Announcement]) -> dict[str, Produ
         problem = ""
         if len({(claim.spec.target, claim.spec.publisher) for claim in claims}) > 1:
             problem = _contested(
-                f"product type {name}", claims, f"that of {first.distribution.name} is used"
+                f"product type {name}", claims, f"the one of {first.distribution.name} is used"
             )
         entries[name] = ProductEntry(
             spec=first.spec, distribution=first.distribution, problem=problem

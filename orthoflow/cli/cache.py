@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 _SUMMARIES: Final = {
     "list": "List the stored results with their size and age.",
-    "gc": "Remove what no stored result needs any more.",
-    "verify": "Check every byte of the store, and set aside what is damaged.",
+    "gc": "Remove objects that no stored result needs.",
+    "verify": "Check every byte of the store, and set damaged parts aside.",
 }
 
 
@@ -81,7 +81,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
     "--older-than",
     type=float,
     metavar="DAYS",
-    help="Also remove results that no run used for so many days; 0 removes all.",
+    help="Also remove results that no run used for this many days; 0 removes all.",
 )
 @click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option

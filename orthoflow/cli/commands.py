@@ -101,8 +101,8 @@ class Command(click.Command):
             if not found or not (is_number or "unexpected extra argument" in error.message):
                 raise
             sentence = (
-                f"{error.message.rstrip('.')}; {found} was taken apart at its spaces: put all of "
-                "the value in quotes, as --set 'wall.near=[[1, 2, 3]]'"
+                f"{error.message.rstrip('.')}; {found} was split at its "
+                "spaces: quote the whole value, as --set 'wall.near=[[1, 2, 3]]'"
             )
             raise click.UsageError(sentence, ctx) from error
 
@@ -313,7 +313,7 @@ def execution_options(command: _Decorated) -> _Decorated:
         default=2,
         show_default=True,
         metavar="N",
-        help="With dask: try a step again so often whose worker was lost.",
+        help="With dask: how often a step is repeated after its worker was lost.",
     )(command)
     command = click.option(
         "--scheduler",
@@ -325,8 +325,8 @@ def execution_options(command: _Decorated) -> _Decorated:
         "--executor",
         type=click.Choice(["local", "inline", "dask"]),
         default="local",
-        help="A process per step, all in this one (for debugging; a step's memory then holds what "
-        "earlier ones left, too), or on the workers of dask.",
+        help="A process per step, all in this one (for debugging; a step's memory then "
+        "includes that of earlier ones), or on the workers of dask.",
     )(command)
     return click.option(
         "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
@@ -380,7 +380,9 @@ def explain(error: Exception, session: Session) -> int:
         echo_error(*([hint] if hint else _sentences(error)))
         return error.exit_code
     if is_for_want_of_memory(error):
-        echo_error("error: not enough memory to go on; free some, or raise the limit on memory")
+        echo_error(
+            "error: not enough memory to continue; free memory, or raise the limit on memory"
+        )
         return EXIT_CELL_FAILED
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
@@ -394,7 +396,7 @@ def explain(error: Exception, session: Session) -> int:
         return EXIT_PLUGIN_MISSING
     echo_error(
         f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
-        "repeat the command with --debug and report what it prints"
+        "repeat the command with --debug and report its output"
     )
     return EXIT_CELL_FAILED
 

@@ -27,7 +27,13 @@ from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile
-    from orthoflow.records.comparison import ComparedMetric, Pair, ParameterValue, RunComparison
+    from orthoflow.records.comparison import (
+        CellFacts,
+        ComparedMetric,
+        Pair,
+        ParameterValue,
+        RunComparison,
+    )
     from orthoflow.report.moved import Alike
 
 Value = TypeVar("Value")
@@ -65,7 +71,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     else:
         _print(comparison, most=None if is_whole else ROWS_MOST)
         echo("", verify_hint(first, second))
-    return code_for(map(broken_seal, runs), "do not rely on what is printed here")
+    return code_for(map(broken_seal, runs), "do not rely on this output")
 
 
 def comparison_json(comparison: RunComparison) -> dict[str, object]:
@@ -119,11 +125,12 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
-    _print_pairs("steps", without_seeds(comparison.cells), str, most, step_of)
+    steps = without_seeds(comparison.cells)
+    _print_pairs("steps", [_differing_parts(pair) for pair in steps], str, most, step_of)
     if comparison.readdressed:
         pairs = [f"{ours} (A) and {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
         named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
-        echo(f"compared, though called otherwise: {named}")
+        echo(f"compared despite different names: {named}")
     _print_pairs(
         "parameters (* set, others are defaults)",
         comparison.shared(comparison.parameters),
@@ -194,6 +201,22 @@ def _counts(rows: Sequence[Pair[Any]]) -> str:
     if found.n_rounded:
         counts.append(f"another {found.n_rounded} differ by less than a millionth")
     return ", ".join(counts) or "none"
+
+
+def _differing_parts(pair: Pair[CellFacts]) -> Pair[str]:
+    """Describe the sides of a step by what differs; a step of one run by status and method."""
+    left, right = pair.left, pair.right
+    sides: list[str | None] = []
+    for ours, theirs in ((left, right), (right, left)):
+        if ours is None:
+            sides.append(None)
+        elif theirs is None:
+            sides.append(", ".join(ours.parts[:2]))
+        else:
+            own = [part for part in ours.parts if part not in theirs.parts]
+            is_alone = pair.is_same or ours.determinism != theirs.determinism
+            sides.append(", ".join(own or [ours.determinism if is_alone else _NOTHING]))
+    return dataclasses.replace(pair, left=sides[0], right=sides[1])  # type: ignore[arg-type,return-value]
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:

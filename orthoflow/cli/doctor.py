@@ -122,7 +122,7 @@ class Finding:
 @store_option
 @json_option
 def doctor(store: Path, *, as_json: bool) -> int:
-    """Show what is installed, what is missing, and what that costs.
+    """Show what is installed, what is missing, and the consequences.
 
     Ends with 4 when something is missing without which nothing works.
     """
@@ -159,7 +159,7 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
     if costs:
         echo("", "What that costs:", *costs)
     if is_broken:
-        echo("", "something that everything needs is missing")
+        echo("", "a required library is missing")
     elif costs:
         echo("", f"orthoflow works, with {counted(len(costs), 'restriction')}")
     else:

@@ -35,13 +35,14 @@ _HELP: Final = "\n\n".join(
         "Write the results of RUN, a run folder or its run.h5, for other programs.",
         *(f"{name}: {entry.summary}." for name, entry in FORMATS.items()),
         (
-            "--embed: run.h5 alone, which verifies and replays without any other file; what it "
-            "lacks so far comes from the store and from the input files, found by content, under "
+            "--embed: run.h5 alone, which can be verified and replayed without any "
+            "other file; missing parts come from the store and from the input files, found "
+            "by content, under "
             "any name: where --input points, else as `replay` finds them."
         ),
         (
-            "--split: of a run on several datasets a run folder each, with record, report and "
-            "products."
+            "--split: of a run on several datasets, a run "
+            "folder for each, with record, report and products."
         ),
     ]
 )
@@ -53,13 +54,13 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--embed",
     is_flag=True,
-    help="Write a record that needs nothing beside it: with every product and input file in it; "
-    "alone, or in the place of the record with --to ro-crate.",
+    help="Write a self-contained record with every product and input file; "
+    "by itself, or instead of the record with --to ro-crate.",
 )
 @click.option(
     "--split",
     is_flag=True,
-    help="Write a run folder per dataset, whose record verifies and replays alone.",
+    help="Write a run folder per dataset, whose record can be verified and replayed by itself.",
 )
 @input_option
 @store_option
@@ -68,10 +69,12 @@ _HELP: Final = "\n\n".join(
     "--cell",
     "cell",
     metavar="ADDRESS",
-    help="colmap: the step whose orientations are meant; without it the last one that oriented "
-    "photos. laz, copc, ply, e57: the step that found the planes; without it the last one that "
-    "did. layers: the step that projected photos onto walls, likewise. figures: the only step "
-    "that is meant. gltf, tiles, sheet, dxf, geojson: that of the orthoimages, likewise.",
+    help="colmap: the step with the orientations; by "
+    "default the last one that oriented photos. laz, copc, ply, e57: the step that found the "
+    "planes; "
+    "by default the last one that did. layers: the step that projected photos onto walls, "
+    "likewise. figures: only those "
+    "of this step. gltf, tiles, sheet, dxf, geojson: the step of the orthoimages, likewise.",
 )
 @click.option(
     "--license",
@@ -88,27 +91,31 @@ _HELP: Final = "\n\n".join(
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="sheet: draw at 1:N (50 or 1:50); without it the largest usual scale at which each wall "
-    "fits onto one sheet.",
+    help="sheet: draw at 1:N (50 or 1:50); by default the largest usual scale at "
+    "which each wall fits onto one sheet.",
 )
 @click.option(
     "--paper",
     metavar="PAPER",
     help="sheet: A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as 700x500; "
-    "without it the smallest that takes each wall on one sheet (without --scale at most A3).",
+    "by default the smallest that takes each wall on one sheet (without --scale at most A3).",
 )
 @click.option(
     "--grid",
     type=click.FloatRange(min=0.0),
     metavar="DISTANCE",
-    help="sheet: distance of the crosses with coordinates in --units, 0 for none; without it about "
-    "2 cm on the paper.",
+    help="sheet: distance of the crosses with coordinates in --units, 0 for none; by default "
+    "about 2 cm on the paper.",
 )
 @click.option(
     "--units",
     type=click.Choice(["m", "ft"]),
-    help="sheet: of coordinates, heights and the scale bar; m without it. With ft the usual scales "
-    "are 1:48 (1/4 inch to the foot) and so on.",
+    help="sheet: unit of coordinates, heights and the scale bar; m by default. With ft the "
+    "usual scales "
+    "are 1:48 (1/4 inch to the foot) and so "
+    ""
+    ""
+    "on.",
 )
 @click.option(
     "--title-block",
@@ -122,7 +129,7 @@ _HELP: Final = "\n\n".join(
     multiple=True,
     type=click.Choice(["depth", "intensity"]),
     help="sheet: show depth as contours, or the laser intensity, beside the orthoimage; "
-    "may be given twice.",
+    "can be given twice.",
 )
 @click.option(
     "--height",
@@ -130,46 +137,55 @@ _HELP: Final = "\n\n".join(
     type=float,
     multiple=True,
     metavar="METRES",
-    help="plan: how far above the floor it is cut; 1.2 without it; may be given several times.",
+    help="plan: height of the cut above the floor, 1.2 by default; can be given several times.",
 )
 @click.option(
     "--through",
     multiple=True,
     metavar="X,Y,X,Y",
-    help="section: two places of the plan, metres in the coordinates of the scan; who looks at the "
-    "section has the first on the left; may be given several times.",
+    help="section: two places of the plan, metres in the coordinates of the scan; the viewer "
+    "has the first on "
+    "the left; can be given several "
+    ""
+    ""
+    "times.",
 )
 @click.option("--dimensions", is_flag=True, help="plan, section: write lengths beside the lines.")
 @click.option(
     "--language",
     type=click.Choice(["en", "de", "fr", "pl", "es"]),
-    help="sheet, plan, section, elevation: language of labels; en without it.",
+    help="sheet, plan, section, elevation: language of labels; en by default.",
 )
 @click.option(
     "--light",
     metavar="AZIMUTH,ALTITUDE",
-    help="relief: where the light comes from, degrees: on the wall clockwise from above, and over "
-    "its plane; 315,25 (top left) without it.",
+    help="relief: direction of the light in degrees: clockwise from the top on "
+    "the wall, and altitude above its plane; 315,25 (top left) by default.",
 )
 @click.option(
     "--base-url",
     metavar="URL",
-    help="iiif: where the folder will be handed out, e.g. https://example.org/room; "
-    "http://localhost:8000 without it.",
+    help="iiif: where the folder will be published, e.g. https://example.org/room; "
+    "http://localhost:8000 by default.",
 )
 @click.option(
     "--format",
     "figure_format",
     type=click.Choice(["pdf", "svg", "png"]),
-    help="figures: of charts and drawings, png at 300 dpi; svg without it. Pictures become pages "
-    "of a PDF, and stay PNG otherwise.",
+    help="figures: format of charts and drawings, png at 300 dpi; svg by default. Pictures "
+    "become pages "
+    "of a PDF, and stay PNG "
+    ""
+    ""
+    "otherwise.",
 )
 @click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
     help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "
-    "point), of the scan, its intensity, a colour per plane, or blue behind and red before the "
-    "plane; without it the first of these that there is.",
+    "point), of the scan, its intensity, a colour per plane, or blue behind and red in front "
+    "of the "
+    "plane; by default the first of these that is available.",
 )
 @click.option(
     "--wall",
@@ -187,7 +203,7 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--clean",
     is_flag=True,
-    help="laz, copc, ply, e57: without points that have fewer than ten about them.",
+    help="laz, copc, ply, e57: without points that have fewer than ten neighbours.",
 )
 @click.option(
     "--relief",
@@ -199,7 +215,7 @@ _HELP: Final = "\n\n".join(
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Where to write it, a new or empty folder; without it export/FORMAT in RUN (or embedded, "
+    help="Where to write it, a new or empty folder; by default export/FORMAT in RUN (or embedded, "
     "datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
@@ -219,14 +235,14 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
-        raise RecordError(f"{finding}; what was changed is not handed on: take another copy of it")
+        raise RecordError(f"{finding}; changed records are not exported: use another copy")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             summary = _export_to(FORMATS[target], opened, aside, chosen)
         else:
             summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
-    return code_for([finding], f"rely on nothing in {folder}")
+    return code_for([finding], f"do not use anything in {folder}")
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
@@ -256,7 +272,7 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + ("all of it embedded before, the same seal" if is_same else "sealed again")
+        + ("everything was embedded already, the seal is the same" if is_same else "sealed again")
         + f": sha256:{after}"
     )
 

@@ -29,7 +29,7 @@ _RECIPES: Final = ("photos-on-scan", "direct", "plan")
     default=Path("workflow.yaml"),
     show_default=True,
     metavar="FILE",
-    help="Workflow file to write; one that is there stays as it is.",
+    help="Workflow file to write; an existing file is not changed.",
 )
 @click.option(
     "--recipe",
@@ -47,7 +47,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     from orthoflow.cli.progress import working_on
 
     if output.exists():
-        raise ArgumentError(f"{output} is there already: choose another name with -o")
+        raise ArgumentError(f"{output} exists already: choose another name with -o")
     with working_on("looking at the files"):
         from orthoflow.workflow.draft import draft_workflow, recognised
 

@@ -32,7 +32,7 @@ from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
 
 _SUMMARIES: Final = {
-    "list": "List every method, and what is wrong with plugins that do not load.",
+    "list": "List every method, and problems of plugins that do not load.",
     "show": "Show a method's parameters, ports, origin and citations.",
     "new": "Write a plugin of your own that works and passes its tests at once.",
     "check": "Run the conformance suite on a method.",
@@ -69,7 +69,7 @@ plugins: Final[click.Command] = LazyGroup(
 @click.command("list", cls=Command)
 @json_option
 def plugins_list(*, as_json: bool) -> int:
-    """List methods, kinds and product types, and what is wrong with plugins that do not load.
+    """List methods, kinds and product types, and problems of plugins that do not load.
 
     `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
     """
@@ -324,9 +324,7 @@ def _type_text(field: Mapping[str, Any], definitions: Mapping[str, Mapping[str, 
 @click.command("new", cls=Command)
 @click.argument("name", metavar="NAME")
 @click.option("--kind", default="", metavar="KIND", help="Kind of the method, e.g. plane.")
-@click.option(
-    "--new-kind", default="", metavar="KIND", help="A kind of its own instead, e.g. mark."
-)
+@click.option("--new-kind", default="", metavar="KIND", help="A new kind instead, e.g. mark.")
 @click.option(
     "--takes",
     default="cloud",
@@ -345,9 +343,9 @@ def _type_text(field: Mapping[str, Any], definitions: Mapping[str, Mapping[str, 
     "--folder",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     default=Path(),
-    help="Where the folder NAME is made; the current one unless given.",
+    help="Where the folder NAME is made; by default the current folder.",
 )
-@click.option("--author", default="The authors", help="For pyproject, licence and citation.")
+@click.option("--author", default="The authors", help="Name for pyproject, licence and citation.")
 @click.option("--licence", default="MIT", show_default=True, help="SPDX expression.")
 @click.option("--citation", default="", help="Where the method comes from: DOI, title or URL.")
 @json_option
@@ -365,7 +363,7 @@ def plugins_new(
     if about["kind"] and new_kind:
         raise click.UsageError(
             f"--kind {about['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
-            "its own) exclude each other: leave one of them out"
+            "its own) exclude each other: omit one of them"
         )
     if not (about["kind"] or new_kind):
         raise click.UsageError(
@@ -416,7 +414,7 @@ def plugins_new(
 @click.option(
     "--quick",
     is_flag=True,
-    help="Leave out what takes more than two runs of the method, and name it.",
+    help="Skip and name checks that need more than two runs of the method.",
 )
 @json_option
 def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: bool) -> int:

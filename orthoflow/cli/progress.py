@@ -119,7 +119,7 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
         return ""
     # A few short steps would suggest that a run of minutes is nearly over.
     if not known or n_unknown > len(known):
-        return "time left not known yet"
+        return "remaining time not yet known"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
     if n_unknown:
         return f"at least {seconds} left; {counted(n_unknown, 'step')} without an estimate"
@@ -231,7 +231,7 @@ def end_text(event: CellFinished) -> str:
         return f"{event.address}: cached"
     took = f" in {duration(result.wall_s)}" if result.started else ""
     if took and (result.compile_s or 0.0) >= _MIN_COMPILE_S:
-        took += f", besides {duration(result.compile_s or 0.0)} of loading and compiling"
+        took += f", plus {duration(result.compile_s or 0.0)} of loading and compiling"
     # The summary states why something was skipped.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"

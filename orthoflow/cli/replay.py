@@ -161,8 +161,8 @@ class _Call:
         from orthoflow.records.runs import REPORT_FILE
 
         current_session().resume_hint = (
-            "interrupted; what is finished is kept, and the same command with "
-            f"-o {self.folder} goes on from there"
+            "interrupted; finished steps are kept, and "
+            f"the same command with -o {self.folder} goes on from there"
         )
         for note in self.replay.notes:
             echo(f"note: {note}", err=self.as_json)

@@ -18,7 +18,7 @@ from orthoflow.errors import ArgumentError
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Where to write it; for a single run its own report.html.",
+    help="Output file; for a single run by default its own report.html.",
 )
 @store_option
 def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:

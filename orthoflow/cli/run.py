@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 @click.option(
     "--embed",
     is_flag=True,
-    help="Put everything into the record: also point clouds, photos and the input files.",
+    help="Put everything into the record, including point clouds, photos and the input files.",
 )
 @click.option(
     "--json-log",
@@ -149,7 +149,7 @@ class Call:
         report = folder / REPORT_FILE
         _print_tracebacks(made.run.record.cells, folder / LOGS)
         if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
-            echo_error(f"with more room on the disk, the same command with -o {folder} goes on")
+            echo_error(f"with more disk space, the same command with -o {folder} goes on")
         try:
             _print_summary(made, report)
         except BrokenPipeError:
@@ -168,8 +168,8 @@ class Call:
         run_id = new_run_id()
         folder = self.folder or new_run_folder(self.workflow.name, run_id)
         current_session().resume_hint = (
-            "interrupted; what is finished is kept, and the same command with "
-            f"-o {folder} goes on from there"
+            "interrupted; finished steps are kept, and "
+            f"the same command with -o {folder} goes on from there"
         )
         report = folder / REPORT_FILE
 
@@ -235,7 +235,7 @@ class Call:
             write_page(run, report, go_on=go_on)
 
         if show_unfinished(outcome, self.plan, self.workflow, folder, self.store, show):
-            echo_error(f"report of what there is so far: {report}")
+            echo_error(f"report of the finished steps: {report}")
 
 
 @contextmanager

@@ -70,7 +70,7 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "page",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write a page that leads to the report of each run.",
+    help="Write a page with links to the report of each run.",
 )
 @click.option(
     "--csv",

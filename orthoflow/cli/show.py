@@ -79,7 +79,7 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
         _print_environments(opened)
         _print_files(opened)
         echo("", verify_hint(run))
-    return code_for([broken_seal(opened)], "do not rely on what is printed here")
+    return code_for([broken_seal(opened)], "do not rely on this output")
 
 
 def _print_head(run: Run) -> None:

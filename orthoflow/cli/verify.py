@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option(
     "--strict",
     is_flag=True,
-    help="Fail over notes, too: published files that are missing or not the record's, a changed "
+    help="Also fail for notes: published files that are missing or not the record's, a changed "
     "report, a signature that was not checked.",
 )
 @json_option
@@ -72,7 +72,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     else:
         for finding in findings:
             echo(finding)
-        beside = f"the seal of {verification.path} holds, but what lies beside it is not as written"
+        beside = f"the seal of {verification.path} holds, but files beside it are not as written"
         echo_error(f"error: {verification.wrong or beside}, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 

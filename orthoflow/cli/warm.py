@@ -31,7 +31,7 @@ _RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
     "orient-methods": _WITH_PHOTOS,
     "ortho-methods": _WITH_PHOTOS,
 }
-_UNKNOWN: Final = "no simulated room tries it: it compiles when it first runs"
+_UNKNOWN: Final = "no simulated room uses it: it is compiled when it first runs"
 
 
 @click.command(cls=Command)

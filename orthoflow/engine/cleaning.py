@@ -1,4 +1,4 @@
-"""Cleaning a store: damage is found and set aside, and what nothing needs is removed."""
+"""Cleaning a store: damaged objects are set aside, and unneeded ones are removed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from orthoflow.errors import ArgumentError
 
 @dataclass(frozen=True, kw_only=True)
 class Damage:
-    """Something damaged that was set aside.
+    """A damaged object that was set aside.
 
     Attributes:
-        name: what it was called below the store's folder.
-        what: the part that was damaged; for a result, why it is of no use.
+        name: its path below the store's folder.
+        what: the damaged part; for a result, why it is unusable.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Damage:
 
 @dataclass(frozen=True, kw_only=True)
 class Aside:
-    """What lies aside until garbage collection removes it: how many things, and how large."""
+    """Objects set aside until garbage collection removes them: number and size."""
 
     count: int
     size_bytes: int
@@ -40,13 +40,13 @@ class Aside:
 
 @dataclass(frozen=True, kw_only=True)
 class Soundness:
-    """What a look at a store gave.
+    """The result of checking a store.
 
     Attributes:
-        n_results: sound results.
-        n_objects: sound products and figures.
+        n_results: intact results.
+        n_objects: intact products and figures.
         damaged: what was set aside now.
-        aside: everything that lies aside.
+        aside: everything that was set aside.
     """
 
     n_results: int
@@ -56,12 +56,12 @@ class Soundness:
 
 
 def check_store(store: Store) -> Soundness:
-    """Look at every object and every result; runs may use the store meanwhile.
+    """Check every object and every result; runs may use the store meanwhile.
 
-    A result whose products or figures are not all there is set aside too.
+    A result with missing products or figures is set aside too.
 
     Raises:
-        ArgumentError: something else lies in the folder.
+        ArgumentError: the folder has other content.
         StoreError: the store cannot be read, or something damaged cannot be set aside.
     """
     require_store(store.folder)
@@ -87,7 +87,7 @@ def lying_aside(store: Store) -> Aside:
 
 
 def _named_by_digest(folder: Path) -> tuple[str, ...]:
-    """Names, without suffix, of what the store puts there; what else lies there is not ours."""
+    """Yield names, without suffix, of the store's own files; others are not ours."""
     names = (path.name.removesuffix(".json") for path in folder.glob("*"))
     return tuple(sorted(name for name in names if re.fullmatch("[0-9a-f]{64}", name)))
 
@@ -95,7 +95,7 @@ def _named_by_digest(folder: Path) -> tuple[str, ...]:
 def _damaged_objects(store: Store, names: Iterable[str]) -> Iterator[Damage]:
     for name in names:
         part = store.damage(name, with_published=True, again=True)
-        # One that is gone was exchanged by a run, or removed by somebody: results will tell.
+        # A missing one was replaced by a run, or removed by somebody: results will show it.
         if part and part != WHOLE:
             yield Damage(name=f"objects/{name}", what=part)
 
@@ -117,7 +117,7 @@ class GarbageReport:
     Attributes:
         n_results: results.
         n_objects: products and figures.
-        n_damaged: what had been set aside because it was damaged.
+        n_damaged: number of damaged objects that had been set aside.
         freed_bytes: bytes of everything removed.
     """
 
@@ -130,15 +130,15 @@ class GarbageReport:
 def collect_garbage(
     store: Store, *, older_than_days: float | None = None, dry_run: bool = False
 ) -> GarbageReport:
-    """Remove incomplete results, products without results, what is damaged or left by killed runs.
+    """Remove incomplete results, products without results, damaged objects and leftovers.
 
     Args:
         store: the store; no run may use it meanwhile.
-        older_than_days: also remove results that no run used for so many days; 0 removes all.
-        dry_run: only say what would go.
+        older_than_days: also remove results that no run used for this many days; 0 removes all.
+        dry_run: only report what would be removed.
 
     Raises:
-        ArgumentError: the number of days is negative, or something else lies in the folder.
+        ArgumentError: the number of days is negative, or the folder has other content.
         StoreError: a run uses the store.
     """
     if older_than_days is not None and older_than_days < 0:
@@ -171,7 +171,7 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
     )
     freed = sum(size_of(path) for path in (*results, *objects, *preimages, *rest))
     if not is_dry:
-        # Results first: killed in between, no result is left whose objects are gone.
+        # Results first: after a kill in between, no result remains whose objects are gone.
         for path in (*results, *preimages, *objects, *rest):
             _remove(path)
     return GarbageReport(

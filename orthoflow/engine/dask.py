@@ -2,7 +2,7 @@
 
 A worker runs a task in a process of its own as one machine does; its products go into the store,
 and Dask carries the task there and its result back. An attempt has a folder of its own in that of
-the task: a worker that was given up may still write into its own, and the number of folders says
+the task: a worker that was given up may still write into its own, and the number of folders shows
 how often the task was tried. Workers that the executor makes itself are threads of this process.
 """
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
 
 
-# In the folder of a task: who finds it stops.
+# In the folder of a task: a task that finds it stops.
 CANCEL_FILE: Final = "cancel"
 _ATTEMPT: Final = "attempt-"
 _POLL_S: Final = 0.1
@@ -53,15 +53,15 @@ _LOOK_S: Final = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What a worker is told besides the task itself.
+    """The instructions for a worker besides the task itself.
 
     Attributes:
         task: what to run.
-        name: what the scheduler calls it.
-        topic: where to say how it goes.
-        retries: so often it may be tried again after its worker was lost.
-        methods: what the plan says of its methods, see `methods_text`; empty for a worker in the
-            process that made the plan.
+        name: the scheduler's name for it.
+        topic: topic for progress messages.
+        retries: how often it may be repeated after its worker was lost.
+        methods: the plan's statement about its methods, see `methods_text`; empty for a worker in
+            the process that made the plan.
     """
 
     task: Task
@@ -73,12 +73,12 @@ class Order:
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """What a worker finds where it is.
+    """The surroundings of a worker.
 
     Attributes:
-        seen: content of the file that it was asked to read, or why it cannot.
+        seen: content of the file that it was asked to read, or why it cannot read it.
         clock_s: its time, seconds since 1970.
-        misfit: in what its methods or libraries are others; empty when they are the same.
+        misfit: how its methods or libraries differ; empty if they are the same.
     """
 
     seen: str
@@ -87,7 +87,7 @@ class Surroundings:
 
 
 def look_around(path: str, methods: str) -> Surroundings:
-    """State what a worker sees: runs on each before it gets a task."""
+    """Return the surroundings of a worker: runs on each before it gets a task."""
     try:
         seen = Path(path).read_text(encoding="utf-8")
     except OSError as error:
@@ -96,7 +96,7 @@ def look_around(path: str, methods: str) -> Surroundings:
 
 
 def run_attempt(order: Order) -> str:
-    """Run a task in a child process of this worker; give its result as JSON."""
+    """Run a task in a child process of this worker; return its result as JSON."""
     worker = get_worker()
     task = order.task
     home = Path(task.folder)
@@ -122,7 +122,7 @@ def run_attempt(order: Order) -> str:
 
 
 def describe_loss(who: str, times: int) -> str:
-    """State that a task was given up because workers were lost under it."""
+    """Report that a task was given up because workers were lost."""
     lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
     return f"{who} was given up: {lost}; the logs of the workers may say why"
 
@@ -141,7 +141,7 @@ def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> C
 
 
 def _is_given_up(worker: Worker, name: str) -> bool:
-    """Whether nobody waits for a task any more: its run has ended, or gave it to another worker."""
+    """Whether a task is obsolete: its run has ended, or another worker has it."""
     state = worker.state.tasks.get(name)
     is_closing = worker.status not in WORKER_ANY_RUNNING
     return is_closing or state is None or state.state == "cancelled"
@@ -151,20 +151,20 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
     return result_to_json(failed_result(task, error))
 
 
-# The resource that workers state: cores that steps may use there.
+# The resource that workers state: cores for steps.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
-# So long a run waits for a first worker, for a lost scheduler, and when all workers are gone.
+# Time to wait for a first worker, for a lost scheduler, and when all workers are gone.
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
-# Steps have 5 s to stop by themselves, and their workers hear of it within one.
+# Steps have 5 s to stop by themselves, and their workers are informed within one.
 _STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
 # File times decide what is old in a store.
 _CLOCKS_APART_S: Final = 60.0
-# Otherwise each worker would look a hundred times a second at what its thread does, which is to
-# wait, and fifty times at its own loop.
+# Otherwise each worker would check a hundred times a second what its thread does, which is to wait,
+# and fifty times its own loop.
 _QUIET: Final = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
@@ -174,7 +174,7 @@ _QUIET: Final = {
 
 @dataclass(kw_only=True)
 class _Running:
-    """A task, and what dask makes of it."""
+    """A task, and its state in dask."""
 
     task: Task
     future: Future[str]
@@ -184,13 +184,13 @@ class DaskExecutor:
     """Runs tasks on the workers of a cluster, or on workers of its own."""
 
     def __init__(self, plan: RunPlan, scratch: Path, capacity: Capacity, tell: Tell) -> None:
-        """Connect to the scheduler, and make sure that each worker can do what the plan asks.
+        """Connect to the scheduler, and check that each worker can execute the plan.
 
         Args:
-            plan: its options say which scheduler; its methods must be those of the workers.
+            plan: its options name the scheduler; its methods must be those of the workers.
             scratch: a folder of the run in the store.
-            capacity: of the workers that it makes itself where no scheduler is given.
-            tell: gets the address of a task and what it says.
+            capacity: of the workers that it makes itself without a scheduler.
+            tell: called with the address of a task and its message.
 
         Raises:
             ArgumentError: there is no such scheduler, no worker, or one does not see the store.
@@ -219,11 +219,11 @@ class DaskExecutor:
 
     @property
     def capacity(self) -> Capacity:
-        """What the workers that are there may do at the same time."""
+        """Return what the present workers can run at the same time."""
         return self._capacity
 
     def start(self, task: Task) -> None:
-        """Hand a task to the scheduler.
+        """Submit a task to the scheduler.
 
         Raises:
             StoreError: its files cannot be written.
@@ -245,7 +245,7 @@ class DaskExecutor:
         future.add_done_callback(lambda _, address=task.address: self._news.put((address, None)))
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
-        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile.
+        """Wait for tasks to end, up to a time; forwards messages of running tasks.
 
         Raises:
             ClusterError: the scheduler, or every worker, is gone.
@@ -266,19 +266,19 @@ class DaskExecutor:
         return ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop; those that nobody hears of for 20 s are given up."""
+        """Ask all tasks to stop; those that do not answer for 20 s are given up."""
         self._stop_at = time.monotonic() + _STOPPING_S
         for run in self._running.values():
             with suppress(OSError):
                 (Path(run.task.folder) / CANCEL_FILE).touch()
 
     def close(self) -> None:
-        """Let go of whatever still runs: workers stop what nobody waits for."""
+        """Release whatever still runs: workers stop obsolete tasks."""
         for run in self._running.values():
             with suppress(Exception):
                 run.future.cancel()
         cluster = self._client.cluster
-        # What dask says when something is gone already helps nobody.
+        # Dask's messages about losses are of no use at this point.
         with suppress(Exception):
             self._client.close(timeout=_CLOSE_S)
         if cluster is not None:
@@ -317,7 +317,7 @@ class DaskExecutor:
                 task, StepFailedError(f"{task.who} could not be run by its worker ({said})")
             )
 
-    # Any: what a worker said of itself.
+    # Any: a worker's own statement.
     def _hear(self, event: tuple[float, Any]) -> None:
         said = event[1]
         with suppress(AttributeError, KeyError, TypeError, ValueError):
@@ -331,7 +331,7 @@ class DaskExecutor:
             self._news.put((str(said["address"]), heard))
 
     def _watch(self) -> None:
-        """Look every two seconds who is there."""
+        """Check every two seconds which workers are present."""
         now = time.monotonic()
         if now - self._looked < _WATCH_S:
             return
@@ -341,7 +341,7 @@ class DaskExecutor:
         workers = self._workers() if self._client.status == "running" else {}
         if workers:
             self._with_workers = now
-            # Its own share the cores of this machine, however many they are.
+            # Its own workers share the cores of this machine, however many they are.
             self._capacity = _capacity(workers) if self._address else self._capacity
         elif self._running and now - self._with_workers > _PATIENCE_S:
             raise self._lost()
@@ -353,9 +353,9 @@ class DaskExecutor:
             f"command with the same -o goes on, with any executor"
         )
 
-    # Any: what the scheduler knows of its workers.
+    # Any: the scheduler's statement about its workers.
     def _workers(self) -> Mapping[str, Any]:
-        """Address -> facts, of the workers that say how many cores they have."""
+        """Return address -> facts, of the workers that state their cores."""
         try:
             known = self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception:  # noqa: BLE001 - whatever keeps it from answering: it does not
@@ -402,7 +402,7 @@ class DaskExecutor:
 
 
 def _client(address: str, capacity: Capacity) -> Client:
-    # It tells of each lost worker, with tracebacks; what matters is said by us.
+    # It logs each lost worker with tracebacks; the relevant part is reported by us.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address:
         try:
@@ -417,11 +417,11 @@ def _client(address: str, capacity: Capacity) -> Client:
             n_workers=capacity.n_tasks,
             threads_per_worker=1,
             processes=False,
-            # The scheduler of the run sees to it that all together take no more than there are.
+            # The run's scheduler ensures that all together do not exceed the cores.
             resources={CORES: capacity.n_cores},
             # Steps are processes of their own, whose memory is watched by us.
             memory_limit=0,
-            # Nobody else reaches them.
+            # They are not accessible from outside.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
@@ -429,7 +429,7 @@ def _client(address: str, capacity: Capacity) -> Client:
     return Client(cluster, set_as_default=False)
 
 
-# Any: what the scheduler knows of its workers.
+# Any: the scheduler's statement about its workers.
 def _capacity(workers: Mapping[str, Any]) -> Capacity:
     cores = [int(facts["resources"][CORES]) for facts in workers.values()]
     share = max(1, min(cores))

@@ -1,4 +1,4 @@
-"""Writing that survives a kill, JSON that carries its own digest, and locks between processes."""
+"""Writing that survives a kill, JSON with its own digest, and locks between processes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
     errno.EDQUOT: "the disk quota is used up; free some space, or choose another folder",
     errno.EFBIG: "the file would be larger than allowed here; choose another folder",
-    errno.EIO: "Input/output error, the disk or the way to it fails; choose another folder",
-    errno.ESTALE: "Stale file handle, the disk is not connected any more; connect it anew",
+    errno.EIO: "Input/output error, the disk or its connection fails; choose another folder",
+    errno.ESTALE: "Stale file handle, the disk is not connected any more; reconnect it",
     errno.EROFS: "the disk is read-only; choose another folder",
     errno.EACCES: "permission is denied; choose another folder",
     errno.EPERM: "permission is denied; choose another folder",
     errno.ENOTDIR: "a file stands where a folder is needed; choose another folder",
 }
 
-# What no method is to blame for when it happens in the store.
+# Errors in the store that are not the fault of a method.
 _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
 
 
 def is_broken(error: OSError, folder: Path) -> bool:
-    """Whether an error says that the disk on which a folder lies fails, and not that it is full."""
+    """Whether an error means that the disk of a folder fails, and not that it is full."""
     if error.errno not in _BROKEN:
         return False
     # Descriptors have no names.
@@ -66,7 +66,7 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut, where a system lets folders be synced."""
+    """Make renames in a folder survive a power cut, if the system can sync folders."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -78,7 +78,7 @@ def sync_folder(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Make the content of a closed file survive a power cut."""
-    # Windows syncs files that may be written only.
+    # Windows only syncs files opened for writing.
     descriptor = os.open(path, flags("O_RDWR" if os.name == "nt" else "O_RDONLY"))
     try:
         os.fsync(descriptor)
@@ -87,7 +87,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make everything below a folder survive a power cut, its name in its own folder left aside."""
+    """Make everything below a folder survive a power cut, except its own name."""
     folders = [folder]
     for path in folder.rglob("*"):
         if path.is_dir():
@@ -99,10 +99,10 @@ def sync_tree(folder: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file aside and rename it into place; readers see the old one or the new one.
+    """Write a temporary file and rename it; readers see the old one or the new one.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     aside = path.with_name(f".{path.name[:40]}-{uuid.uuid4().hex}")
     with writing_to(path.parent):
@@ -122,10 +122,10 @@ def place_folder(aside: Path, final: Path) -> bool:
     """Rename a finished folder into place.
 
     Returns:
-        False when another writer was first; the newcomer is then removed.
+        False if another writer was first; the new folder is then removed.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     with writing_to(final.parent):
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -143,17 +143,18 @@ def place_folder(aside: Path, final: Path) -> bool:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Give the name of a folder to make and fill; it gets its final name when the block ends well.
+    """Yield the name of a folder to create and fill; it gets its final name if the block succeeds.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     aside = final.with_name(f".{final.name}.unfinished")
     remove_tree(aside)
     try:
         with writing_to(final):
             if os.path.lexists(aside):
-                # What could not be removed would be handed over with the rest: this says why.
+                # A part that could not be removed would be passed on with the rest: this states
+                # why.
                 shutil.rmtree(aside)
             yield aside
             sync_tree(aside)
@@ -165,16 +166,16 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder that may be gone already or be removed by somebody else meanwhile."""
+    """Remove a folder that may be gone already or be removed by another process meanwhile."""
     try:
         shutil.rmtree(folder, ignore_errors=True)
     except RecursionError:
-        # Before Python 3.13 it calls itself for every level, and there may be thousands.
+        # Before Python 3.13 it recurses for every level, and there may be thousands.
         subprocess.run(["rm", "-rf", "--", folder], stderr=subprocess.DEVNULL, check=False)
 
 
 def folder_size(folder: Path) -> int:
-    """Bytes of all files below a folder, 0 when it is not there."""
+    """Return the size of all files below a folder, 0 if it is missing."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -189,7 +190,7 @@ _DIGEST: Final = re.compile(r'\{"sha256":"([0-9a-f]{64})",')
 
 
 def with_digest(text: str) -> str:
-    """Put the SHA-256 of a JSON object's text into it as its first entry.
+    """Insert the SHA-256 of a JSON object's text as its first entry.
 
     >>> with_digest('{"a":1}')[:24]
     '{"sha256":"015abd7f5cc57'
@@ -198,7 +199,7 @@ def with_digest(text: str) -> str:
 
 
 def is_checked(text: str) -> bool:
-    """Whether a text has the digest that it begins with; one that begins with none has not."""
+    """Whether a text has the digest that it begins with; False without a digest."""
     found = _DIGEST.match(text)
     return found is not None and found[1] == _sha256(f"{{{text[found.end() :]}")
 
@@ -209,10 +210,10 @@ def _sha256(text: str) -> str:
 
 @contextmanager
 def shared_lock(path: Path) -> Iterator[None]:
-    """Hold a lock that many may hold at once; waits while one holds it exclusively.
+    """Hold a shared lock; waits while another process holds it exclusively.
 
     Raises:
-        StoreError: the lock file cannot be made, or the file system has no locks.
+        StoreError: the lock file cannot be created, or the file system has no locks.
     """
     with _waited_for(path, is_shared=True):
         yield
@@ -220,10 +221,10 @@ def shared_lock(path: Path) -> Iterator[None]:
 
 @contextmanager
 def taking_turns(path: Path) -> Iterator[None]:
-    """Hold a lock alone; waits while somebody else holds it.
+    """Hold an exclusive lock; waits while another process holds it.
 
     Raises:
-        StoreError: the lock file cannot be made, or the file system has no locks.
+        StoreError: the lock file cannot be created, or the file system has no locks.
     """
     with _waited_for(path, is_shared=False):
         yield
@@ -231,14 +232,14 @@ def taking_turns(path: Path) -> Iterator[None]:
 
 @contextmanager
 def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
-    """Hold a lock alone; never waits.
+    """Hold an exclusive lock; never waits.
 
     Args:
-        path: lock file, made when missing.
-        busy: the sentence for the case that somebody holds it.
+        path: lock file, created if missing.
+        busy: the sentence in case another process holds it.
 
     Raises:
-        StoreError: somebody holds it, or it cannot be made.
+        StoreError: another process holds it, or it cannot be created.
     """
     with _opened(path) as lock:
         if not _taken(lock, path, is_shared=False, waits=False):
@@ -247,7 +248,7 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds the lock file, shared or alone."""
+    """Whether a living process holds the lock file, shared or exclusively."""
     if not path.exists():
         return False
     with _opened(path) as lock:

@@ -20,10 +20,10 @@ _GIT_TIMEOUT_S: Final = 10.0
 
 
 def environment(threads: int) -> RecordedEnvironment:
-    """Describe this machine and installation, as a record's environment has it.
+    """Describe this machine and installation for a record.
 
     Args:
-        threads: threads given to the cell.
+        threads: threads of the cell.
     """
     unnamed = RecordedEnvironment(
         id="",
@@ -41,20 +41,20 @@ def environment(threads: int) -> RecordedEnvironment:
 
 
 def python_path() -> str:
-    """`PYTHONPATH` for a child process that is to import what this one would."""
+    """Return `PYTHONPATH` for a child process with the import path of this one."""
     paths = [str(Path(path).absolute()) for path in sys.path]
     return os.pathsep.join(dict.fromkeys(paths))
 
 
 @cache
 def packages() -> dict[str, str]:
-    """Installed distributions with their versions, the first of a name winning as on import."""
+    """Return installed distributions with their versions; the first of a name wins as on import."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
         try:
             name, version = _stated(distribution)
         except ValueError:
-            # Not even text: nobody can say what it is.
+            # Not even text, so its meaning is unknown.
             continue
         if name and version and name not in found:
             found[name] = version
@@ -62,7 +62,7 @@ def packages() -> dict[str, str]:
 
 
 def _stated(distribution: metadata.Distribution) -> tuple[str, str]:
-    """Name and version of a distribution, without the long text behind them: each run reads all."""
+    """Return name and version of a distribution, without reading its long description."""
     files = ("METADATA", "PKG-INFO", "")  # the last where the file itself is on the path
     text = next(filter(None, map(distribution.read_text, files)), "")
     stated = {"name": "", "version": ""}
@@ -77,7 +77,7 @@ def _stated(distribution: metadata.Distribution) -> tuple[str, str]:
 
 @cache
 def cpu_name() -> str:
-    """Model name of the processor."""
+    """Return the model name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -88,7 +88,7 @@ def cpu_name() -> str:
 
 @cache
 def git_commit() -> str:
-    """Commit of orthoflow's code when run from a checkout, `+changes` behind it when dirty."""
+    """Return the commit of orthoflow's code in a checkout, with `+changes` if modified."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
@@ -112,17 +112,17 @@ def _git(root: Path, *arguments: str) -> str:
 
 
 def now() -> str:
-    """The time as ISO 8601 in UTC, to milliseconds."""
+    """Return the time as ISO 8601 in UTC, to milliseconds."""
     return _written(datetime.now(UTC), "milliseconds")
 
 
 def time_of_file(mtime_s: float) -> str:
-    """The time of a file, in seconds since 1970, as ISO 8601 in UTC, to seconds."""
+    """Return the time of a file, in seconds since 1970, as ISO 8601 in UTC, to seconds."""
     return _written(datetime.fromtimestamp(mtime_s, tz=UTC), "seconds")
 
 
 def time_in_a_name() -> str:
-    """The time in UTC as names have it: digits that sort."""
+    """Return the time in UTC for use in names: digits that sort."""
     return f"{datetime.now(UTC):%Y%m%d-%H%M%S}"
 
 

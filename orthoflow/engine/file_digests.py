@@ -1,6 +1,7 @@
-"""SHA-256 of input files, remembered as long as the file system says they are the same.
+"""SHA-256 of input files, cached as long as the file system reports them unchanged.
 
-And where files lay: records name no folders, so this is how those of an earlier run are found.
+The paths of files are kept, too: records contain no folders, so this is how those of an earlier run
+are found.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ _SETTLED_NS: Final = 2_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class FileRef(RecordedFile):
-    """An input file by name and content, where it lies.
+    """An input file by name, content and path.
 
     Attributes:
-        identity: what the file system says of it; only to notice a change while a step reads it.
+        identity: file system attributes, used only to notice a change while a step reads it.
     """
 
     identity: str
@@ -57,7 +58,7 @@ class FileDigests:
         """Return the digest of one file.
 
         Raises:
-            InputError: the file cannot be read, or has a name that a record cannot take.
+            InputError: the file cannot be read, or its name is not allowed in a record.
         """
         if problem := name_problem(path.name):
             raise InputError(
@@ -66,13 +67,11 @@ class FileDigests:
             )
         if text_of_path(path) is None:
             raise InputError(
-                f"the input file {one_line(path)} has a path that is no UTF-8: rename it"
+                f"the input file {one_line(path)} has a path that is not UTF-8: rename it"
             )
         try:
             if not stat.S_ISREG(path.stat().st_mode):
-                raise InputError(
-                    f"the input {path} is no file: expected one that can be read again"
-                )
+                raise InputError(f"the input {path} is not a regular file, which can be read again")
             identity = file_identity(path)
             known = self._known.get(identity)
             sha256 = known or file_sha256(path)
@@ -93,14 +92,14 @@ class FileDigests:
         )
 
     def note_place(self, sha256: str, path: Path) -> None:
-        """Remember where a run found a file, unless it still lies where an earlier one did."""
+        """Record where a run found a file, unless it is still at an earlier path."""
         earlier, place = self.place(sha256), path.absolute()
         if earlier is None or (earlier != place and not self._is_known(earlier, sha256)):
             self._places[sha256] = str(place)
             self._is_dirty = True
 
     def place(self, sha256: str) -> Path | None:
-        """Where a file of that digest lay, which may be gone or changed since."""
+        """Return where a file of that digest was, which may be gone or changed since."""
         place = self._places.get(sha256)
         return None if place is None else Path(place)
 
@@ -111,10 +110,10 @@ class FileDigests:
             return False
 
     def save(self) -> None:
-        """Keep what is new for the next run.
+        """Save new digests for the next run.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         if self._is_dirty:
             text = json.dumps({"files": self._known, "places": self._places}, sort_keys=True)
@@ -123,10 +122,10 @@ class FileDigests:
 
 
 def file_identity(path: Path) -> str:
-    """What the file system says of a file as long as it stays as it is.
+    """Return file system attributes that are constant while a file is unchanged.
 
     Raises:
-        OSError: the file cannot be reached.
+        OSError: the file is not accessible.
     """
     return _identity(path.stat())
 

@@ -1,4 +1,4 @@
-"""A run folder: names of what lies in it, its journal, and what a run says while it goes on."""
+"""A run folder: names of its contents, its journal, and events of a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from orthoflow.system import file_lock, flags
 
 @dataclass(frozen=True, kw_only=True)
 class RunStarted:
-    """The run begins, or goes on after an interruption.
+    """The run begins, or continues after an interruption.
 
     Attributes:
         run_id: id of the run.
@@ -50,7 +50,7 @@ class CellStarted:
 
 @dataclass(frozen=True, kw_only=True)
 class CellProgress:
-    """A running cell is this far, 0..1."""
+    """A running cell has reached this fraction, 0..1."""
 
     address: str
     fraction: float
@@ -67,7 +67,7 @@ class CellLogged:
 
 @dataclass(frozen=True, kw_only=True)
 class CellReported:
-    """A running cell reports something that deserves attention."""
+    """A running cell reports a diagnostic."""
 
     address: str
     diagnostic: Diagnostic
@@ -78,10 +78,9 @@ class CellFinished:
     """A cell has its outcome.
 
     Attributes:
-        address: of the cell.
+        address: address of the cell.
         result: ok, failed or skipped.
-        cached: the result was in the store, also when this run put it there before it was
-            interrupted.
+        cached: the result was in the store, also if this run stored it before it was interrupted.
     """
 
     address: str
@@ -96,7 +95,7 @@ RunListener: TypeAlias = Callable[[RunEvent], None]
 
 
 def ignore(event: RunEvent) -> None:
-    """Take an event and do nothing with it."""
+    """Accept an event and do nothing."""
 
 
 JOURNAL: Final = "journal.jsonl"
@@ -112,7 +111,7 @@ class RunBegan:
     """The first line of a journal.
 
     Attributes:
-        time: ISO 8601 UTC, as in every line; who resumes takes the run's start from here.
+        time: ISO 8601 UTC, as in every line; a resumed run takes its start from here.
         format: of the journal.
         run_id: id of the run.
         workflow: name of the workflow.
@@ -127,7 +126,7 @@ class RunBegan:
 
 @dataclass(frozen=True, kw_only=True)
 class RunWent:
-    """The run as a whole went on, was broken off, or ended."""
+    """The run as a whole was continued, interrupted or ended."""
 
     event: Literal["resumed", "interrupted", "ended"]
     time: str
@@ -135,7 +134,7 @@ class RunWent:
 
 @dataclass(frozen=True, kw_only=True)
 class CellBegan:
-    """A cell was given to the executor."""
+    """A cell was passed to the executor."""
 
     event: Literal["started"] = "started"
     time: str
@@ -150,8 +149,8 @@ class CellEnded:
     Attributes:
         event: of the line.
         time: ISO 8601 UTC.
-        address: of the cell.
-        key: its key.
+        address: address of the cell.
+        key: its cache key.
         status: ok, failed or skipped.
         cached: it was in the store.
         error: the sentence of a failure.
@@ -170,7 +169,7 @@ class CellEnded:
 
 @dataclass(frozen=True, kw_only=True)
 class CellDamaged:
-    """The stored result of a cell was damaged; `what` says in which parts."""
+    """The stored result of a cell was damaged; `what` names the parts."""
 
     event: Literal["damaged"] = "damaged"
     time: str
@@ -186,25 +185,25 @@ class Journal:
     """An open run folder, locked for this process.
 
     Attributes:
-        run_id: of the run; kept when it is resumed.
+        run_id: id of the run; kept when it is resumed.
         is_resumed: the folder held an unfinished run.
         started: ISO 8601 UTC, of the first attempt.
         finished_keys: keys of the cells that this run has computed before it was interrupted.
-        damaged: address -> what of its stored result was found damaged in this run.
+        damaged: address -> damaged parts of its stored result found in this run.
     """
 
     def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
-        """Open or make a run folder.
+        """Open or create a run folder.
 
         Args:
             folder: the run folder.
             name: name of the workflow.
-            run_id: id of a new run, made up when empty; a resumed run keeps its own.
+            run_id: id of a new run, generated if empty; a resumed run keeps its own.
 
         Raises:
-            ArgumentError: the folder is in use by another run, or holds a finished run in which
-                nothing lacked room on the disk, another workflow's run, or other files.
-            StoreError: the disk refuses.
+            ArgumentError: the folder is in use by another run, or holds a finished run without lack
+                of disk space, another workflow's run, or other files.
+            StoreError: the disk cannot be written.
         """
         self._folder = folder
         self._path = folder / JOURNAL
@@ -230,10 +229,10 @@ class Journal:
         os.close(self._descriptor)
 
     def write(self, line: JournalLine) -> None:
-        """Add a line and bring it to the disk.
+        """Append a line and sync it to the disk.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         if isinstance(line, CellDamaged):
             self.damaged[line.address] = line.what
@@ -272,7 +271,7 @@ class Journal:
             sync_folder(self._folder)
 
     def _reopen(self, lines: Sequence[JournalLine]) -> None:
-        """Take the name of a finished run from a record; the next one replaces it."""
+        """Remove the name of a finished run from a record; the next one replaces it."""
         if not _lacked_room(lines):
             raise _is_finished(self._folder)
         record = self._folder / RECORD_FILE
@@ -280,7 +279,7 @@ class Journal:
             record.replace(self._folder / f".{RECORD_FILE}.earlier")
 
     def _read_lines(self) -> list[JournalLine]:
-        """Read whole lines; a last one that was cut off by a kill is removed."""
+        """Read complete lines; an incomplete last one is removed."""
         content = self._path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
         with writing_to(self._folder):
@@ -308,11 +307,11 @@ def require_run_folder(folder: Path, name: str) -> None:
     """Refuse what a journal would refuse, before anything is read for the run.
 
     Args:
-        folder: the run folder, which need not be there.
+        folder: the run folder, which need not exist.
         name: name of the workflow.
 
     Raises:
-        ArgumentError: no run of the workflow can begin or go on there.
+        ArgumentError: no run of the workflow can begin or continue there.
     """
     _check_folder(folder)
     if is_running(folder):
@@ -324,10 +323,10 @@ def require_run_folder(folder: Path, name: str) -> None:
 
 @contextmanager
 def kept_from_others(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a run folder while what came out of its run is written there.
+    """Keep other runs out of a run folder while the results of its run are written there.
 
     Raises:
-        ArgumentError: another run goes on there already.
+        ArgumentError: another run uses it.
     """
     path = folder / JOURNAL
     if not path.exists():
@@ -353,7 +352,7 @@ def _check_workflow(folder: Path, first: RunBegan, name: str) -> None:
 
 
 def readable_lines(folder: Path) -> list[JournalLine]:
-    """Return the lines of a journal, also while it is written; none where it cannot be read."""
+    """Return the lines of a journal, even while it is written; none if it cannot be read."""
     with suppress(OSError, ValueError):
         return _parsed((folder / JOURNAL).read_bytes())
     return []
@@ -367,14 +366,16 @@ def _is_finished(folder: Path) -> ArgumentError:
 
 
 def _lacked_room(lines: Sequence[JournalLine]) -> bool:
-    """Whether a cell failed because the disk was full: with more room, the run goes on."""
+    """Whether a cell failed because the disk was full: with more space, the run continues."""
     ends = {line.address: line for line in lines if isinstance(line, CellEnded)}
     return any(end.error_type == DiskSpaceError.__name__ for end in ends.values())
 
 
 def _check_folder(folder: Path) -> None:
     if files := [place for place in (folder, *folder.parents) if place.is_file()]:
-        raise ArgumentError(f"{folder} can be no folder, for {files[0]} is a file; {_ANOTHER}")
+        raise ArgumentError(
+            f"{folder} cannot be a folder, because {files[0]} is a file; {_ANOTHER}"
+        )
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             what = "a link" if path.is_symlink() else "a pipe or a device"
@@ -390,26 +391,26 @@ def _check_folder(folder: Path) -> None:
 
 
 def is_running(folder: Path) -> bool:
-    """Whether a living process is at work on the run in a folder."""
+    """Whether a living process works on the run in a folder."""
     path = folder / JOURNAL
     try:
         with open_file(path) as journal, closing(file_lock(path, journal.fileno())) as lock:
-            # Shared, so that two who ask do not take each other for runs.
+            # Shared, so that two such checks do not mistake each other for runs.
             return not lock.take(is_shared=True, waits=False)
     except OSError:
         return False
 
 
 def new_run_id() -> str:
-    """Make up the id of a run: its time in UTC, and something random."""
+    """Generate the id of a run: its time in UTC, and a random part."""
     return f"{time_in_a_name()}-{uuid.uuid4().hex[:6]}"
 
 
 def new_run_folder(name: str, run_id: str) -> Path:
-    """Where a run goes that nobody gave a folder: `runs/<name>-<run id>`.
+    """Return the default folder of a run: `runs/<name>-<run id>`.
 
     Raises:
-        RecordError: the name, which a record may have given, cannot be that of a folder.
+        RecordError: the name, which may come from a record, cannot be a folder name.
     """
     try:
         return path_below(Path("runs"), f"{name}-{run_id}")
@@ -420,7 +421,7 @@ def new_run_folder(name: str, run_id: str) -> Path:
 
 
 def cell_file_name(address: str) -> str:
-    """Name, without suffix, of what belongs to a cell: its address, shortened where too long.
+    """Return the name, without suffix, of files of a cell: its address, shortened if too long.
 
     >>> cell_file_name("ortho@plane=ransac,orient=pnp")
     'ortho@plane=ransac,orient=pnp'

@@ -1,7 +1,7 @@
-"""Cache keys: which ingredients decide a cell's result, and nothing else.
+"""Cache keys: the SHA-256 of everything that determines a cell's result.
 
-Paths, step names, cores, timeouts and time stamps stay out on purpose. The code of a method and the
-versions of the libraries that it may use go in for every method, without the author's doing.
+Paths, step names, cores, timeouts and time stamps are excluded on purpose. The code of a method and
+the versions of the libraries that it may use are included for every method automatically.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ from orthoflow.workflow.expand import Cell
 _WHAT: Final = "orthoflow/cell"
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
-# What a method's result can depend on in the framework; engine and command line cannot change it.
+# Parts of the framework on which a method's result can depend; engine and command line cannot
+# change it.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _FRAMEWORK: Final = "orthoflow."
 _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
-# What we require and no result depends on: command line, files of runs, pages, drawings, metadata.
+# Requirements that do not affect results: command line, files of runs, pages, drawings, metadata.
 _WITHOUT_EFFECT: Final = frozenset(
     {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
     | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
@@ -59,7 +60,7 @@ _States: TypeAlias = tuple[tuple[Path, int, int], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class MethodFacts(MethodIdentity):
-    """What the engine needs to know of a method, without its class.
+    """What the engine needs to know about a method, without its class.
 
     Attributes:
         target: import string of the class.
@@ -81,13 +82,13 @@ class MethodFacts(MethodIdentity):
 
     @property
     def kernels(self) -> str:
-        """Names the folder for the kernels of a plugin; empty for our own methods."""
+        """Name of the folder for the kernels of a plugin; empty for our own methods."""
         if self.target.startswith(f"{_BUILT_IN_PACKAGE}."):
             return ""
         return hashlib.sha256("".join(self.code.values()).encode()).hexdigest()
 
     def is_code_unchanged(self) -> bool:
-        """Whether the code on the disk is still the one in the keys."""
+        """Whether the code on the disk is still the code of the keys."""
         try:
             return all(files_digest(self.sources[name]) == self.code[name] for name in self.sources)
         except OSError:
@@ -96,14 +97,14 @@ class MethodFacts(MethodIdentity):
 
 @dataclass(frozen=True, kw_only=True)
 class CellKey:
-    """Key of a cell and the text it is the SHA-256 of."""
+    """Key of a cell and the text whose SHA-256 it is."""
 
     key: str
     preimage: str
 
 
 def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
-    """Load a method and note what decides its results.
+    """Load a method and determine what its results depend on.
 
     Raises:
         PluginError: the method, or a library it needs, is missing or broken.
@@ -145,11 +146,11 @@ def input_digest(files: Sequence[RecordedFile]) -> str:
 
 
 def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -> CellKey:
-    """Return the key of a cell whose inputs are known.
+    """Return the key of a cell with known inputs.
 
     Args:
         cell: the cell.
-        facts: of its method.
+        facts: facts of its method.
         inputs: port -> product.
     """
     preimage: dict[str, JsonValue] = {
@@ -167,14 +168,14 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
         },
     }
     if facts.determinism == "exact" and cell.repeat:
-        # The same result, computed once more to be timed.
+        # The same result, computed again to be timed.
         preimage["repeat"] = cell.repeat
     text = canonical_json(preimage)
     return CellKey(key=hashlib.sha256(text.encode()).hexdigest(), preimage=text)
 
 
 def read_preimage(text: str) -> Mapping[str, JsonValue]:
-    """Read a preimage's text; an empty mapping when it is not one."""
+    """Read a preimage's text; an empty mapping if it is invalid."""
     try:
         content = parse_json(text)
     except ValueError:
@@ -183,7 +184,7 @@ def read_preimage(text: str) -> Mapping[str, JsonValue]:
 
 
 def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, str]:
-    """What a preimage says under `code` or `tools`; nothing where it is no mapping.
+    """Return the `code` or `tools` of a preimage; empty if it is not a mapping.
 
     >>> stated_versions({"tools": {"numpy": "2.1"}, "code": [1]}, "tools")
     {'numpy': '2.1'}
@@ -208,12 +209,13 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mapping[str, str]:
     """Return the versions of the libraries on which results of a plugin's methods may depend.
 
-    They are what its distribution and ours require, and what its sources import besides; those that
-    are not installed are left out. What only shows or keeps results is none of them.
+    These are the requirements of its distribution and ours, and further imports of its sources;
+    those that are not installed are omitted. Libraries that only show or store results are
+    excluded.
 
     Args:
-        distribution: of the plugin.
-        sources: its Python files, where it is not one of ours.
+        distribution: distribution of the plugin.
+        sources: its Python files, if it is not one of ours.
     """
     required = [direct_requirements(name) or () for name in (DISTRIBUTION, distribution)]
     names = {*_CORE, *required[0], *required[1], *_imported(sources)}
@@ -225,7 +227,7 @@ def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mappi
 
 
 def _imported(sources: Iterable[Path]) -> set[str]:
-    """Canonical names of the distributions whose modules Python files import anywhere."""
+    """Return canonical names of the distributions whose modules Python files import anywhere."""
     modules = {
         name
         for path in sources
@@ -240,12 +242,12 @@ def _imported(sources: Iterable[Path]) -> set[str]:
 
 
 def framework_tag() -> str:
-    """What stands for the framework's code."""
+    """Return a digest of the framework's code."""
     return files_digest(framework_files())
 
 
 def publisher_tag(entry: ProductEntry) -> str:
-    """What stands for the code that writes the published files of a product type, if any does."""
+    """Return a digest of the code that writes the published files of a product type, if any."""
     module = entry.spec.publisher.partition(":")[0]
     if not module:
         return ""
@@ -257,7 +259,7 @@ def publisher_tag(entry: ProductEntry) -> str:
 
 @cache
 def framework_files() -> tuple[Path, ...]:
-    """The framework's code that methods use."""
+    """Return the files of the framework's code that methods use."""
     parts = [_ROOT / part for part in _FRAMEWORK_PARTS]
     return tuple(
         file for part in parts for file in ([part] if part.is_file() else part.rglob("*.py"))
@@ -265,10 +267,10 @@ def framework_files() -> tuple[Path, ...]:
 
 
 def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
-    """The code that a method belongs to, and the data in the same packages.
+    """Return the files of a method's code, and the data in the same packages.
 
     For the built-in methods that is the package of their kind, since one kind never imports
-    another; for all others everything their distribution's packages hold.
+    another; for all others everything in their distribution's packages.
     """
     files = entry.source_files()
     module = entry.spec.target.partition(":")[0]
@@ -287,12 +289,12 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
 
 
 def _code_files(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
-    """Files whose content decides a method's results, whatever version their distribution says."""
+    """Return files whose content affects a method's results, regardless of the version."""
     return {"plugin": plugin_files(entry), "framework": framework_files()}
 
 
 def files_digest(files: Iterable[Path]) -> str:
-    """Digest of files with their names; computed once for as long as they stay as they are."""
+    """Return the digest of files with their names; cached as long as they are unchanged."""
     return _digest(_states(files))
 
 

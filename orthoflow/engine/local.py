@@ -1,4 +1,4 @@
-"""Executors of one machine: a process per task, guarded against everything it may do, or none."""
+"""Executors of one machine: a guarded process per task, or none."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from orthoflow.system import address_space, flags, read_at
 
 Tell = Callable[[str, StepEvent], None]
 _GRACE_S: Final = 5.0
-# So many messages are taken at once: a step that never stops must not keep us from its timeout.
+# Maximum number of messages per poll: a step that never stops must not delay its timeout.
 _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
-# Of a long log the end is kept: what went wrong stands last.
+# The end of a long log is kept: errors are at the end.
 _LOOKS: Final = 10
 _KEPT_BYTES: Final = 256 << 10
 _LARGEST_LOG: Final = 8 << 20
@@ -65,13 +65,13 @@ class TaskEnd:
 
 @dataclass(frozen=True, kw_only=True)
 class Capacity:
-    """What may run at the same time.
+    """Limits for concurrent tasks.
 
     Attributes:
         n_tasks: tasks.
-        n_cores: cores of all of them.
-        cores_of_one: the most that one may have.
-        share: what one gets that asks for nothing.
+        n_cores: total number of cores.
+        cores_of_one: maximum for one task.
+        share: default for one task.
     """
 
     n_tasks: int
@@ -81,7 +81,7 @@ class Capacity:
 
     @classmethod
     def of_jobs(cls, jobs: int, n_cores: int) -> Capacity:
-        """So many jobs that share the cores of one machine."""
+        """A number of jobs that share the cores of one machine."""
         share = max(1, n_cores // jobs)
         return cls(n_tasks=jobs, n_cores=n_cores, cores_of_one=n_cores, share=share)
 
@@ -89,22 +89,22 @@ class Capacity:
 class Executor(Protocol):
     """Runs tasks; used from one thread.
 
-    Nothing here assumes one machine: a task is JSON, its results lie in the store.
+    Nothing here assumes one machine: a task is JSON, its results are in the store.
     """
 
     @property
     def capacity(self) -> Capacity:
-        """What may run at the same time, now."""
+        """Return the current limits for concurrent tasks."""
 
     def start(self, task: Task) -> None:
-        """Begin a task, or put it in line.
+        """Start a task, or queue it.
 
         Raises:
             StoreError: its files cannot be written.
         """
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
-        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
+        """Wait for tasks to end, up to a time; forwards messages of running tasks."""
 
     def cancel(self) -> None:
         """Ask all tasks to stop; they still end through `poll`, after a grace period by force."""
@@ -120,9 +120,9 @@ class InlineExecutor:
         """Make one.
 
         Args:
-            capacity: what a task may have.
-            tell: gets the address of a task and what it says.
-            is_interrupted: whether the user asked to stop, also while a task runs.
+            capacity: limits for a task.
+            tell: called with the address of a task and its message.
+            is_interrupted: whether the user asked to stop, even while a task runs.
         """
         self.capacity = capacity
         self._tell = tell
@@ -131,11 +131,11 @@ class InlineExecutor:
         self._is_cancelled = False
 
     def start(self, task: Task) -> None:
-        """Put a task in line."""
+        """Queue a task."""
         self._waiting.append(task)
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
-        """Run the next task to its end; the timeout means nothing here."""
+        """Run the next task to its end; timeouts are ignored."""
         if not self._waiting:
             return ()
         task = self._waiting.popleft()
@@ -156,21 +156,21 @@ class InlineExecutor:
         return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)
 
     def cancel(self) -> None:
-        """Let the tasks in line end without running; none runs while this is called."""
+        """End the queued tasks without running them; none runs while this is called."""
         self._is_cancelled = True
 
     def close(self) -> None:
-        """Forget the tasks in line."""
+        """Remove the queued tasks."""
         self._waiting.clear()
 
 
 class StepLog:
-    """An open log that another process appends to, while this one keeps it short.
+    """An open log that another process appends to, while this one limits its size.
 
-    It stays open: under its name there may be anything by the time that the step has ended.
+    It stays open, because its name may refer to anything by the time that the step has ended.
 
     Attributes:
-        path: under which the other process opens it.
+        path: path under which the other process opens it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -187,12 +187,12 @@ class StepLog:
         self._notice = b""
 
     def shorten(self) -> None:
-        """Drop all but the end of a log that has grown too long; who appends goes on behind it."""
+        """Drop all but the end of a log that has grown too long; the writer continues after it."""
         size = os.fstat(self._descriptor).st_size
         if size <= _LARGEST_LOG:
             return
         tail = self._tail(size)
-        # What is written between the look and the cut is lost: look again until nothing was.
+        # Text written between reading and truncating is lost: read again until nothing was.
         for _ in range(_LOOKS):
             grown = os.fstat(self._descriptor).st_size
             if grown == size:
@@ -200,13 +200,13 @@ class StepLog:
             size, tail = grown, self._tail(grown)
         self._n_dropped += size - len(self._notice) - len(tail)
         self._notice = f"... ({self._n_dropped} bytes before)\n".encode()
-        # A full disk costs the log, not the run.
+        # A full disk affects the log, not the run.
         with contextlib.suppress(OSError):
             os.ftruncate(self._descriptor, 0)
             os.write(self._descriptor, self._notice + tail)
 
     def text(self) -> str:
-        """The end of the log, without the NUL characters that no text in a record may have."""
+        """End of the log, without NUL characters, which no text in a record may contain."""
         size = os.fstat(self._descriptor).st_size
         tail = self._tail(size)
         text = tail.decode("utf-8", errors="replace").replace("\0", "")
@@ -214,7 +214,7 @@ class StepLog:
         return text if size == len(tail) else f"... ({n_before} bytes before)\n{text}"
 
     def close(self) -> None:
-        """Close it; nothing can be asked any more."""
+        """Close it; no further reads are possible."""
         os.close(self._descriptor)
 
     def _tail(self, size: int) -> bytes:
@@ -228,15 +228,15 @@ class _Running:
     Attributes:
         task: the task.
         step: its process.
-        log: what it prints.
+        log: its output.
         started: ISO 8601 UTC.
         clock: monotonic seconds at the start.
         oom_kills: the kernel's counter at the start.
-        reason: why we stopped it; None as long as we did not.
-        is_victim: stopped for want of memory.
-        kill_at: when it has had its time to end by itself, monotonic seconds.
-        peak_bytes: largest own memory seen from outside.
-        result: what it sent.
+        reason: why we stopped it; None otherwise.
+        is_victim: stopped because of lack of memory.
+        kill_at: end of the grace period, monotonic seconds.
+        peak_bytes: largest own memory measured from outside.
+        result: the result that it sent.
     """
 
     task: Task
@@ -252,7 +252,7 @@ class _Running:
     result: CellResult | None = None
 
 
-# By process, what runs, of all executors here: a cluster's workers in this process have one each.
+# By process, the tasks of all executors here: a cluster's workers in this process have one each.
 _all_running: Final[dict[int, _Running]] = {}
 
 
@@ -292,12 +292,12 @@ class LocalExecutor:
         self._running[task.address] = _all_running[run.step.pid] = run
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
-        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
+        """Wait for tasks to end, up to a time; forwards messages of running tasks."""
         unstarted, self._unstarted = tuple(self._unstarted), []
         waited = [run.step.process.sentinel for run in self._running.values()]
         heard = [run.step.pipe for run in self._running.values() if not run.step.pipe.closed]
         wait([*heard, *waited], 0.0 if unstarted else min(timeout_s, self._guard.interval_s))
-        # Asked for before the last words are taken: nothing is said after the end.
+        # Checked before the last messages are read: nothing is sent after the end.
         ended = [run for run in self._running.values() if not run.step.process.is_alive()]
         for run in self._running.values():
             self._hear(run)
@@ -306,7 +306,7 @@ class LocalExecutor:
         return unstarted + ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop: SIGTERM, and SIGKILL when they do not within 5 s."""
+        """Ask all tasks to stop: SIGTERM, and SIGKILL after 5 s."""
         for run in self._running.values():
             self._stop(run, CancelledStepError(f"step {run.task.address} was interrupted"))
 
@@ -326,13 +326,13 @@ class LocalExecutor:
                     return
                 message = run.step.pipe.recv_bytes(_LARGEST_MESSAGE)
             except (EOFError, OSError):
-                # Ended, or it wrote there what is no message.
+                # Ended, or sent an invalid message.
                 run.step.pipe.close()
                 return
             self._take(run, message)
 
     def _take(self, run: _Running, message: bytes) -> None:
-        # A method may write into the pipe by mistake: what says nothing is passed over.
+        # A method may write into the pipe by mistake: invalid messages are ignored.
         with contextlib.suppress(ValueError, StoreError, RecursionError):
             if message.startswith(RESULT):
                 text = message.removeprefix(RESULT).decode()
@@ -358,7 +358,7 @@ class LocalExecutor:
     def _guard_memory(self) -> None:
         runs = {str(pid): run for pid, run in _all_running.copy().items()}
         victim = self._guard.check({name: run.step.pid for name, run in runs.items()})
-        # One at a time: the memory of a dying process is not free at once.
+        # One at a time: the memory of a dying process is not released at once.
         if victim is None or any(run.is_victim for run in runs.values()):
             return
         run = runs[victim.address]
@@ -419,12 +419,12 @@ def _reason_of_silence(run: _Running) -> OrthoflowError:
 
 
 def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
-    """State how a process ended that left no result.
+    """Return an error for a process that ended without a result.
 
     Args:
-        who: method and distribution, as `Task.who` has them.
-        code: as `subprocess` has it, negative for signals.
-        n_bytes: largest memory seen.
+        who: method and distribution, from `Task.who`.
+        code: as in `subprocess`, negative for signals.
+        n_bytes: largest measured memory.
         tail: last line of its log.
     """
     if code >= 0:
@@ -439,7 +439,7 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
 
 
 def describe_memory(who: str, n_bytes: int) -> StepFailedError:
-    """State that a step was stopped for want of memory."""
+    """Return an error for a step stopped because of lack of memory."""
     return StepFailedError(
         f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
         f"stopped); give it less data or coarser parameters"
@@ -447,12 +447,12 @@ def describe_memory(who: str, n_bytes: int) -> StepFailedError:
 
 
 def describe_timeout(who: str, limit_s: float) -> StepFailedError:
-    """State that a step took longer than its workflow allows."""
+    """Return an error for a step that exceeded its timeout."""
     return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as people say it.
+    """Format a duration for people.
 
     >>> [duration(s) for s in (0.5, 90, 1800, 7200)]
     ['0.5 s', '90 s', '30 min', '2 h']

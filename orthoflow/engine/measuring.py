@@ -1,4 +1,4 @@
-"""Time and memory of methods, processes and the machine, and which step goes when memory ends."""
+"""Time and memory of methods, processes and the machine, and choice of a step to stop."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from orthoflow.geometry.threads import start_beside
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
 _CGROUPS: Final = Path("/sys/fs/cgroup")
-# Version 1 says "unlimited" with a number near 2**63.
+# Version 1 expresses "unlimited" as a number near 2**63.
 _UNLIMITED: Final = 1 << 60
-# A process can touch fresh memory at about this rate; the next look must come before the floor.
+# A process can allocate memory at about this rate; the next check must precede the limit.
 _FASTEST_BYTES_PER_S: Final = 6 * GIB
 _SHORTEST_S: Final = 0.01
 _LONGEST_S: Final = 0.25
 
 
 def process_memory(process_id: int | None = None) -> int:
-    """Bytes that a process, this one by default, made itself; 0 when it is gone.
+    """Return the memory that a process, by default this one, has allocated; 0 if it is gone.
 
-    Mapped files do not count: they can be read again.
+    Mapped files are not counted: they can be read again.
     """
     try:
         memory = psutil.Process(process_id).memory_info()
@@ -42,7 +42,7 @@ def process_memory(process_id: int | None = None) -> int:
 
 
 def tree_memory(root: int) -> int:
-    """Bytes that a process and all that it started made themselves."""
+    """Return the memory that a process and all its descendants have allocated."""
     try:
         children = psutil.Process(root).children(recursive=True)
     except psutil.Error:
@@ -52,19 +52,19 @@ def tree_memory(root: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class AvailableMemory:
-    """Bytes that processes here can still get, and bytes there are in all."""
+    """Memory that processes here can still get, and the total."""
 
     available: int
     total: int
 
     @property
     def floor(self) -> int:
-        """Below this the machine starts to fail at random: 512 MiB or 3 % of all."""
+        """Below this the machine fails unpredictably: 512 MiB or 3 % of the total."""
         return min(max(512 * MIB, self.total * 3 // 100), self.total // 8)
 
 
 def available_memory() -> AvailableMemory:
-    """Measure the machine and every control group that this process is in."""
+    """Measure the machine and every control group of this process."""
     memory = psutil.virtual_memory()
     total, available = memory.total, memory.available
     for limit, used in _group_limits():
@@ -74,7 +74,7 @@ def available_memory() -> AvailableMemory:
 
 
 def _group_limits() -> list[tuple[int, int]]:
-    """(limit, used) of this process's memory control groups and their parents, in bytes."""
+    """Yield (limit, used) of this process's memory control groups and their parents, in bytes."""
     try:
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -128,27 +128,27 @@ def _reclaimable(folder: Path, name: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Victim:
-    """The step to stop, and the memory it holds."""
+    """The step to stop, and its memory."""
 
     address: str
     n_bytes: int
 
 
 class MemoryGuard:
-    """Watches the memory that is left while steps run.
+    """Watches the remaining memory while steps run.
 
     Attributes:
-        interval_s: when to look again at the latest.
+        interval_s: time until the next check at the latest.
     """
 
     def __init__(self) -> None:
         self.interval_s = _LONGEST_S
 
     def check(self, roots: Mapping[str, int]) -> Victim | None:
-        """Choose a step to stop when too little memory is left.
+        """Choose a step to stop if too little memory is left.
 
         Args:
-            roots: name -> process above all others of every running step.
+            roots: name -> root process of every running step.
         """
         memory = available_memory()
         margin = memory.available - memory.floor
@@ -157,14 +157,14 @@ class MemoryGuard:
             return None
         held = {address: tree_memory(root) for address, root in roots.items()}
         largest = max(held, key=lambda address: held[address])
-        # Somebody else may be eating: a small step would be killed for nothing.
+        # Another program may be the cause: stopping a small step would not help.
         if held[largest] < memory.floor:
             return None
         return Victim(address=largest, n_bytes=held[largest])
 
 
 def oom_kills() -> int:
-    """How often the kernel has killed for want of memory since it started."""
+    """Return how often the kernel has killed processes for lack of memory since it started."""
     try:
         lines = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -173,9 +173,9 @@ def oom_kills() -> int:
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, also while a library or a thread was started.
+    """Whether an error means lack of memory, even while a library or a thread was started.
 
-    The loader and threads tell that in words only.
+    The loader and threads report it only as text.
     """
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "allocate memory" in str(error)
@@ -184,16 +184,15 @@ def is_for_want_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
 
 
-# Every import goes through these, where a module is not there yet and where another thread still
-# loads it. Private, but finders and loaders only hear when a module is looked for, not when all
-# that it imports is there.
+# Every import passes through these, for new modules and for those that another thread still loads.
+# Private, but finders and loaders are only called when a module is searched, not when all its
+# imports are finished.
 _BOOTSTRAP: Final = cast("Any", importlib)._bootstrap  # noqa: SLF001
 _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
 # Held while a kernel is compiled, or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
-# A load as long as this leaves objects in number; to look for garbage among them takes a few
-# hundredths of it.
+# A longer load leaves many objects; garbage collection over them takes a few hundredths of it.
 _LONG_S: Final = 0.25
 _SAMPLE_S: Final = 0.05
 
@@ -201,16 +200,16 @@ _SAMPLE_S: Final = 0.05
 class LoadingMeter:
     """Measures, while it is entered, how long this process loads modules and compiles.
 
-    Times of several threads that load at once count once. A daemon thread that loads keeps nobody
-    waiting: its seconds stop no clock, only its processor time is known.
+    Times of several threads that load concurrently count once. A daemon thread that loads blocks
+    nobody: its seconds stop no clock, only its processor time is counted.
     """
 
     def __init__(self, *, sets_aside: bool = False) -> None:
-        """Begin at nought.
+        """Start at zero.
 
         Args:
-            sets_aside: whether no search for garbage looks again at what was loaded, nor at
-                anything else that is there by then: only for a process that ends with the step.
+            sets_aside: whether garbage collection ignores everything loaded so far: only for a
+                process that ends with the step.
         """
         self._sets_aside = sets_aside
         self._lock = threading.RLock()
@@ -250,12 +249,12 @@ class LoadingMeter:
             return self._processor_s
 
     def clock_s(self) -> float:
-        """Return seconds as `time.perf_counter`, but stand still while something is loaded."""
+        """Return seconds as `time.perf_counter`, but paused while something is loaded."""
         with self._lock:
             return time.perf_counter() - self.total_s
 
     def begin(self) -> None:
-        """Hear that this thread begins to load; what it loads for that is part of it."""
+        """Record that this thread begins to load; nested loads are part of it."""
         own = self._own
         own.depth = getattr(own, "depth", 0) + 1
         if own.depth > 1:
@@ -269,11 +268,11 @@ class LoadingMeter:
             self._n_open += 1
 
     def end(self) -> None:
-        """Hear that this thread has loaded what it began with."""
+        """Record that this thread has finished its outermost load."""
         own = self._own
         depth = getattr(own, "depth", 0)
         if depth == 0:
-            # It began before anybody listened.
+            # It began before the measurement.
             return
         own.depth = depth - 1
         if own.depth:
@@ -320,8 +319,8 @@ class MemorySampler:
     """Samples this process's memory in a thread while a method runs.
 
     Attributes:
-        processor_s: processor seconds that the samples took so far. They grow with the clock, so a
-            step that compiles for minutes would seem to compute longer.
+        processor_s: processor seconds of the samples so far. They grow with the clock, so a step
+            that compiles for minutes would seem to compute longer.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
-"""An object of the store: a folder with a product or a figure, and how damage to it is found.
+"""An object of the store: a folder with a product or a figure, and detection of damage.
 
-A figure's folder has the SHA-256 of its bytes for a name. A product's has the digest of its content
-for one, which says nothing about the bytes of its files: `object.json` does, and begins with the
-digest of its own text.
+A figure's folder is named by the SHA-256 of its bytes. A product's is named by the digest of its
+content, which does not cover the bytes of its files: `object.json` does, and begins with the digest
+of its own text.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ PRODUCT: Final = "product.h5"
 PUBLISHED: Final = "files"
 BLOB: Final = "blob"
 DESCRIPTION: Final = "object.json"
-# The part that is missing where nothing of an object is there.
+# The missing part if nothing of an object exists.
 WHOLE: Final = "whole object"
-# The machine is short of something: that says nothing about the file.
+# The machine lacks a resource: that does not mean damage.
 SHORTAGES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
@@ -43,10 +43,10 @@ class ObjectFile:
 
 @dataclass(frozen=True, kw_only=True)
 class StoredProduct:
-    """What the `object.json` of a product says.
+    """The content of a product's `object.json`.
 
     Attributes:
-        object: name of the folder that it was written for.
+        object: name of its folder.
         type: product type.
         publisher: version of what wrote the published files.
         files: path in the folder -> file; `object.json` is not among them.
@@ -60,17 +60,17 @@ class StoredProduct:
 
 
 class CheckedFiles:
-    """The files that one process found sound; while they are not changed it need not look again."""
+    """The files that a process found intact; unchanged ones need not be checked again."""
 
     def __init__(self) -> None:
         self._identities: dict[Path, tuple[int, ...]] = {}
 
     def trust(self, path: Path) -> None:
-        """Take a file for sound as it is now."""
+        """Mark a file as intact in its present state."""
         self._identities[path] = _identity(path)
 
     def forget(self, path: Path) -> None:
-        """Look again at the next occasion, for damage that does not show in time and size."""
+        """Check again next time, for damage that does not change time and size."""
         self._identities.pop(path, None)
 
     def is_sound(self, path: Path, expected: ObjectFile) -> bool:
@@ -97,7 +97,7 @@ def describe_product(folder: Path, name: str, type_name: str, publisher: str) ->
     """Write `object.json` for the files that lie in a folder.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
         OSError: a file cannot be read.
     """
     published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
@@ -117,10 +117,10 @@ def describe_product(folder: Path, name: str, type_name: str, publisher: str) ->
 
 
 def require_plain_files(folder: Path, who: str) -> None:
-    """Refuse what cannot be published: links, devices, and names that no file can have elsewhere.
+    """Refuse what cannot be published: links, devices, and names that other systems do not allow.
 
     Raises:
-        ProductError: something of that kind lies in the folder.
+        ProductError: the folder contains something of that kind.
     """
     for path in folder.rglob("*"):
         problem = name_problem(path.name)
@@ -131,7 +131,7 @@ def require_plain_files(folder: Path, who: str) -> None:
 
 
 def read_description(folder: Path) -> StoredProduct | None:
-    """Read `object.json`; None when it is damaged, of another object, or not there.
+    """Read `object.json`; None if it is damaged, belongs to another object, or is missing.
 
     Raises:
         OSError: the machine lacks memory or open files.
@@ -149,7 +149,7 @@ def read_description(folder: Path) -> StoredProduct | None:
 
 
 def files_of(folder: Path) -> Mapping[str, ObjectFile]:
-    """The files that an object must have, by path in its folder; empty when nobody knows."""
+    """Return the files that an object must have, by path in its folder; empty if unknown."""
     if folder.is_symlink():
         return {}
     if (folder / BLOB).exists():
@@ -159,7 +159,7 @@ def files_of(folder: Path) -> Mapping[str, ObjectFile]:
 
 
 def missing_part(folder: Path) -> str:
-    """Say which part of an object is not there in its full length, at a glance; empty: none is."""
+    """Part of an object that is missing or incomplete, by a quick check; empty if none."""
     files = files_of(folder)
     if not files:
         return part_name(DESCRIPTION) if folder.is_dir() else WHOLE
@@ -174,7 +174,7 @@ def missing_part(folder: Path) -> str:
 
 
 def part_name(path: str) -> str:
-    """What people call a file of an object."""
+    """Return the readable name of a file of an object."""
     names = {PRODUCT: "product file", BLOB: "figure", DESCRIPTION: "description"}
     return names.get(path) or f"published file {path.removeprefix(f'{PUBLISHED}/')}"
 

@@ -1,4 +1,4 @@
-"""The frozen plan of a run: what is in the store, what will run, and why."""
+"""The frozen plan of a run: which results are stored, which cells will run, and why."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
-# Of results that lost their objects so many are passed over.
+# Maximum number of incomplete results that are skipped.
 _MOST_LOOKED_AT: Final = 5
-# Settings of cameras and of pictures' places, which may well be the same for several.
+# Parameters of cameras and positions of pictures, which may be equal for several.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
-# To start a process and to read and keep its products.
+# Time to start a process and to read and store its products.
 _START_S: Final = 1.0
 
 
@@ -59,16 +59,16 @@ class RunOptions:
     """Options of plan and run.
 
     Attributes:
-        jobs: cells that run at the same time; they share the cores.
+        jobs: number of concurrent cells, which share the cores.
         executor: `local` (a child process per cell), `inline` (this process, for debugging) or
             `dask` (a child process per cell, on the workers of a cluster).
-        scheduler: address of dask's scheduler; empty for workers of its own, as many as `jobs`.
-        retries: so often a cell is tried again whose worker was lost.
-        only: run these steps and what they need, from the store where it is there.
+        scheduler: address of dask's scheduler; empty for own workers, as many as `jobs`.
+        retries: how often a cell is repeated after its worker was lost.
+        only: run these steps and what they need, from the store if it is there.
         from_: run these steps, what follows from them, and what all these need.
         until: run these steps and what they need.
         force: run these steps although their results are in the store.
-        cores: processors to use in all; None for all this process may use.
+        cores: total number of processors; None for all that this process may use.
     """
 
     jobs: int = 1
@@ -100,24 +100,24 @@ class RunOptions:
 
     @property
     def all_cores(self) -> int:
-        """Processors the run may use in all."""
+        """Return the number of processors of the run."""
         return self.cores or usable_cores()
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedCell:
-    """A cell and what will happen to it.
+    """A cell and its planned treatment.
 
     Attributes:
         cell: the cell.
         status: `cached`, `will run`, `unknown yet` (its inputs are not known yet, and what it may
             be given is in the store or not) or `skipped`.
-        reason: why; names the ingredient that changed since the nearest earlier result.
-        key: its key where its inputs are known, else None.
-        inputs: port -> product where they are known.
-        result: what the store has, for cached cells.
-        took_s: how long the method took when it ran last, in this step where it did; 0 for cells
-            that do not run, None when nobody knows.
+        reason: why; names what changed since the nearest earlier result.
+        key: its key if its inputs are known, else None.
+        inputs: port -> product if they are known.
+        result: the stored result of cached cells.
+        took_s: duration of the method's last run, preferably in this step; 0 for cells that do not
+            run, None if unknown.
     """
 
     cell: Cell
@@ -161,15 +161,15 @@ class ProductTarget:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """Everything a run needs to know, decided before it starts.
+    """Everything a run needs, decided before it starts.
 
     Attributes:
         name: name of the workflow.
-        cells: in topological order; cells that were not selected are left out.
-        inputs: workflow input -> files; None when it is optional and absent.
+        cells: in topological order; cells that were not selected are omitted.
+        inputs: workflow input -> files; None if it is optional and absent.
         methods: method id -> facts.
         products: type name -> import strings.
-        options: as given.
+        options: the given options.
     """
 
     name: str
@@ -187,7 +187,7 @@ def plan_run(
     store: Store,
     options: RunOptions | None = None,
 ) -> RunPlan:
-    """Plan a run: digest the inputs, make the keys, look into the store. Nothing is computed.
+    """Plan a run: digest the inputs, compute the keys, check the store. Nothing is computed.
 
     Raises:
         ArgumentError: an option names a step that does not exist.
@@ -244,7 +244,7 @@ def _require_distinct(
 
 
 def needed_addresses(cell: Cell) -> tuple[str, ...]:
-    """Addresses of the cells whose outputs a cell takes, each once."""
+    """Return addresses of the cells whose outputs a cell takes, each once."""
     sources = (source for source in cell.inputs.values() if isinstance(source, CellOutput))
     return tuple(dict.fromkeys(source.address for source in sources))
 
@@ -254,7 +254,7 @@ def known_inputs(
     inputs: Mapping[str, PlannedInput | None],
     results: Mapping[str, CellResult],
 ) -> dict[str, ProductRef]:
-    """Products on a cell's input ports once the cells before it have results."""
+    """Return products on a cell's input ports once the previous cells have results."""
     known: dict[str, ProductRef] = {}
     for port, source in cell.inputs.items():
         if isinstance(source, CellOutput):
@@ -272,7 +272,7 @@ def known_inputs(
 
 @dataclass(kw_only=True)
 class _Planner:
-    """Plans cell after cell, each behind all it needs."""
+    """Plans cell after cell, each after all it needs."""
 
     inputs: Mapping[str, PlannedInput | None]
     methods: Mapping[str, MethodFacts]
@@ -290,7 +290,7 @@ class _Planner:
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None and not self._is_known(cell.method):
-            # Of what never ran with this store nothing can be stored, whatever it will be given.
+            # A method that never ran with this store has no stored results for any inputs.
             reason = "no result of its method is stored"
             planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)
@@ -327,7 +327,7 @@ class _Planner:
         return explain(key, cell.step, self._before(cell.method))
 
     def _took_s(self, cell: Cell) -> float | None:
-        """How long the method took when it did what is nearest to this: same step, same params."""
+        """Duration of the method in the most similar call: same step, same parameters."""
         params = {
             f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
             for name, value in cell.params.items()
@@ -340,7 +340,7 @@ class _Planner:
             return (earlier.step != cell.step, n_changed)
 
         if place not in self._times:
-            # Stable: the newest of those that are as near comes first.
+            # Stable: the newest of equally similar ones comes first.
             nearest = sorted(self._before(cell.method), key=distance)[:_MOST_LOOKED_AT]
             results = (self.store.result(item.key) for item in nearest)
             found = next((result for result in results if result is not None), None)
@@ -357,7 +357,7 @@ class _Planner:
 
 
 def remember_places(inputs: Mapping[str, PlannedInput | None], store: Store) -> None:
-    """Let the store remember where the files of a run lie, for a replay or an export of it."""
+    """Note in the store where the files of a run are, for a replay or an export of it."""
     digests = store.file_digests()
     for given in inputs.values():
         for file, path in zip(given.files, given.paths, strict=True) if given else ():
@@ -379,7 +379,7 @@ def _digest_inputs(
         ref = ProductRef(type_name="files", encoding_version=0, digest=input_digest(refs))
         planned[name] = PlannedInput(ref=ref, paths=files.paths, files=refs)
     if store.folder.is_dir():
-        # Only a memory: a plan must also be possible on a full or read-only disk.
+        # Only a cache: a plan must also be possible on a full or read-only disk.
         with contextlib.suppress(StoreError):
             digests.save()
     return planned
@@ -409,7 +409,7 @@ def _product_targets(
 
 
 def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
-    """State what changed since the most similar earlier result of the same method.
+    """Return what changed since the most similar earlier result of the same method.
 
     Args:
         key: of the cell.

@@ -1,6 +1,6 @@
-"""What every step needs, loaded once in the process that steps are forked from.
+"""Libraries that every step needs, loaded once in the process from which steps are forked.
 
-Never a plugin: no third-party code of a plugin runs in the process that others come from.
+Never a plugin: no third-party code runs in the process from which others are forked.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _LIBRARIES: Final = (
 
 
 def load_libraries() -> None:
-    """Load libraries; steps report what is wrong with one of them."""
+    """Load libraries; steps report their errors."""
     if address_space() is not None:
-        # Some crash where they get too little memory, and every step with them.
+        # Some crash with too little memory, and every step with them.
         return
     for name in _LIBRARIES:
         with suppress(Exception):
@@ -49,8 +49,8 @@ def load_libraries() -> None:
 def _register_compiler() -> None:
     """Let numba register what it can compile, as it does for the first kernel of a process.
 
-    That takes longer than loading numba. Its extensions, which third parties install, are left to
-    each step, which looks for them again.
+    That takes longer than loading numba. Its extensions, which third parties install, are loaded in
+    each step.
     """
     from numba.core import entrypoints  # noqa: PLC0415 - only where numba is there
     from numba.core.registry import cpu_target  # noqa: PLC0415

@@ -1,7 +1,7 @@
-"""Starting the process of a step, and ending it with all that it started.
+"""Starting the process of a step, and ending it with all its descendants.
 
-Processes come from `multiprocessing`: forked from a server that has loaded `engine.preload` where
-the system has that, spawned elsewhere.
+Processes come from `multiprocessing`: forked from a server that has loaded `engine.preload` if the
+system supports it, otherwise spawned.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def start_step(task: Task) -> StepProcess:
     """Start the process of a task; its log and its folder exist.
 
     Raises:
-        StepFailedError: this machine gives no process more.
+        StepFailedError: this machine cannot start another process.
     """
     context = (
         multiprocessing.get_context("forkserver")
@@ -135,7 +135,7 @@ def start_step(task: Task) -> StepProcess:
     failure: Exception | None = None
     with theirs, _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
-        # A server that somebody killed is noticed by its silence, and started anew.
+        # A killed server is detected by its silence, and started again.
         for _ in range(2):
             process = context.Process(target=run_step, args=arguments, name=task.address)
             try:
@@ -194,7 +194,7 @@ def _start_conditions() -> Iterator[None]:
 def _variables(task: Task) -> Mapping[str, str]:
     """Environment variables for the process of a task."""
     variables = dict(os.environ)
-    # A setting of somebody who debugs kernels; for that there is --executor inline.
+    # A setting for debugging kernels; use --executor inline for that.
     variables.pop("NUMBA_DISABLE_JIT", None)
     return variables | {
         **dict.fromkeys(_THREAD_VARIABLES, str(task.cores)),

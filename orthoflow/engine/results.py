@@ -1,4 +1,4 @@
-"""What a finished cell leaves behind, and its form in the store: the link to journal and record."""
+"""The result of a finished cell, and its form in the store: the link to journal and record."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class CellResult(CellOutcome):
 
     Attributes:
         run_id: the run that computed it.
-        environment: where it was computed, None when it never was.
+        environment: where it was computed, None if it never was.
         inputs: port -> product.
         outputs: port -> product.
         figures: pictures.
@@ -86,7 +86,7 @@ class CellResult(CellOutcome):
 
     @property
     def objects(self) -> frozenset[str]:
-        """Names of the store's objects that it refers to: products and figures."""
+        """Return names of the store's objects that it refers to: products and figures."""
         products = {ref.digest.removeprefix("sha256:") for ref in self.outputs.values()}
         return frozenset(products | {figure.sha256 for figure in self.figures})
 
@@ -102,7 +102,7 @@ def result_from_json(text: str, where: str) -> CellResult:
     """Read a result from JSON text.
 
     Args:
-        text: what `result_to_json` gave.
+        text: from `result_to_json`.
         where: name of the file, for the error message.
 
     Raises:
@@ -114,7 +114,7 @@ def result_from_json(text: str, where: str) -> CellResult:
         if not isinstance(content, dict) or form != FORMAT:
             raise StoreError(f"{where} has a result format that this orthoflow cannot read")
         if not is_checked(text):
-            raise StoreError(f"{where} is damaged: it does not have the digest that it states")
+            raise StoreError(f"{where} is damaged: its content does not match its digest")
         return _codec().validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]

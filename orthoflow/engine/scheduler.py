@@ -1,4 +1,4 @@
-"""Executes a plan: starts cells as their inputs become known, keeps going past failures."""
+"""Executes a plan: starts cells as their inputs become known, and continues after failures."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = DiagnosticSpec(
     code="code-changed-while-running",
     severity="warning",
-    text="the code of the method changed during the run: the result is not kept for other runs",
+    text="the code of the method changed during the run: the result is not stored",
 )
 _STORED_RESULT_DAMAGED: Final = DiagnosticSpec(
     code="stored-result-damaged",
     severity="warning",
     text="the stored result was damaged ({damage}) and was computed again",
 )
-# So often a failed cell is given another chance whose inputs were damaged when it failed.
+# How often a failed cell with damaged inputs is repeated.
 _MOST_REPEATS: Final = 3
 
 
@@ -91,8 +91,8 @@ class RunOutcome:
         results: address -> result, in the order of the plan.
         cached: address -> id of the run that computed it, for results of other runs.
         resumed: addresses that this run had computed before it was interrupted.
-        damaged: address -> what of its stored result was damaged, for what was computed again.
-        inputs: workflow input -> files; None when it is optional and absent.
+        damaged: address -> damaged parts of its stored result, for cells that were computed again.
+        inputs: workflow input -> files; None if it is optional and absent.
     """
 
     run_id: str
@@ -106,19 +106,19 @@ class RunOutcome:
 
     @property
     def failed(self) -> Mapping[str, CellResult]:
-        """The failed cells; those behind them are skipped and not among them."""
+        """Return the failed cells; those that depend on them are skipped and not included."""
         return {
             address: result for address, result in self.results.items() if result.status == "failed"
         }
 
     @property
     def status(self) -> Literal["ok", "failed"]:
-        """`failed` when some cell failed."""
+        """`failed` if a cell failed."""
         return "failed" if self.failed else "ok"
 
     @property
     def exit_code(self) -> int:
-        """0 good; the code that all failures share (2 inputs, 4 plugins or libraries); else 1."""
+        """Return 0 without failures, their common code (2 inputs, 4 plugins or libraries), or 1."""
         codes = {result.exit_code for result in self.failed.values()}
         if not codes:
             return 0
@@ -136,21 +136,21 @@ def execute(
 ) -> RunOutcome:
     """Run a plan to its end.
 
-    A failed cell prunes only what needs it. After a kill at any instant the same call with the
+    A failed cell only stops cells that need it. After a kill at any time the same call with the
     same folder resumes.
 
     Args:
-        plan: from `plan_run`; its options say how to run it.
-        run_folder: takes the journal and the logs; made when missing.
-        store: where products and results go.
-        listen: gets events as they happen.
-        run_id: id of a new run, made up when empty; a resumed run keeps its own.
-        on_interruption: gets what there is so far before the run ends with `StoreError`,
-            `ClusterError` or `CancelledStepError`; cells that have no result are not in it.
+        plan: from `plan_run`; its options control the execution.
+        run_folder: receives the journal and the logs; created if missing.
+        store: receives products and results.
+        listen: called with events as they happen.
+        run_id: id of a new run, generated if empty; a resumed run keeps its own.
+        on_interruption: called with the results so far before the run ends with `StoreError`,
+            `ClusterError` or `CancelledStepError`; cells without results are not included.
 
     Raises:
-        ArgumentError: the run folder holds a finished run or other files, or a path is no text.
-        StoreError: the disk refuses, or the run folder is in use.
+        ArgumentError: the run folder holds a finished run or other files, or a path is not text.
+        StoreError: the disk cannot be written, or the run folder is in use.
         CancelledStepError: interrupted by Ctrl-C or SIGTERM.
         ClusterError: the scheduler was lost, or does not answer.
         PluginError: workers have other versions of a method or library, or dask is missing.
@@ -159,7 +159,7 @@ def execute(
     for what, path in (("run folder", folder), ("store", store.folder)):
         if text_of_path(path) is None:
             raise ArgumentError(
-                f"the {what} {one_line(path)} has a path that is no UTF-8: rename it"
+                f"the {what} {one_line(path)} has a path that is not UTF-8: rename it"
             )
     with store.in_use(), Journal(folder, plan.name, run_id=run_id) as journal:
         with writing_to(folder):
@@ -194,7 +194,7 @@ def execute(
 
 @dataclass(frozen=True, kw_only=True)
 class _Ready:
-    """Key and inputs of a cell that only waits for room."""
+    """Key and inputs of a cell that waits for free cores."""
 
     key: CellKey
     refs: Mapping[str, ProductRef]
@@ -238,12 +238,12 @@ class _Run:
                 self._take(end)
 
     def outcome(self) -> RunOutcome:
-        """Return what the run left, in the order of the plan."""
+        """Return the results of the run, in the order of the plan."""
         self._journal.write(RunWent(event="ended", time=now()))
         return self._outcome_of(item.cell.address for item in self._plan.cells)
 
     def so_far(self) -> RunOutcome:
-        """Return what there is, without cells that were asked to stop."""
+        """Return the results so far, without cells that were asked to stop."""
         return self._outcome_of(
             address
             for item in self._plan.cells
@@ -271,12 +271,12 @@ class _Run:
                 self._take(end)
         self._journal.write(RunWent(event="interrupted", time=now()))
         raise CancelledStepError(
-            f"the run was interrupted; the same command goes on where it stopped, given "
-            f"-o {self._tasks.logs.parent.name}"
+            f"the run was interrupted; the same command "
+            f"continues it with -o {self._tasks.logs.parent.name}"
         )
 
     def _advance(self, executor: Executor) -> None:
-        """Settle or start every cell whose inputs are known, as far as the cores go."""
+        """Settle or start every cell whose inputs are known, as far as cores are free."""
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
@@ -343,9 +343,9 @@ class _Run:
     def _is_held_up(
         self, cell: Cell, refs: Mapping[str, ProductRef], *, again: bool = False
     ) -> bool:
-        """Whether a cell must wait because stored products that it takes turn out to be damaged.
+        """Whether a cell must wait because its stored inputs are damaged.
 
-        The cells that gave them, and all behind these, are then settled anew.
+        The cells that gave them, and all that depend on these, are then settled again.
         """
         givers = {
             source.address
@@ -368,7 +368,7 @@ class _Run:
         return bool(givers)
 
     def _is_under_way(self, key: CellKey) -> bool:
-        """Whether an equal cell runs already; its result will then serve both."""
+        """Whether an equal cell already runs; its result will then serve both."""
         return any(task.key == key.key for task in self._running.values())
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
@@ -403,26 +403,26 @@ class _Run:
             self._store.trust(result)
             self._store.forget_failure(task.key)
         elif result.status == "ok":
-            # Kept under its key it would pass for what the code of that key computes.
+            # Stored under its key it would count as the result of that key's code.
             changed = _CODE_CHANGED.of("", {})
             self._listen(CellReported(address=cell.address, diagnostic=changed))
             result = _reporting(result, changed)
         elif result.exit_code != CancelledStepError.exit_code:
             self._store.remember_failure(task.key, result.error_message)
         if self._has_other_inputs_now(cell, task):
-            # What it took was damaged and came out differently when it was computed again.
+            # Its input was damaged and came out differently when it was computed again.
             self._waiting[cell.address] = planned
             return
         self._settle(cell, result)
 
     def _is_to_repeat(self, cell: Cell, task: Task, result: CellResult) -> bool:
-        """Whether a cell failed because of what the store gave it, not because of its method."""
+        """Whether a cell failed because of its stored inputs, not because of its method."""
         repeats = self._repeats.get(cell.address, 0)
         if result.status == "ok" or result.exit_code == CancelledStepError.exit_code:
             return False
         refs = {port: given.ref for port, given in task.inputs.items()}
         is_fault_of_store = self._is_held_up(cell, refs, again=True)
-        # Another run may have set aside what this one was about to read, and mended it since.
+        # Another run may have set aside what this one was about to read, and replaced it since.
         is_fault_of_store |= result.error_type == DamageError.__name__
         self._repeats[cell.address] = repeats + 1
         return is_fault_of_store and repeats < _MOST_REPEATS
@@ -438,11 +438,11 @@ class _Run:
         damage = self._journal.damaged.get(cell.address)
         if damage and result.status == "ok":
             result = _reporting(result, _STORED_RESULT_DAMAGED.of("", {"damage": damage}))
-        # Their names are this workflow's, the result may be another's.
+        # Their names are those of this workflow, the result may be another's.
         named = (placed(one, cell.setting, self._step_of) for one in result.diagnostics)
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
-        # What an equal cell gave a moment ago is as new as that.
+        # The result of an equal cell a moment ago counts as new.
         if is_cached and result.run_id != self._journal.run_id:
             self._cached[cell.address] = result.run_id
         elif is_cached and result.key not in self._made:
@@ -484,14 +484,14 @@ def _passing_on(listen: RunListener) -> Tell:
 
 @contextmanager
 def _scratch(store: Store, run_id: str) -> Iterator[Path]:
-    """A folder for work in progress; those that killed runs left are removed first."""
+    """A folder for work in progress; leftovers of killed runs are removed first."""
     with writing_to(store.folder):
         for old in store.scratch.iterdir():
             if old.is_dir() and old.name != "loose" and not is_locked(_lock_of(old)):
                 remove_tree(old)
                 _lock_of(old).unlink(missing_ok=True)
     folder = store.scratch / f"{run_id}-{uuid.uuid4().hex[:6]}"
-    # Locked before it exists, so that no other run ever takes it for a left-over.
+    # Locked before it exists, so that no other run mistakes it for a leftover.
     with exclusive_lock(_lock_of(folder), f"the scratch folder {folder} is in use"):
         with writing_to(store.folder):
             folder.mkdir(parents=True)
@@ -508,11 +508,11 @@ def _lock_of(folder: Path) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class _TaskMaker:
-    """Makes the tasks of one run.
+    """Creates the tasks of one run.
 
     Attributes:
         plan: of the run.
-        store: where products and results go.
+        store: receives products and results.
         scratch: folder of the run for work in progress, on the store's file system.
         logs: folder for the logs of steps.
         run_id: of the run.
@@ -585,8 +585,8 @@ def _executor_of(
     Args:
         plan: of the run.
         scratch: its scratch folder.
-        tell: takes what steps say.
-        is_asked_to_stop: whether somebody interrupts the run.
+        tell: called with messages of steps.
+        is_asked_to_stop: whether the run is interrupted.
 
     Raises:
         PluginError: its library is not installed.
@@ -610,14 +610,14 @@ class Interruption:
     """Whether the run was asked to stop.
 
     Attributes:
-        is_asked: a signal came.
+        is_asked: a signal was received.
     """
 
     def __init__(self) -> None:
         self.is_asked = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Handle the signal; a second one does not wait for anybody.
+        """Handle the signal; a second one does not wait.
 
         Raises:
             KeyboardInterrupt: asked a second time.
@@ -629,7 +629,7 @@ class Interruption:
 
 @contextmanager
 def _watching_interruptions() -> Iterator[Interruption]:
-    """Catch SIGINT and SIGTERM inside the block; only the main thread can, others never see any."""
+    """Catch SIGINT and SIGTERM inside the block, which only the main thread can."""
     interruption = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield interruption

@@ -1,4 +1,4 @@
-"""The store: products by digest, results by key; the engine's only door to the record format.
+"""The store: products by digest, results by key; the engine's only access to the record format.
 
 Layout below the store's folder:
 
@@ -14,7 +14,7 @@ Layout below the store's folder:
     damaged.lock                    held by who sets something aside
 
 Everything has the digest of its bytes (`objects`, `checked_json`) and is checked when a run, or an
-export, takes it. What is damaged is set aside, never removed: another run may have it open.
+export, uses it. Damaged objects are set aside, never removed: another run may have them open.
 """
 
 from __future__ import annotations
@@ -71,28 +71,28 @@ from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products.product import Payload, Product
 from orthoflow.sdk.lines import one_line
 
-# Made together when a store is first used. The last one is what a store is known by: a git
-# repository has `objects`, and anybody's folder may have `results`.
+# Created together when a store is first used. The last one identifies a store: a git repository has
+# `objects`, and any folder may have `results`.
 _MADE: Final = ("scratch", "results", "objects", "preimages")
-# What else may come first, as a lock does. A disk of its own has `lost+found`, and systems leave
-# hidden files everywhere.
+# Other files that may be created first, such as a lock. A separate disk has `lost+found`, and
+# systems create hidden files everywhere.
 _OURS: Final = frozenset(
     {*_MADE, "failures", "damaged", "digests.json", "lock"} | {"damaged.lock", "lost+found"}
 )
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a run has made a store of a folder."""
+    """Whether a folder is the store of a run."""
     return (folder / _MADE[-1]).is_dir()
 
 
 def require_store(folder: Path) -> None:
-    """Refuse a folder of something else, for a store is written to and cleaned up.
+    """Refuse a folder with other content, because a store is written to and cleaned up.
 
-    One that is not there, or has nothing but hidden files and what a store has, may become one.
+    A missing one, or one with only hidden files and parts of a store, may become one.
 
     Raises:
-        ArgumentError: other files lie there, and no store.
+        ArgumentError: there are other files, and no store.
         StoreError: the folder cannot be read.
     """
     if is_store(folder) or not folder.is_dir():
@@ -102,18 +102,18 @@ def require_store(folder: Path) -> None:
         foreign = sorted(name for name in names if name[0] != "." and name not in _OURS)
     if foreign:
         raise ArgumentError(
-            f"{folder} is no store of orthoflow: it holds {foreign[0]}"
+            f"{folder} is not a store of orthoflow: it holds {foreign[0]}"
             f"{f' and {len(foreign) - 1} more' if foreign[1:] else ''}; name a store, or a folder "
             "that is empty or not there yet, with --store"
         )
 
 
 def make_store(folder: Path) -> None:
-    """Make the folders of a store, where they are not there yet.
+    """Create the folders of a store, if they are missing.
 
     Raises:
-        ArgumentError: something else lies there.
-        StoreError: they cannot be made.
+        ArgumentError: the folder has other content.
+        StoreError: they cannot be created.
     """
     require_store(folder)
     with writing_to(folder):
@@ -134,14 +134,14 @@ __all__ = [
 ]
 
 _READ_RETRY_S: Final = 0.05
-# A reason stands in one column of a table; the record of the run has the whole sentence.
+# A reason is in one column of a table; the record of the run has the whole sentence.
 _LONGEST_FAILURE: Final = 400
 
 ProductT = TypeVar("ProductT", bound=Product)
 
 
 class Publisher(Protocol):
-    """What writes the files of a product that people open in other programs."""
+    """Writes the files of a product for other programs."""
 
     def __call__(self, product: Product, folder: Path, digest: str, /) -> object:
         """Write the files into an existing empty folder."""
@@ -149,11 +149,11 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class TakenResult:
-    """What a run gets for a key.
+    """The stored result for a key.
 
     Attributes:
-        result: None when there is none, or none that is whole.
-        damage: which parts of it were damaged, empty when there is nothing to say.
+        result: None if there is none, or an incomplete one.
+        damage: its damaged parts, empty without any.
     """
 
     result: CellResult | None
@@ -172,17 +172,17 @@ class Preimage:
 class Store:
     """A folder of products and results that runs share, also at the same time.
 
-    Nothing half written is ever taken as valid: every file and folder is made aside, synced and
-    renamed into place.
+    Incomplete data are never accepted: every file and folder is created under a temporary name,
+    synced and renamed.
     """
 
     def __init__(self, folder: Path, *, workspace: Path | None = None) -> None:
-        """Name a store; nothing is touched before something is written.
+        """Name a store; nothing is created before something is written.
 
         Args:
             folder: the store's folder.
-            workspace: where unfinished objects lie, on the same file system; below the store's
-                scratch folder when not given.
+            workspace: folder of unfinished objects, on the same file system; by default below the
+                store's scratch folder.
         """
         self.folder = Path(folder).absolute()
         self.scratch = self.folder / "scratch"
@@ -197,16 +197,16 @@ class Store:
         self._found_damaged: dict[str, str] = {}
 
     def file_digests(self) -> FileDigests:
-        """Return the memory of input files' digests; call its `save` when done."""
+        """Return the cache of input files' digests; call its `save` when done."""
         return FileDigests(self.folder / "digests.json")
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """Keep garbage collection away.
+        """Prevent garbage collection.
 
         Raises:
-            ArgumentError: something else lies in the folder.
-            StoreError: the store's folder cannot be made.
+            ArgumentError: the folder has other content.
+            StoreError: the store's folder cannot be created.
         """
         make_store(self.folder)
         with shared_lock(self.lock_file):
@@ -217,18 +217,18 @@ class Store:
     def put_product(
         self, product: Product, publisher: Publisher | None = None, *, publisher_tag: str = ""
     ) -> ProductRef:
-        """Keep a product and the files it publishes.
+        """Store a product and its published files.
 
         Args:
-            product: what to keep; an equal one that is there already stays.
+            product: the product; an equal one that is there already stays.
             publisher: writes its published files.
-            publisher_tag: version of the publisher; files of another version are made anew.
+            publisher_tag: version of the publisher; files of another version are written again.
 
         Raises:
             StoreError: full disk, or another failure of the disk.
-            ProductError: the product holds what no store can keep.
+            ProductError: the product has content that cannot be stored.
         """
-        # Loads h5py, which a plan does without.
+        # Loads h5py, which a plan does not need.
         from orthoflow_provenance.arrays import write_product_file  # noqa: PLC0415
 
         aside = self._new_folder()
@@ -252,27 +252,27 @@ class Store:
     def get_product(
         self, digest: str, cls: type[ProductT], *, is_checked: bool = False
     ) -> ProductT:
-        """Read a product; arrays are read-only, those of scan size memory-mapped.
+        """Read a product; arrays are read-only, large ones memory-mapped.
 
         Args:
             digest: of the product.
             cls: its type.
-            is_checked: somebody has looked at its bytes already, as the coordinator does for steps.
+            is_checked: its bytes have been checked already, as the coordinator does for steps.
 
         Raises:
-            DamageError: it is not there, or is damaged.
+            DamageError: it is missing or damaged.
             ProductError: it is of another type.
         """
         from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
 
         path = self._object(digest) / PRODUCT
         if not path.is_file():
-            # Another run may be exchanging the folder for an equal one this very moment.
+            # Another run may be replacing the folder by an equal one at this moment.
             time.sleep(_READ_RETRY_S)
         if not path.exists():
             raise DamageError(f"the store {self.folder} has no product {digest}")
         what = f"the stored product {digest[:19]} in {self.folder}"
-        damaged = f"{what} was damaged; run again and it is computed anew"
+        damaged = f"{what} was damaged; run again to compute it again"
         if not is_checked and not self.is_sound(digest):
             raise DamageError(damaged)
         try:
@@ -284,16 +284,16 @@ class Store:
         return cls.from_payload(Payload(**shared_fields(stored, Payload)))
 
     def product_file(self, digest: str) -> Path | None:
-        """The HDF5 file of a product, None when it is not there or is damaged."""
+        """Return the HDF5 file of a product, None if it is missing or damaged."""
         return self._object(digest) / PRODUCT if self.is_sound(digest) else None
 
     def published_files(self, digest: str) -> Mapping[Path, str]:
-        """The files that a product published, sorted by name, and the SHA-256 that each must have.
+        """Published files of a product, sorted by name, and the required SHA-256 of each.
 
-        They are not read here: who copies them computes the digests on the way.
+        They are not read here: copying them computes the digests.
 
         Raises:
-            DamageError: the product is not there, or nobody knows what it published.
+            DamageError: the product is missing, or its published files are unknown.
         """
         folder = self._object(digest)
         found = read_description(folder)
@@ -309,10 +309,10 @@ class Store:
     # Figures ------------------------------------------------------------------------------------
 
     def put_blob(self, content: bytes) -> str:
-        """Keep bytes, give their SHA-256 in hexadecimal digits.
+        """Store bytes, return their SHA-256 in hexadecimal digits.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         sha256 = hashlib.sha256(content).hexdigest()
         folder = self.objects / sha256
@@ -326,10 +326,10 @@ class Store:
         return sha256
 
     def blob(self, sha256: str) -> bytes:
-        """The bytes of a figure.
+        """Return the bytes of a figure.
 
         Raises:
-            DamageError: they are not there, or are damaged.
+            DamageError: they are missing or damaged.
         """
         with contextlib.suppress(OSError):
             content = (self._object(sha256) / BLOB).read_bytes()
@@ -341,16 +341,16 @@ class Store:
     # Damage -------------------------------------------------------------------------------------
 
     def is_sound(self, name: str, *, again: bool = False) -> bool:
-        """Whether a product or a figure has the bytes that were put there; see `damage`."""
+        """Whether a product or a figure has its original bytes; see `damage`."""
         return not self.damage(name, again=again)
 
     def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
-        """State which part of an object is damaged, and set it aside; empty when it is sound.
+        """Return the damaged part of an object, and set it aside; empty if it is intact.
 
         Args:
             name: of the object: digest of a product, or SHA-256 of a figure.
-            with_published: look at the published files too.
-            again: look at files, too, that this process has found sound and nobody changed since.
+            with_published: also check the published files.
+            again: also check files that this process has found intact and that are unchanged since.
 
         Raises:
             StoreError: it cannot be set aside.
@@ -363,19 +363,19 @@ class Store:
 
         part = damaged_part()
         if part and not self._set_aside(folder, damaged_part):
-            # It is gone, or another run has mended it, or it could not be read just once.
+            # It is gone, or another run has replaced it, or a read failed only once.
             part = damaged_part()
         if part and part != WHOLE:
             self._found_damaged[folder.name] = part
         return part
 
     def damaged_objects(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Look at every byte of objects, set damaged ones aside and name them."""
+        """Check every byte of objects, set damaged ones aside and name them."""
         wanted = dict.fromkeys(names)
         return tuple(name for name in wanted if self.damage(name, with_published=True, again=True))
 
     def trust(self, result: CellResult) -> None:
-        """Take the objects of a result for sound that has only just been computed."""
+        """Mark the objects of a result that was just computed as intact."""
         for name in result.objects:
             folder = self.objects / name
             with contextlib.suppress(OSError):
@@ -385,14 +385,14 @@ class Store:
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
-        """The result of a key; None when there is none, or objects of it are visibly not whole."""
+        """Result of a key; None without one, or if objects of it are visibly incomplete."""
         result = self._read_result(key)
         if result is None or any(missing_part(self.objects / name) for name in result.objects):
             return None
         return result
 
     def take(self, key: str) -> TakenResult:
-        """Take the result of a key into a run: what is visibly damaged is set aside and named.
+        """Use the result of a key in a run: visibly damaged parts are set aside and named.
 
         Raises:
             StoreError: the store cannot be read.
@@ -415,7 +415,7 @@ class Store:
         return TakenResult(result=result)
 
     def damage_of_result(self, key: str) -> str:
-        """State what makes a result useless, and set it aside; empty when all of it is there.
+        """Return why a result is unusable, and set it aside; empty if it is complete.
 
         Raises:
             StoreError: it cannot be set aside.
@@ -431,14 +431,14 @@ class Store:
         return reason
 
     def size_bytes(self, result: CellResult) -> int:
-        """What a result's products, their published files and its figures take here."""
+        """Return the size of a result's products, their published files and its figures."""
         return sum(folder_size(self.objects / name) for name in result.objects)
 
     def put_result(self, key: str, result: CellResult, step: str) -> None:
-        """Keep the result of a cell; its objects must be in the store already.
+        """Store the result of a cell; its objects must be in the store already.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         with writing_to(self.folder):
             folder = self.preimages / result.method
@@ -449,7 +449,7 @@ class Store:
         write_whole(folder / f"{key}.json", json.dumps(preimage).encode())
 
     def earlier_preimages(self, method: str, *, limit: int = 100) -> tuple[Preimage, ...]:
-        """Preimages of earlier results of a method, newest first."""
+        """Yield preimages of earlier results of a method, newest first."""
         folder = self.preimages / method
         dated = []
         with contextlib.suppress(FileNotFoundError):
@@ -470,7 +470,7 @@ class Store:
             write_whole(self.failures / key, one_line(sentence, _LONGEST_FAILURE).encode())
 
     def forget_failure(self, key: str) -> None:
-        """Take back what was remembered: the cell has a result now."""
+        """Remove the sentence, because the cell has a result now."""
         with contextlib.suppress(OSError):
             (self.failures / key).unlink()
 
@@ -524,7 +524,7 @@ class Store:
         return result if result.key == key and result.status == "ok" else None
 
     def _is_there(self, folder: Path, publisher_tag: str) -> bool:
-        """Whether an equal object is there, sound, and needs no newer published files."""
+        """Whether an equal object is stored, intact, and its published files are current."""
         found = read_description(folder)
         is_current = found is not None and found.publisher == publisher_tag
         return is_current and not self._damaged_part(folder, with_published=True, again=True)
@@ -545,17 +545,17 @@ class Store:
         return ""
 
     def _set_aside(self, path: Path, is_damaged: Callable[[], object]) -> bool:
-        """Move a file or folder out of the way, if it is there and still damaged.
+        """Move a file or folder out of the way, if it exists and is still damaged.
 
         Raises:
             StoreError: it cannot be moved.
         """
         if not os.path.lexists(path):
-            # Who only asks a store leaves no lock there, and makes no folder for it.
+            # Reading a store leaves no lock there, and creates no folder for it.
             return False
         try:
             with writing_to(self.folder), taking_turns(self.folder / "damaged.lock"):
-                # Another run may have been quicker, and may have put a sound one there.
+                # Another run may have been faster, and may have stored an intact one.
                 if not os.path.lexists(path) or not is_damaged():
                     return False
                 self.damaged.mkdir(exist_ok=True)
@@ -571,19 +571,19 @@ class Store:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Return the store of a folder, if there is one: to look for it makes none."""
+    """Return the store of a folder, if there is one; it is not created."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 
 def publish_into(folder: Path, product: Product, publisher: Publisher, digest: str) -> None:
-    """Let a product publish its files in a new folder: plain files alone."""
+    """Let a product publish its files in a new folder: plain files only."""
     folder.mkdir(parents=True)
     publisher(product, folder, digest)
     require_plain_files(folder, f"a {product.type_name}")
 
 
 def digest_of(product: Product) -> str:
-    """Digest of a product's logical content, `sha256:` + 64 hexadecimal digits."""
+    """Return the digest of a product's logical content, `sha256:` + 64 hexadecimal digits."""
     from orthoflow_provenance.arrays import payload_digest  # noqa: PLC0415 - as above
 
     return payload_digest(product.to_payload())
@@ -609,7 +609,7 @@ class StoredResult:
         method: method id.
         run_id: the run that computed it.
         ended: ISO 8601 UTC.
-        last_used: ISO 8601 UTC, when a run last took or made it.
+        last_used: ISO 8601 UTC, when a run last used or created it.
         size_bytes: of its products with their published files; equal products of several results
             count for each.
         is_complete: all its products and figures are there.
@@ -625,7 +625,7 @@ class StoredResult:
 
 
 def list_results(store: Store) -> tuple[StoredResult, ...]:
-    """List the results of a store, last used first; unreadable ones are left out."""
+    """List the results of a store, last used first; unreadable ones are omitted."""
     found: list[StoredResult] = []
     for path in store.results.glob("*.json"):
         try:

@@ -1,4 +1,4 @@
-"""Running one task: read the inputs, call the method, keep the outputs.
+"""Running one task: read the inputs, call the method, store the outputs.
 
 `run_step` is what the process of a step does, `run_task` does it in any process.
 """
@@ -71,7 +71,7 @@ from orthoflow.system import adopt_orphans, children_processor_s, flags
 _CHECKED_BYTES: Final = 16 << 20
 # The main one, the sampler of memory, and the one that waits for the coordinator.
 _OWN_THREADS: Final = 3
-# With room for what a method raised, which is cut shorter, and the words around it.
+# With a margin for the method's own message, which is cut shorter, and the words around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
@@ -83,8 +83,8 @@ class TaskFile:
     """An input file of a task.
 
     Attributes:
-        path: where it lies.
-        identity: what the file system says of it as long as it stays as it is.
+        path: its path.
+        identity: file system attributes while it is unchanged.
         sha256: digest of its content, hexadecimal.
     """
 
@@ -112,12 +112,12 @@ class TaskInput:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOutput:
-    """What an output port must carry: type, class and publisher by import string.
+    """What an output port must give: type, class and publisher by import string.
 
     Attributes:
         type_name: product type.
         target: of its class.
-        publisher: of what writes its published files; empty when nothing does.
+        publisher: of its published files; empty without any.
         publisher_tag: version of the publisher.
     """
 
@@ -171,7 +171,7 @@ class Task(MethodIdentity):
 
     @property
     def who(self) -> str:
-        """Method and distribution, as sentences about it begin."""
+        """Method and distribution, as the beginning of sentences."""
         brought = (
             f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
         )
@@ -179,30 +179,30 @@ class Task(MethodIdentity):
 
     @property
     def scratch(self) -> Path:
-        """The folder a method may write to."""
+        """Return the folder a method may write to."""
         return Path(self.folder) / "scratch"
 
 
 Listener = Callable[[StepEvent], None]
 
 
-# What the process of a step sends: one of these, then JSON.
+# Messages of the process of a step: one of these, then JSON.
 EVENT: Final = b"event "
 RESULT: Final = b"result "
 
 
 def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None:
-    """Be the process of a step: run a task, send what it says and at last its result.
+    """Be the process of a step: run a task, send its messages and finally its result.
 
     Args:
         task: what to run.
-        pipe: takes `EVENT` and `RESULT` messages.
+        pipe: receives `EVENT` and `RESULT` messages.
         variables: all environment variables of the step.
     """
     _move_to(task, variables)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    # Nobody but the method can raise it from here on.
+    # From here on only the method can raise it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_coordinator, daemon=True).start()
     events = _EventPipe(pipe)
@@ -217,7 +217,7 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
 
 
 def _move_to(task: Task, variables: Mapping[str, str]) -> None:
-    """Take the surroundings of a step for this process."""
+    """Set up the environment of a step in this process."""
     if hasattr(os, "setsid"):
         os.setsid()
     adopt_orphans()
@@ -240,10 +240,10 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
     task.scratch.mkdir(parents=True, exist_ok=True)
     os.chdir(task.scratch)
     tempfile.tempdir = None
-    # Be the first that the kernel kills when memory runs out, instead of the coordinator.
+    # Be the first process that the kernel kills when memory runs out, instead of the coordinator.
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
-    # Libraries that are loaded have read how many threads they may start.
+    # Loaded libraries have already read how many threads they may start.
     reload_numba_config()
     threadpoolctl.threadpool_limits(task.cores)
     if "cv2" in sys.modules:
@@ -251,7 +251,7 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
 
 
 def _end_with_coordinator() -> None:
-    """Wait until the process that wants the result is gone, and end with all of this session."""
+    """Wait until the process that waits for the result is gone, then end this session."""
     coordinator = multiprocessing.parent_process()
     if coordinator is not None:
         coordinator.join()
@@ -278,9 +278,9 @@ class _EventPipe:
         self._sent = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Send an event; progress at most ten times a second, the rest into the log too.
+        """Send an event; progress at most ten times a second, the rest also to the log.
 
-        Another text of the same fraction is another activity, and always sent.
+        A new text with the same fraction is another activity, and always sent.
         """
         if event.kind == "progress":
             is_soon = time.monotonic() - self._sent_s < _PROGRESS_EVERY_S
@@ -289,13 +289,13 @@ class _EventPipe:
                 return
             self._sent_s, self._sent = time.monotonic(), event
         else:
-            # The method may have closed it, or put something else into its place.
+            # The method may have closed it, or replaced it.
             with suppress(AttributeError, OSError, ValueError):
                 sys.stderr.write(shown(event.text, keep="\n") + "\n")
         self.send(EVENT + json.dumps(dataclasses.asdict(event)).encode())
 
     def send(self, message: bytes) -> None:
-        """Send a message, unless the method closed the pipe: then it works on unheard."""
+        """Send a message, unless the method closed the pipe: then it works without messages."""
         with self._lock, suppress(OSError):
             self._pipe.send_bytes(message)
 
@@ -311,7 +311,7 @@ def run_task(
 
     Args:
         task: what to run; its folder exists.
-        listen: gets progress, log lines and diagnostics.
+        listen: called with progress, log lines and diagnostics.
         is_cancelled: asks whether to stop.
         has_own_process: whether this process ends with the task.
     """
@@ -323,13 +323,13 @@ def run_task(
         with sampler, meter, heard_by(news.compiling):
             result = call.run()
     except BaseException as error:
-        # Where Ctrl-C is ignored, nobody but the method can have raised it.
+        # If Ctrl-C is ignored, only the method can have raised it.
         is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
         if isinstance(error, KeyboardInterrupt) and is_users:
             raise
         trace = _trace(error)
         if not isinstance(error, OrthoflowError):
-            # Into the log, and with it into the record: there an author looks for what went wrong.
+            # To the log, and so to the record, where an author looks for the error.
             news.listen(StepEvent(kind="log", text=trace))
         result = failed_result(task, explain_failure(task, error), trace)
     return dataclasses.replace(
@@ -344,13 +344,13 @@ def run_task(
 
 def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
     """Return the result of a cell that failed."""
-    # Of a file all problems come at once, a line each.
+    # A file reports all problems at once, a line each.
     said = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
         blank_result(task),
         status="failed",
         error_type=type(error).__name__,
-        error_message=one_line(said, _LONGEST_ERROR) or f"{task.who} failed without a word",
+        error_message=one_line(said, _LONGEST_ERROR) or f"{task.who} failed without a message",
         traceback=trace,
         exit_code=error.exit_code,
     )
@@ -371,7 +371,7 @@ def blank_result(task: Task) -> CellResult:
 
 
 def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
-    """Turn whatever a method raised into one of our errors with one sentence."""
+    """Convert any exception of the method into one of our errors with one sentence."""
     if isinstance(error, OrthoflowError):
         return error
     if is_for_want_of_memory(error):
@@ -399,36 +399,36 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        # No StoreError: the method wanted more than there is, and stands failed in the record.
+        # Not a StoreError: the method needed more than is available, and is recorded as failed.
         kind = StepFailedError if error.errno == errno.EFBIG else DiskSpaceError
         return kind(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
 
 
 class _News:
-    """Passes on what a step says, and between that which kernel it waits for."""
+    """Forwards messages of a step, and in between which kernel it waits for."""
 
     def __init__(self, listen: Listener) -> None:
         self._listen = listen
         self._last = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Pass on what the method says."""
+        """Forward a message of the method."""
         if event.kind == "progress":
             self._last = event
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """State what is compiled; when that is over, what was said before."""
+        """Report what is compiled; afterwards, the previous message."""
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
 @dataclass(kw_only=True)
 class _TimedContext(StepContext):
-    """A context that knows how long figures took, which is no time of the method.
+    """A context that measures the time of figures, which does not belong to the method.
 
     Attributes:
-        drawing_s: seconds by the clock, and of the processor.
+        drawing_s: seconds of the clock, and of the processor.
     """
 
     drawing_s: tuple[float, float] = (0.0, 0.0)
@@ -446,7 +446,7 @@ class _TimedContext(StepContext):
 
 
 class _Call:
-    """One call of a method, with what it measured so far also when it fails."""
+    """One call of a method, with its measurements so far even if it fails."""
 
     def __init__(
         self,
@@ -479,7 +479,7 @@ class _Call:
         return self._context.diagnostics
 
     def costs(self) -> Costs:
-        """What the call took so far."""
+        """Return the cost of the call so far."""
         return Costs(
             wall_s=self._wall_s,
             cpu_s=self._processor_s,
@@ -501,9 +501,9 @@ class _Call:
                 os._exit(1)
             drawing_s, drawing_cpu_s = self._context.drawing_s
             self._wall_s = round(self._meter.clock_s() - wall_s - drawing_s, 4)
-            # Clocks of threads run ahead of their process's by ticks.
+            # Clocks of threads are ahead of their process's by ticks.
             self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
-        # Not through `progress`: who was asked to stop, and ended all the same, has a result.
+        # Not through `progress`: a step that was asked to stop, but finished, has a result.
         self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
         self._check_inputs(inputs)
         result = dataclasses.replace(
@@ -584,7 +584,7 @@ class _Call:
         return refs
 
     def _check_output(self, port: str, product: Product, ref: ProductRef) -> None:
-        # Only who still runs can change what was returned; a thread can be seen.
+        # Only a running thread can change what was returned, and threads are visible.
         is_checked = _n_bytes(product) <= _CHECKED_BYTES or threading.active_count() > _OWN_THREADS
         if is_checked and digest_of(product) != ref.digest:
             raise MethodError(
@@ -621,7 +621,7 @@ def load_target(target: str) -> object:
 def _check_file(file: TaskFile) -> None:
     path = Path(file.path)
     try:
-        # Who only touched it, or gave it another name, has changed nothing.
+        # Touching or renaming it changes nothing.
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
         raise InputError(
@@ -640,5 +640,5 @@ def _trace(error: BaseException) -> str:
         text = "".join(traceback.format_exception(error))
     except Exception:  # noqa: BLE001 - as above, it may fail at being told of
         text = ""
-    # The end says what happened.
+    # The relevant part is at the end.
     return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()

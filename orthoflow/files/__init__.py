@@ -1,1 +1,1 @@
-"""Files of other programs: images, GeoTIFF, point clouds, and what a run publishes for people."""
+"""Files of other programs: images, GeoTIFF, point clouds, and the files that a run publishes."""

@@ -9,10 +9,10 @@ cameras:
   "*": {width: 4000, height: 3000, fx: 3004.2, fy: 3004.2, cx: 1999.5, cy: 1499.5}
 ```
 
-The first entry that matches a photo holds. Of `model: fisheye` (`cv2.fisheye`) the distortion is
-k1, k2, k3, k4, and `field_of_view_deg` the whole angle to use, 180 where it is missing. Pixels in
-the file count from the centre of the first pixel; inside, that centre is at (0.5, 0.5), and only
-this module converts.
+The first entry that matches a photo applies. For `model: fisheye` (`cv2.fisheye`) the distortion is
+k1, k2, k3, k4, and `field_of_view_deg` the full angle to use, 180 by default. Pixels in the file
+count from the centre of the first pixel; internally, that centre is at (0.5, 0.5), and only this
+module converts.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _DIALECT: Final = Dialect(
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedLenses:
-    """What a calibration file says; the first pattern that matches a photo holds.
+    """The content of a calibration file; the first pattern that matches a photo applies.
 
     Attributes:
         patterns: photo names or shell patterns.
@@ -115,7 +115,7 @@ def calibration_text(calibration: Calibration) -> str:
     """Return the content of a calibration file."""
     lines = [
         "# Pixels as OpenCV counts them: the centre of the first pixel is (0, 0).",
-        "# distortion: k1, k2, p1, p2, k3. The first entry that matches a photo's name holds.",
+        "# distortion: k1, k2, p1, p2, k3. The first entry that matches a photo's name applies.",
         "cameras:",
     ]
     for pattern, camera in zip(calibration.patterns, calibration.intrinsics, strict=True):
@@ -137,8 +137,8 @@ def calibration_text(calibration: Calibration) -> str:
 def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
     """Return the first pattern that is the photo's name, or matches it as in a shell.
 
-    The case of letters counts. A name that holds brackets matches itself, and a name with folders
-    is also matched without them.
+    Matching is case-sensitive. A name with brackets matches itself, and a name with folders is also
+    matched without them.
     """
     names = (photo_name, photo_name.rpartition("/")[2])
     for pattern in patterns:
@@ -150,7 +150,7 @@ def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
 def lens_for(
     calibration: CalibratedLenses, photo_name: str, width: int, height: int
 ) -> Intrinsics | FisheyeLens | None:
-    """Return the calibrated lens of a photo; None when no entry matches its name.
+    """Return the calibrated lens of a photo; None if no entry matches its name.
 
     Args:
         calibration: the calibrated lenses.
@@ -180,7 +180,7 @@ def lens_for(
 
 
 class _Lens(BaseModel):
-    """An entry of the file; validators know the fields above theirs."""
+    """An entry of the file; validators use the fields above theirs."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -226,7 +226,7 @@ class _Lens(BaseModel):
         if len(values) != len(terms):
             raise ValueError(
                 f"expected the {len(terms)} numbers [{', '.join(terms)}], got {len(values)} "
-                "values; fill up with 0, other lens models are not read"
+                "values; pad with 0; other lens models are not supported"
             )
         if len(info.data) == _FIELDS_ABOVE and (problem := _problem(_lens(info.data, values))):
             raise ValueError(
@@ -264,7 +264,7 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
 
 
 class _Reader:
-    """Turns the text into cameras and collects everything that is wrong with it."""
+    """Turns the text into cameras and collects all problems with it."""
 
     def __init__(self, file_name: str) -> None:
         self.file_name = file_name
@@ -304,7 +304,7 @@ class _Reader:
         return CalibratedLenses(patterns=tuple(lenses), lenses=tuple(lenses.values()))
 
     def add(self, position: Position, path: str, message: str) -> None:
-        """Keep a problem of the YAML; places are told by line and column."""
+        """Keep a problem of the YAML; positions are lines and columns."""
         del path
         self._add(position, message)
 
@@ -341,7 +341,7 @@ class _Reader:
 
 
 def _place(entry: Entry, location: Sequence[int | str]) -> tuple[Position, str, Value]:
-    """Where in the text a field of an entry stands, how messages call it, and its value."""
+    """Position in the text of a field of an entry, its name in messages, and its value."""
     position, value, path = entry.position, entry.value, ""
     for key in location:
         path += f"[{key}]" if isinstance(key, int) else f".{key}"
@@ -353,7 +353,7 @@ def _place(entry: Entry, location: Sequence[int | str]) -> tuple[Position, str, 
 
 
 def _sentence(error: ErrorDetails, value: Value) -> str:
-    """State what pydantic found wrong with a field, and the way out."""
+    """Describe what pydantic found wrong with a field, and how to correct it."""
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return message
@@ -363,7 +363,7 @@ def _sentence(error: ErrorDetails, value: Value) -> str:
     near = difflib.get_close_matches(key, known, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""
     if key.isdecimal():
-        hint = ", what a decimal comma leaves behind: write decimal points"
+        hint = ", probably a decimal comma: write decimal points"
     return f"unknown key{hint}; expected {', '.join(known)}"
 
 
@@ -376,7 +376,7 @@ def _folds(camera: Intrinsics) -> bool:
             rays = camera.posed().rays_camera(pixels)
     except (GeometryError, np.linalg.LinAlgError):
         return True
-    # The search may end on the far side of the fold: the radius must grow all the way to the ray.
+    # The search may end beyond the fold: the radius must increase all the way to the ray.
     k1, k2, _, _, k3 = camera.distortion
     steps = np.linspace(0.0, float((rays[:, :2] ** 2).sum(axis=1).max()), 200)
     growth = 1.0 + steps * (3.0 * k1 + steps * (5.0 * k2 + steps * 7.0 * k3))

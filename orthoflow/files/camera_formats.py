@@ -1,4 +1,4 @@
-"""Files of cameras: who reads which, and the readers of `cameras.json`, Bundler, RealityCapture.
+"""Files of cameras: choice of the reader, and readers of `cameras.json`, Bundler, RealityCapture.
 
 Metashape, COLMAP and E57 have modules of their own.
 """
@@ -38,18 +38,18 @@ from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
 _FULL_FRAME_MM: Final = 36.0
-# Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
+# OpenGL axes, as in Bundler and RealityCapture: x right, y up, z backwards.
 _FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 _ANGLES: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _FOCAL_BEHIND: Final = re.compile(r"\s+0\s+[-+.\deE]+$")
 _SEPARATORS: Final = re.compile("[,;\t]")
 _FIRST_LINES: Final = 50
-# Of several files of one kind these are meant.
+# Preferred names if there are several files of one kind.
 _USUAL_NAMES: Final = ("cameras.json", "bundle.out", "cameras.xml", "cameras.csv")
 
 
 def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
-    """Read the cameras of one file, or of a folder that several files make.
+    """Read the cameras of one file, or of a folder of files that belong together.
 
     Raises:
         InputError: the files are of no known kind, damaged, or hold too many.
@@ -94,7 +94,7 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
 
 
 def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
-    """Parts of each COLMAP model among files, binary before text, by their folders."""
+    """Return the parts of each COLMAP model among files, binary before text, by folder."""
     for suffix in (".bin", ".txt"):
         folders: dict[Path, dict[str, Path]] = {}
         for path in paths:
@@ -107,11 +107,11 @@ def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
-    """Names of the photos of a Bundler file, from the list beside it that has as many.
+    """Return the names of the photos of a Bundler file, from a list beside it with as many entries.
 
-    A line is a name, which may hold spaces or stand in quotes, or a name, 0 and a focal length in
-    pixels. Of several lists the one is meant that is called after the file, then `list.txt`; lists
-    of anything but photos are none where there is one of photos.
+    A line is a name, which may contain spaces or be quoted, or a name, 0 and a focal length in
+    pixels. Of several lists the one named like the file is used, then `list.txt`; lists of other
+    files are ignored if there is one of photos.
     """
     n_cameras = bundler_count(path)
     lists = {
@@ -162,7 +162,7 @@ def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise damaged(path, "it is no cameras.json of a run") from error
+        raise damaged(path, "it is not a cameras.json of a run") from error
 
 
 def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
@@ -200,10 +200,10 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
 
 
 def bundler_count(path: Path) -> int:
-    """Return how many cameras a file of Bundler states.
+    """Return the number of cameras that a Bundler file states.
 
     Raises:
-        InputError: it does not.
+        InputError: it states none.
     """
     words = list(islice(_words_of(path), 2))
     counts = numbers_of(words, path, "the counts of cameras and points")
@@ -213,18 +213,18 @@ def bundler_count(path: Path) -> int:
 
 
 def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
-    """Read Bundler's file: f, k1, k2, R and t of each camera, with the axes of OpenGL.
+    """Read a Bundler file: f, k1, k2, R and t of each camera, with OpenGL axes.
 
-    Its pixels count from the middle of the photo, y upwards.
+    Its pixels count from the centre of the photo, y upwards.
 
     Args:
         path: the file.
-        names: of the photos, in its order.
+        names: names of the photos, in the order of the file.
 
     Raises:
         InputError: it is damaged.
     """
-    # What follows the cameras are points, which may be many.
+    # Points follow the cameras, and may be many.
     words = list(islice(_words_of(path), 2 + 15 * len(names)))
     found = []
     for index, name in enumerate(names):
@@ -253,7 +253,7 @@ def _words_of(path: Path) -> Iterator[str]:
 
 
 def _head_of(lines: Sequence[str]) -> tuple[int, list[str]] | None:
-    """Line and columns of a RealityCapture list's head; None where no line is one."""
+    """Return line and columns of the header of a RealityCapture list; None without one."""
     for number, line in enumerate(lines):
         columns = [word.strip().lower() for word in _SEPARATORS.split(line.lstrip("# \ufeff"))]
         if {"name", "heading"} <= set(columns):
@@ -272,9 +272,9 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
     """Read RealityCapture's "internal/external camera parameters" (CSV).
 
     The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
-    principal point in shares of that side from the middle; heading is clockwise from north (y),
-    pitch 0 looks straight down. Terms that are not in the list are zero; lines of comment may
-    stand anywhere.
+    principal point in shares of that side from the centre; heading is clockwise from north (y),
+    pitch 0 looks straight down. Terms that are not in the list are zero; comment lines may be
+    anywhere.
 
     Raises:
         InputError: it is damaged.
@@ -297,7 +297,7 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
             if any(row) and not row[0].lstrip().startswith("#")
         )
     except csv.Error as error:
-        raise damaged(path, f"it is no table: {error}") from error
+        raise damaged(path, f"it is not a table: {error}") from error
 
 
 def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
@@ -332,7 +332,7 @@ def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
 def _world_from_angles(
     heading_deg: float, pitch_deg: float, roll_deg: float
 ) -> NDArray[np.float64]:
-    """World from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
+    """Return world from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
     h, p, r = (math.radians(value) for value in (-heading_deg, pitch_deg, roll_deg))
     about_z = [[math.cos(h), -math.sin(h), 0.0], [math.sin(h), math.cos(h), 0.0], [0.0, 0.0, 1.0]]
     about_x = [[1.0, 0.0, 0.0], [0.0, math.cos(p), -math.sin(p)], [0.0, math.sin(p), math.cos(p)]]

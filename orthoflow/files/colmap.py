@@ -1,4 +1,4 @@
-"""Orientations as a COLMAP model: `cameras.txt`, `images.txt`, `points3D.txt`, read also as `.bin`.
+"""Orientations as a COLMAP model: `cameras.txt`, `images.txt`, `points3D.txt`; also reads `.bin`.
 
 COLMAP counts pixels as orthoflow does, the centre of the first one at (0.5, 0.5), and has the same
 camera axes, so nothing is converted. The points written are the ties that the orientation kept.
@@ -35,7 +35,8 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.foreign_text import open_file, reading
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 
-# Our names of the parameters of models that OpenCV's hold; COLMAP's own differ for one.
+# Our names of the parameters of models that OpenCV's include; COLMAP uses another one for one of
+# them.
 _NAMES: Final = {"k": "k1"}
 _BROWN: Final = frozenset(
     {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
@@ -43,7 +44,7 @@ _BROWN: Final = frozenset(
 _FISHEYES: Final = frozenset(
     {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
 )
-# What a model consists of; rigs and frames since version 3.12. Its points are not needed.
+# The files of a model; rigs and frames since version 3.12. Its points are not needed.
 COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
 _POSE_BYTES: Final = 64
@@ -54,11 +55,11 @@ _UNDISTORT: Final = "undistort the model with COLMAP (image_undistorter), or ref
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapModel:
-    """What was written.
+    """The numbers of written items.
 
     Attributes:
         n_cameras: lenses.
-        n_images: oriented photos.
+        n_images: number of oriented photos.
         n_points: ties.
     """
 
@@ -68,7 +69,7 @@ class ColmapModel:
 
 
 def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
-    """Write a text model that COLMAP opens into an existing folder.
+    """Write a text model for COLMAP into an existing folder.
 
     Raises:
         ArgumentError: no photo is oriented, or a photo's name has spaces.
@@ -158,11 +159,10 @@ def _lens(camera: Camera) -> Intrinsics:
 
 
 def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
-    """Read the orientations of a model by pycolmap, as text or binary, with rigs where it has them.
+    """Read the orientations of a text or binary model with pycolmap, including rigs.
 
     Args:
-        parts: `cameras`, `images` and, where there are such, `rigs` and `frames`, all `.txt` or
-            all `.bin`.
+        parts: `cameras`, `images` and, if present, `rigs` and `frames`, all `.txt` or all `.bin`.
 
     Raises:
         InputError: the model is damaged.
@@ -184,7 +184,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
         try:
             model = pycolmap.Reconstruction(folder)
         except Exception as error:  # pycolmap raises what its checks in C++ become
-            # After the place in its sources.
+            # In the order of its sources.
             said = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
             raise damaged(images, f"pycolmap cannot read the COLMAP model ({said})") from error
     if not model.images:
@@ -197,7 +197,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     try:
         names = {number: image.name for number, image in by_number} | names
     except UnicodeDecodeError as error:
-        raise damaged(images, "the name of an image is no UTF-8 text") from error
+        raise damaged(images, "the name of an image is not UTF-8 text") from error
     return tuple(
         given
         for number, image in by_number
@@ -206,9 +206,9 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
 
 
 def _require_whole(images: Path) -> None:
-    """Refuse binary images that end early, or state more points than they have bytes for.
+    """Refuse binary images that end early, or state more points than their bytes can hold.
 
-    pycolmap makes room for as many as are stated.
+    pycolmap allocates memory for as many as are stated.
     """
     content = images.read_bytes()
     at, count = 8, int.from_bytes(content[:8], "little")
@@ -226,7 +226,7 @@ def _require_whole(images: Path) -> None:
 
 
 def _whole_names(images: Path) -> dict[int, str]:
-    """Names of photos by the numbers of their images in a text, which pycolmap ends at a space."""
+    """Names of photos by image number from a text, because pycolmap ends names at a space."""
     names: dict[int, str] = {}
     with open_file(images) as content:
         stream = TextIOWrapper(content, encoding="utf-8", errors="replace")
@@ -235,7 +235,7 @@ def _whole_names(images: Path) -> dict[int, str]:
             if words and not words[0].startswith("#"):
                 if len(words) == _WORDS_OF_IMAGE and words[0].isdecimal():
                     names[int(words[0])] = words[9].strip()
-                # The points of the image stand in a line of their own, which may be empty.
+                # The points of the image are on a line of their own, which may be empty.
                 next(stream, None)
     return names
 
@@ -243,7 +243,7 @@ def _whole_names(images: Path) -> dict[int, str]:
 def _given(
     image: Any, whole_name: str, lens: Intrinsics | FisheyeLens | str, note: str, *, path: Path
 ) -> list[GivenCamera]:
-    """The camera of an image; of a panorama those of its faces."""
+    """Return the camera of an image; for a panorama those of its faces."""
     name = photo_path(whole_name)
     if isinstance(lens, str):
         return [GivenCamera(name=name, reason=lens)]
@@ -264,7 +264,7 @@ def _given(
 
 
 def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
-    """A camera's lens with what it leaves out, or why there is none."""
+    """Return a camera's lens with the terms it omits, or the reason why there is none."""
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
         raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
     if camera.is_spherical():

@@ -1,10 +1,10 @@
-"""Panoramas and photos of fisheye lenses as photos of a cube's faces, which every method can take.
+"""Panoramas and fisheye photos converted to photos of the faces of a cube, for all methods.
 
-A fisheye is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): what lies theta off the axis is seen
+A fisheye is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): a point theta off the axis is seen
 theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from the principal
-point. Metashape's has tangential terms and a skew besides. Directions in a panorama are x forwards
-(the middle of the picture), y to the left and z up; columns count azimuth clockwise seen from
-above, rows elevation downwards, as ASTM E2807 has them.
+point. Metashape's also has tangential terms and a skew. Directions in a panorama are x forwards
+(the centre of the picture), y to the left and z up; columns count azimuth clockwise seen from
+above, rows elevation downwards, as in ASTM E2807.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ FACES: Final[Mapping[str, NDArray[np.float64]]] = {
 }
 # From the axes of a camera that looks forwards: x right, y down, z forward.
 PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# What OpenCV can look up.
+# Limit of OpenCV's remap.
 MOST_PX: Final = 32_766
 
 
 def face_lens(width: int) -> Intrinsics:
-    """Lens of the faces of a panorama with so many columns: as fine in the middle of a face."""
+    """Return the lens of the faces of a panorama, with equal resolution at the centre of a face."""
     focal_px = width / (2.0 * math.pi)
     side = max(1, round(2.0 * focal_px))
     return Intrinsics(
@@ -56,7 +56,7 @@ def face_lens(width: int) -> Intrinsics:
 
 
 def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
-    """Directions (height, width, 3) of the pixels of a face, z = 1, in the axes of its camera."""
+    """Return directions (height, width, 3) of the pixels of a face, z = 1, in camera axes."""
     right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
     down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
     across, along = np.meshgrid(right, down)
@@ -68,10 +68,10 @@ class PanoramaFace:
     """A face of a panorama as a photo.
 
     Attributes:
-        name: of the photo.
-        panorama: the panorama's file, as it is.
+        name: name of the photo.
+        panorama: the panorama's file, unmodified.
         face: which of `FACES`.
-        width: columns of the panorama.
+        width: number of columns of the panorama.
         used: mask of the panorama (rows, columns), True where it may be used; None: all.
     """
 
@@ -91,7 +91,7 @@ class PanoramaFace:
         return encode_png(face_picture(decode_levels(self.panorama, self.name), self.face))
 
     def mask(self) -> NDArray[np.bool_] | None:
-        """Which pixels (height, width) may be used; None where all may."""
+        """Return which pixels (height, width) may be used; None if all may."""
         if self.used is None:
             return None
         whole = face_picture(np.where(self.used, np.uint8(255), np.uint8(0)), self.face)
@@ -106,12 +106,12 @@ def faces_of(
 
     Args:
         panorama: the file's bytes.
-        stem: of its name.
+        stem: stem of its name.
         width: columns.
         used: mask of the panorama (rows, columns), True where it may be used; None: all.
 
     Raises:
-        InputError: it has more columns than can be looked up.
+        InputError: it has too many columns.
     """
     if not 1 <= width <= MOST_PX:
         raise InputError(f"panorama {stem} has {width} columns, at most {MOST_PX} can be read")
@@ -124,18 +124,18 @@ def faces_of(
 
 
 def face_name(stem: str, face: str) -> str:
-    """Name of the photo that a panorama's face becomes."""
+    """Return the name of the photo of a panorama's face."""
     return f"{stem}_{face}.png"
 
 
 def face_in(name: str) -> tuple[str, str] | None:
-    """Stem and face in the name of a photo that may be a face; None where it is none."""
+    """Return stem and face of the name of a photo that may be a face; None if it is not."""
     stem, _, face = name.removesuffix(".png").rpartition("_")
     return (stem, face) if stem and face in FACES and name == face_name(stem, face) else None
 
 
 def face_picture(panorama: Colours, name: str) -> Colours:
-    """Look a face up in a panorama (rows, columns[, 3]), between its pixels linearly, as deep."""
+    """Resample a face from a panorama (rows, columns[, 3]) by bilinear interpolation, as deep."""
     import cv2
 
     height, width = panorama.shape[:2]
@@ -146,7 +146,7 @@ def face_picture(panorama: Colours, name: str) -> Colours:
     # OpenCV counts from the centre of the first pixel.
     columns = width * (0.5 - azimuth / (2.0 * math.pi)) - HALF_PIXEL
     rows = height * (0.5 - elevation / math.pi) - HALF_PIXEL
-    # Left of the first column is the last; above the first row nothing is nearer than that row.
+    # The last column is left of the first; above the first row, that row is repeated.
     framed = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
     looked_up = cv2.remap(
         framed,
@@ -164,9 +164,9 @@ _FULL_TURN_DEG: Final = 360.0
 FACE_FROM_CAMERA: Final[Mapping[str, NDArray[np.float64]]] = {
     face: axes @ PANORAMA_FROM_CAMERA for face, axes in FACES.items()
 }
-# Directions per side by which the part of a face that the lens sees is found.
+# Directions per side used to find the part of a face that the lens sees.
 _TRIED: Final = 65
-# A face that shows less than this share of what the largest shows is not worth a photo.
+# A face that shows less than this share of the largest one is omitted.
 _LEAST_SHARE: Final = 0.02
 _ANGLES_TRIED: Final = 2000
 
@@ -181,9 +181,9 @@ class FisheyeLens:
         fx: focal length in pixels along u; fy along v.
         cx: principal point in pixels; cy along v.
         radial: k1, k2, k3, k4.
-        tangential: p1, p2, of the direction as no distortion has bent it.
+        tangential: p1, p2, applied to the undistorted direction.
         skew: pixels along u per unit along v.
-        field_of_view_deg: the whole angle that the lens shows; beyond it photos are not used.
+        field_of_view_deg: the full angle that the lens shows; photos are not used beyond it.
     """
 
     width: int
@@ -198,12 +198,12 @@ class FisheyeLens:
     field_of_view_deg: float = WIDEST_DEG
 
     def project(self, rays_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (..., 2) of directions (..., 3); NaN beyond the field of view."""
+        """Return pixels (..., 2) of directions (..., 3); NaN beyond the field of view."""
         x, y, z = np.moveaxis(rays_camera, -1, 0)
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
         with np.errstate(all="ignore"):
-            # As no distortion has bent it; straight ahead it is zero.
+            # Undistorted; straight ahead it is zero.
             scale = np.where(across > 0.0, theta / np.where(across > 0.0, across, 1.0), 0.0)
             a, b = x * scale, y * scale
             radial, (p1, p2) = _radial(self.radial, theta), self.tangential
@@ -217,17 +217,17 @@ class FisheyeLens:
         return pixels
 
     def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) lie inside the image; NaN does not."""
+        """Report which pixels (..., 2) lie inside the image; NaN does not."""
         u, v = pixels[..., 0], pixels[..., 1]
         return (u >= 0.0) & (u < self.width) & (v >= 0.0) & (v < self.height)
 
     @property
     def limit_rad(self) -> float:
-        """Angle off the axis up to which the lens is used."""
+        """Return the angle off the axis up to which the lens is used."""
         return min(math.radians(0.5 * self.field_of_view_deg), _fold_rad(self.radial))
 
     def finest_px(self, theta_rad: float) -> float:
-        """Pixels per radian at an angle off the axis of at most a right one, where most."""
+        """Return the maximum number of pixels per radian within a right angle off the axis."""
         theta = min(theta_rad, self.limit_rad)
         around = _bent(self, theta) / math.sin(theta) if theta > 0.0 else 1.0
         with np.errstate(all="ignore"):
@@ -236,7 +236,7 @@ class FisheyeLens:
 
 
 def problem_of(lens: FisheyeLens) -> str:
-    """Why a lens is none, or "" where it can be one."""
+    """Return why a lens is invalid, or "" if it is valid."""
     return _problem_of_numbers(lens) or _problem_of_faces(lens)
 
 
@@ -273,14 +273,14 @@ def _is_small(face: Intrinsics) -> bool:
 
 
 def _radial(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bent over unbent angle."""
+    """Return the ratio of distorted to undistorted angle."""
     k1, k2, k3, k4 = radial
     t2 = theta * theta
     return 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
 
 
 def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """By how much the bent angle grows with the unbent one."""
+    """Return the derivative of the distorted by the undistorted angle."""
     k1, k2, k3, k4 = radial
     t2 = theta * theta
     return 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
@@ -288,10 +288,10 @@ def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np
 
 @cache
 def _fold_rad(radial: tuple[float, ...]) -> float:
-    """Angle off the axis where a lens model stops growing; a straight one where it never does."""
+    """Angle off the axis where a lens model stops increasing; a straight angle if never."""
     angles = np.linspace(0.0, math.pi, _ANGLES_TRIED)
     with np.errstate(all="ignore"):
-        # The other way round, so that NaN does not pass.
+        # Written as a negated comparison, so that NaN fails it.
         stops = ~(_growth(radial, angles) > 0.0)
     return float(angles[max(int(np.argmax(stops)) - 1, 0)]) if stops.any() else math.pi
 
@@ -302,7 +302,7 @@ def _bent(lens: FisheyeLens, theta_rad: float) -> float:
 
 
 def _farthest(lens: FisheyeLens) -> float:
-    """Distance of the image's farthest corner from the principal point, in focal lengths."""
+    """Return the distance of the farthest corner from the principal point, in focal lengths."""
     across = max(lens.cx, lens.width - lens.cx) / lens.fx
     down = max(lens.cy, lens.height - lens.cy) / lens.fy
     return math.hypot(across, down)
@@ -310,7 +310,7 @@ def _farthest(lens: FisheyeLens) -> float:
 
 @cache
 def face_lenses(lens: FisheyeLens) -> Mapping[str, Intrinsics]:
-    """Lenses of the faces that a fisheye shows, each cut to what it shows of the face."""
+    """Return lenses of the faces that a fisheye shows, each cropped to the visible part."""
     steps = np.linspace(-1.0, 1.0, _TRIED)
     right, down = np.meshgrid(steps, steps)
     rays = np.stack([right, down, np.ones_like(right)], axis=-1)
@@ -324,9 +324,9 @@ def face_lenses(lens: FisheyeLens) -> Mapping[str, Intrinsics]:
 
 
 def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
-    """Lens of the part of a face between the outermost directions that are seen, and a step more.
+    """Lens of the part of a face between the outermost visible directions, with a margin.
 
-    A face is as fine as the photo is in the middle of it, so that nothing is lost there.
+    A face has the resolution of the photo at its centre, so that nothing is lost there.
     """
     off_axis = 0.0 if face == "front" else 0.5 * math.pi
     side = max(1, round(2.0 * lens.finest_px(off_axis)))
@@ -355,11 +355,11 @@ class FisheyeFace:
     """A face of a cube around a fisheye's photo, as a photo.
 
     Attributes:
-        name: of the photo.
-        photo: the fisheye's photo, as it is.
+        name: name of the photo.
+        photo: the fisheye photo, unmodified.
         face: which of `FACE_FROM_CAMERA`.
         fisheye: its lens.
-        used: mask of the fisheye's photo (height, width), True where it may be used; None: all.
+        used: mask of the fisheye photo (height, width), True where it may be used; None: all.
     """
 
     name: str
@@ -374,11 +374,11 @@ class FisheyeFace:
         return face_lenses(self.fisheye)[self.face]
 
     def encoded(self) -> bytes:
-        """The photo as a PNG file, black where the fisheye shows nothing."""
+        """Return the photo as a PNG file, black where the fisheye shows nothing."""
         return encode_png(self._looked_up(decode_levels(self.photo, self.name)))
 
     def mask(self) -> NDArray[np.bool_] | None:
-        """Which pixels (height, width) may be used; None where all may."""
+        """Return which pixels (height, width) may be used; None if all may."""
         seen = self.fisheye.sees(self._pixels())
         if self.used is not None:
             whole = self._looked_up(np.where(self.used, np.uint8(255), np.uint8(0)))
@@ -386,16 +386,16 @@ class FisheyeFace:
         return None if seen.all() else seen
 
     def _pixels(self) -> NDArray[np.float64]:
-        """Pixels of the fisheye (height, width, 2) of those of the face."""
+        """Return pixels of the fisheye (height, width, 2) of those of the face."""
         return self.fisheye.project(face_rays(self.lens) @ FACE_FROM_CAMERA[self.face])
 
     def _looked_up(self, photo: Colours) -> Colours:
-        """Look the face up in the fisheye's photo, between its pixels linearly."""
+        """Resample the face from the fisheye photo by bilinear interpolation."""
         import cv2
 
         pixels = self._pixels()
         pixels[~self.fisheye.sees(pixels)] = np.nan
-        # OpenCV counts from the centre of the first pixel; NaN it would take anywhere.
+        # OpenCV counts from the centre of the first pixel; NaN would be sampled anywhere.
         places = np.nan_to_num(pixels - HALF_PIXEL).astype(np.float32)
         looked_up = cv2.remap(
             photo,
@@ -411,16 +411,16 @@ class FisheyeFace:
 def fisheye_faces(
     photo: bytes, stem: str, lens: FisheyeLens, used: NDArray[np.bool_] | None = None
 ) -> tuple[FisheyeFace, ...]:
-    """Return what a fisheye's photo shows as photos `<stem>_<face>.png`.
+    """Return the visible parts of a fisheye photo as photos `<stem>_<face>.png`.
 
     Args:
         photo: the file's bytes.
-        stem: of its name.
+        stem: stem of its name.
         lens: its lens.
         used: mask of the photo (height, width), True where it may be used; None: all.
 
     Raises:
-        InputError: the lens is none.
+        InputError: the lens is invalid.
     """
     problem = problem_of(lens)
     if problem:

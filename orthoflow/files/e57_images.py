@@ -1,8 +1,8 @@
-"""Photos inside E57 files (`images2D`), with their lenses and poses where the file states them.
+"""Photos inside E57 files (`images2D`), with their lenses and poses if the file states them.
 
 The camera of a pinhole image has x to the right, y up and z backwards (ASTM E2807), in a frame
-whose pose leads to the file's world. Principal points count from the outer corner of the first
-pixel, as ours do. A spherical image over the whole sphere becomes photos of a cube's six faces.
+whose pose transforms to the file's world. Principal points count from the outer corner of the first
+pixel, as ours do. A full spherical image becomes photos of the six faces of a cube.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class E57Image:
     """A photo inside an E57 file.
 
     Attributes:
-        name: of the photo: the file's, the image's, and the suffix of its content.
-        content: JPEG or PNG as it is in the file, or a face of the panorama that it is.
+        name: name of the photo: the file's, the image's, and the suffix of its content.
+        content: JPEG or PNG as in the file, or a face of the panorama.
         camera: its lens and pose, or why there is none.
     """
 
@@ -46,7 +46,7 @@ class E57Image:
     camera: GivenCamera
 
     def encoded(self) -> bytes:
-        """The photo as a file: of a face a PNG, of others the content."""
+        """Return the photo as a file: for a face a PNG, for others the content."""
         return self.content if isinstance(self.content, bytes) else self.content.encoded()
 
 
@@ -74,14 +74,14 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class E57ImageCount:
-    """How many images an E57 file has, and how many of them it states lens and pose of."""
+    """The number of images of an E57 file, and how many of them have lens and pose."""
 
     n_images: int = 0
     n_posed: int = 0
 
 
 def count_e57_images(path: Path) -> E57ImageCount:
-    """Count what an E57 file has of photos and panoramas, without reading them.
+    """Count the photos and panoramas of an E57 file, without reading them.
 
     Raises:
         InputError: the file is damaged.
@@ -106,7 +106,7 @@ def _children(vector: Any) -> Iterator[Any]:
 
 
 def _images(path: Path, index: int, node: Any) -> Iterator[E57Image]:
-    """One photo, six of a panorama, or none where there is neither JPEG nor PNG."""
+    """Return one photo, six of a panorama, or none without a JPEG or PNG."""
     for kind in _REPRESENTATIONS:
         field = f"{kind}Representation"
         if not node.isDefined(field):

@@ -2,8 +2,8 @@
 
 X is metres along the wall from its left edge and Y the height, or world x and y of floors and
 ceilings, in a local metric coordinate system of the wall's own, pixel-is-area; rasters of level
-planes may lie in a map instead, X to the east and Y to the north. `WallFrame.raster_axes` decides
-it. Equal rasters give equal bytes.
+planes may be in a map instead, X to the east and Y to the north. `WallFrame.raster_axes` decides.
+Equal rasters give equal bytes.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-# Word for word as GDAL reads it back from a GeoTIFF, so that what names it elsewhere is the same.
+# Exactly as GDAL reads it back from a GeoTIFF, so that other references to it match.
 _LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["{},'
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 SITE_CRS: Final = "site"
-# Stands for the id of the run, which no product knows, until its files are published.
+# Placeholder for the id of the run, which products do not know before their files are published.
 _ANY_RUN: Final = "00000000-000000-000000"
 SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 _NAMED_SUFFIXES: Final = (".tif", ".json", ".geojson", ".html")
 _NO_NAME: Final = re.compile(r"[^\w .,()-]", re.ASCII)
-# What is read is held as a whole, beside copies of it.
+# Data that are read are kept in memory, with copies.
 MOST_CELLS: Final = 1 << 28
 MOST_BANDS: Final = 4
 TILE_PX: Final = 512
-# Larger images are not laid out in memory, but in a file beside the one to write.
+# Larger images are not kept in memory, but in a file beside the output.
 _IN_MEMORY_CELLS: Final = 1 << 26
 _CACHE_BYTES: Final = 1 << 27
-# What a small file may state: no honest packing comes near, deflate has at most 1032 to 1.
+# Maximum compression ratio that a small file may state: deflate has at most 1032 to 1.
 _LARGEST_RATIO: Final = 1100
 _LONGEST_CRS: Final = 100
 _SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
-# Types of single bands, and the value that means nothing in them.
+# Types of single bands, and their values for no data.
 _NOTHING: Final = {"float32": math.nan, "int16": -1, "int32": -1, "uint8": None}
 
 
@@ -74,17 +74,17 @@ _COG_OPTIONS: Final[dict[str, object]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RasterFile:
-    """What a GeoTIFF holds.
+    """The content of a GeoTIFF.
 
     Attributes:
         values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
-        shown: (rows, cols) True where the dataset mask says that there is something.
+        shown: (rows, cols) True where the dataset mask is valid.
         gsd_m: side of a cell in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
         down: change of Y per metre down the rows, -1 or 1.
         tags: the dataset's tags.
         crs_wkt: coordinate system, as GDAL gives it.
-        nodata: the value that means nothing, or None.
+        nodata: the value for no data, or None.
         overviews: factors of the overviews.
         layout: `COG` for a cloud-optimised file, else empty.
     """
@@ -102,18 +102,18 @@ class RasterFile:
 
     @property
     def place(self) -> GridPlace:
-        """Where it lies; of its coordinate system nothing is said."""
+        """Return its position; the coordinate system is not included."""
         return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridPlace:
-    """Where a raster lies in its coordinate system.
+    """The position of a raster in its coordinate system.
 
     Attributes:
         gsd_m: side of a cell in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
-        crs: an EPSG code, `site`, or the name of a local one.
+        crs: an EPSG code, `site`, or the name of a local system.
         down: change of Y per metre down the rows, -1 or 1.
     """
 
@@ -124,7 +124,7 @@ class GridPlace:
 
     @classmethod
     def of(cls, frame: WallFrame) -> Self:
-        """Place the raster of a wall."""
+        """Return the position of the raster of a wall."""
         return cls(
             gsd_m=frame.gsd_m,
             corner_m=frame.raster_corner_m,
@@ -134,7 +134,7 @@ class GridPlace:
 
 
 def local_crs_name(name: str) -> str:
-    """Return the name of the coordinate system of a wall in a run that `name_run` fills in."""
+    """Name of the coordinate system of a wall in a run, to be completed by `name_run`."""
     return f"run {_ANY_RUN} {re.sub(_NO_NAME, '_', name)}"
 
 
@@ -144,10 +144,10 @@ def local_crs_wkt(name: str) -> str:
 
 
 def name_run(path: Path, run_id: str) -> None:
-    """Fill the id of a run into the names of the coordinate systems of a published file.
+    """Insert the id of a run into the names of the coordinate systems of a published file.
 
-    The files that products publish are the same for every run; this makes them its own. An id of
-    another length than orthoflow's is cut or filled up, so that nothing in the file moves.
+    The files that products publish are the same for every run; this makes them specific. An id of
+    another length than orthoflow's is cut or padded, so that no offset in the file changes.
     """
     if path.suffix not in _NAMED_SUFFIXES or path.stat().st_size == 0:
         return
@@ -161,33 +161,33 @@ def name_run(path: Path, run_id: str) -> None:
 
 
 def require_map_crs(crs: str) -> None:
-    """Refuse what no map in metres has.
+    """Refuse coordinate systems that are not maps in metres.
 
     Raises:
         InputError: there is no such coordinate system, or it is not in metres.
     """
     found = _map_crs(crs)
-    # Of a local system GDAL says the unit, but not that it is projected.
+    # For a local system GDAL states the unit, but not that it is projected.
     if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
         raise InputError(
-            f"{crs} is no coordinate system in metres: expected a projected one, such as "
+            f"{crs} is not a coordinate system in metres: expected a projected one, such as "
             f"EPSG:2100, or {SITE_CRS}"
         )
 
 
 def epsg_of(map_crs: str | None) -> int | None:
-    """Return the EPSG code of a map's coordinate system; None for `site`, and for any other text.
+    """Return the EPSG code of a map's coordinate system; None for `site` and any other text.
 
     >>> epsg_of("EPSG:25832"), epsg_of("site"), epsg_of(None)
     (25832, None, None)
     """
-    # GDAL takes paths and addresses for coordinate systems too, and a record may name any.
+    # GDAL also accepts paths and addresses as coordinate systems, and a record may contain any.
     found = re.fullmatch(r"EPSG:([0-9]{4,6})", map_crs or "", re.IGNORECASE)
     return int(found[1]) if found else None
 
 
 def epsg_wkt(epsg: int) -> str:
-    """Return the WKT of an EPSG code; empty where PROJ does not know it."""
+    """Return the WKT of an EPSG code; empty if PROJ does not know it."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
@@ -199,7 +199,7 @@ def epsg_wkt(epsg: int) -> str:
 
 
 def _map_crs(crs: str) -> CRS:
-    """The coordinate system of a map.
+    """Return the coordinate system of a map.
 
     Raises:
         InputError: there is none of that name.
@@ -229,16 +229,16 @@ def write_raster(
     place: GridPlace,
     tags: Mapping[str, str],
 ) -> None:
-    """Write one band: values with NaN for nothing, labels with -1 for it, or classes.
+    """Write one band: values with NaN for no data, labels with -1 for it, or classes.
 
     Rasters of more than 64 million cells are written band by band of rows.
 
     Args:
         path: file to write; its folder exists.
         values: (rows, cols) float32, int16 or int32 labels, or uint8 classes, which have no value
-            for nothing.
-        place: where it lies.
-        tags: text to keep with the raster.
+            for no data.
+        place: position of the raster.
+        tags: text stored with the raster.
 
     Raises:
         StoreError: the file cannot be written.
@@ -295,15 +295,15 @@ def write_orthoimage(
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
     Images of more than 64 million cells are written band by band, so that arrays mapped from files
-    need not fit into memory; an uncompressed copy lies beside the file while it is made.
+    need not fit into memory; an uncompressed copy exists beside the file while it is written.
 
     Args:
         path: file to write; its folder exists.
-        rgb: (rows, cols, 3), 8 or 16 bits; the file has as many.
-        shown: (rows, cols) True where the image shows something (painted or filled).
-        place: where it lies.
-        tags: text to keep with the image.
-        icc_profile: what the colours mean; None for sRGB or unknown.
+        rgb: (rows, cols, 3), 8 or 16 bits, which the file has, too.
+        shown: (rows, cols) True where the image has content (painted or filled).
+        place: position of the raster.
+        tags: text stored with the image.
+        icc_profile: colour profile; None for sRGB or unknown.
 
     Raises:
         StoreError: the file cannot be written.
@@ -327,7 +327,7 @@ def write_orthoimage(
 
 @dataclass(frozen=True, kw_only=True)
 class _Image:
-    """What `write_orthoimage` writes."""
+    """The input of `write_orthoimage`."""
 
     rgb: Colours
     shown: NDArray[np.bool_]
@@ -336,7 +336,7 @@ class _Image:
 
 
 def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> None:
-    """Write a large image by way of an uncompressed one, a band of tiles at a time."""
+    """Write a large image via an uncompressed one, a band of tiles at a time."""
     import rasterio
     from rasterio.shutil import copy
 
@@ -368,7 +368,7 @@ def _rows(window: Window) -> slice:
 
 
 def _require_written(path: Path, values: NDArray[np.generic]) -> None:
-    """Read the file again: of a disk that gets full at closing, GDAL only tells a log."""
+    """Read the file back: if the disk is full at closing, GDAL only logs it."""
     import rasterio
 
     with rasterio.open(path) as dataset:
@@ -380,15 +380,15 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
 
 
 def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0) -> str:
-    """Return the world file of a wall's raster, for programs that read no GeoTIFF tags.
+    """Return the world file of a wall's raster, for programs that do not read GeoTIFF tags.
 
     Six lines: step along a row, two rotations, step down a column, and the centre of the first
     pixel.
 
     Args:
-        place: where the raster lies.
-        rows: of cells that a pixel covers; more than one for a preview.
-        columns: of cells that a pixel covers.
+        place: position of the raster.
+        rows: rows of cells that a pixel covers; more than one for a preview.
+        columns: columns of cells that a pixel covers.
     """
     across_m, down_m = columns * place.gsd_m, place.down * rows * place.gsd_m
     first = (place.corner_m[0] + 0.5 * across_m, place.corner_m[1] + 0.5 * down_m)
@@ -400,8 +400,7 @@ def read_raster(path: Path) -> RasterFile:
     """Read a GeoTIFF that orthoflow or another program wrote.
 
     Raises:
-        InputError: the file is no GeoTIFF that GDAL can read, or its cells are not square and
-            upright.
+        InputError: GDAL cannot read the file, or its cells are not square and upright.
     """
     with _opened(path) as dataset:
         _check_size(path, dataset)
@@ -444,21 +443,21 @@ def _reading(path: Path) -> Iterator[None]:
         with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             yield
     except (RasterioError, OSError, UnicodeDecodeError) as error:
-        # UnicodeDecodeError: GDAL's messages and tags hold bytes of the file.
+        # UnicodeDecodeError: GDAL's messages and tags contain bytes of the file.
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
         ) from error
 
 
 class RasterParts:
-    """A GeoTIFF of any size that is read part by part, at the resolution that is wanted.
+    """A GeoTIFF of any size that is read in parts, at the requested resolution.
 
     Attributes:
         shape: rows and columns.
         gsd_m: side of a cell in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
         down: change of Y per metre down the rows, -1 or 1.
-        bands: how many there are.
+        bands: number of bands.
         dtype: numpy's name of the stored type.
     """
 
@@ -484,7 +483,7 @@ class RasterParts:
 
     @property
     def place(self) -> GridPlace:
-        """Where it lies; of its coordinate system nothing is said."""
+        """Return its position; the coordinate system is not included."""
         return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
 
     def __enter__(self) -> Self:
@@ -500,10 +499,10 @@ class RasterParts:
 
         Args:
             cells: left, top, right and bottom of the part, in cells, fractions allowed.
-            shape: rows and columns wanted, at most as many as cells.
+            shape: requested rows and columns, at most as many as cells.
 
         Returns:
-            (rows, cols[, bands]) values, and (rows, cols) True where the file shows something.
+            (rows, cols[, bands]) values, and (rows, cols) True where the file has content.
         """
         from rasterio.enums import Resampling
         from rasterio.windows import Window
@@ -521,12 +520,12 @@ class RasterParts:
 
 
 def check_header(path: Path, dataset: DatasetReader) -> None:
-    """Refuse a file that names others, or that says it holds more than any file of its size.
+    """Refuse a file that references others, or states more than any file of its size can hold.
 
     Raises:
         InputError: it does.
     """
-    # GDAL takes what is to be shown at smaller scales from there, also out of the network.
+    # GDAL reads reduced scales from there, even from the network.
     if dataset.tags(ns="OVERVIEWS"):
         raise InputError(
             f"{path.name} names another file for its overviews: expected a TIFF file that needs "
@@ -542,7 +541,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
 
 
 def _check_size(path: Path, dataset: DatasetReader) -> None:
-    """Refuse what a small file may state and no orthoimage has, before there is room for it."""
+    """Refuse what a small file can state and no orthoimage has, before memory is allocated."""
     cells = dataset.width * dataset.height
     if cells > MOST_CELLS or dataset.count > MOST_BANDS:
         raise InputError(
@@ -603,7 +602,7 @@ def _write(
             dataset.write(bands)
             if shown is not None:
                 dataset.write_mask(shown)
-        # Python writes the file: GDAL only logs a disk that gets full at closing.
+        # Python writes the file: GDAL only logs a disk that is full at closing.
         with path.open("wb") as target:
             target.write(memory.getbuffer())
 
@@ -621,7 +620,7 @@ def _describe(dataset: DatasetWriter, tags: Mapping[str, str], icc_profile: byte
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn what GDAL or the disk says while a file is written into a sentence.
+    """Convert messages of GDAL or the disk while a file is written into a sentence.
 
     Raises:
         StoreError: the file cannot be written.
@@ -637,10 +636,10 @@ def _writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep GDAL to the file itself, and rasterio's advice out of the user's terminal.
+    """Restrict GDAL to the file itself, and keep rasterio's advice from the user's terminal.
 
-    Masks are written into it. Overviews, masks and metadata that lie beside a file are not looked
-    for: no digest is taken of them, and they may name any other file, also in the network.
+    Masks are written into it. Overviews, masks and metadata beside a file are ignored: they are not
+    part of its digest, and may reference any other file, even in the network.
     """
     import rasterio
 
@@ -653,10 +652,10 @@ def quiet() -> Iterator[None]:
 
 @cache
 def let_go_of_foreign_text() -> None:
-    """Print no traceback where rasterio cannot read what GDAL quotes of a file that is not UTF-8.
+    """Print no traceback if rasterio cannot decode a part of a file that GDAL quotes.
 
-    It tries to in a callback, which can raise nothing, and so prints the error in both ways that
-    Python has for that. What GDAL has against the file is raised behind it.
+    It tries this in a callback, which cannot raise, and so prints the error in both of Python's
+    ways. GDAL's own error about the file is raised afterwards.
     """
     hear, show = sys.unraisablehook, sys.excepthook
 
@@ -668,7 +667,7 @@ def let_go_of_foreign_text() -> None:
     def show_rest(
         kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
-        # Whatever ends a program has come through some line of it.
+        # An exception that ends a program has passed through a line of it.
         if not (trace is None and isinstance(error, UnicodeDecodeError)):
             show(kind, error, trace)
 
@@ -677,7 +676,7 @@ def let_go_of_foreign_text() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RasterPlace:
-    """What the header of a GeoTIFF says.
+    """The header of a GeoTIFF.
 
     Attributes:
         shape: rows and columns.
@@ -686,7 +685,7 @@ class RasterPlace:
         wkt2: coordinate system.
         bounds: smallest X and Y, largest X and Y, in the coordinate system.
         outline_lonlat: corners on Earth, counter-clockwise and closed, longitude and latitude in
-            degrees; empty where the coordinate system is no place on Earth.
+            degrees; empty if the coordinate system has no position on Earth.
         bands: type of each band.
     """
 
@@ -703,8 +702,7 @@ def place_of(path: Path) -> RasterPlace:
     """Read the header of a GeoTIFF.
 
     Raises:
-        InputError: the file is no GeoTIFF that GDAL can read, or says what no file of its size can
-            hold.
+        InputError: GDAL cannot read the file, or it states more than any file of its size can hold.
     """
     from rasterio.warp import transform
 

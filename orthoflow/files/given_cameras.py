@@ -1,7 +1,7 @@
-"""Orientations of photos that other programs found, turned from the convention of each into ours.
+"""Orientations of photos from other programs, converted from their conventions into ours.
 
-What comes out has our axes (x right, y down, z forward) and our pixels (first centre at 0.5, 0.5),
-in the world of the file. `camera_formats` knows who reads what.
+The results have our axes (x right, y down, z forward) and our pixels (first centre at 0.5, 0.5), in
+the world of the file. `camera_formats` chooses the reader.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.foreign_text import open_text, reading, text_of_file
 from orthoflow.products import Intrinsics
 
-# Of a model with the observations of each photo, which is read line by line, and of other files.
+# Limits for models with the observations of each photo, which are read line by line, and for other
+# files.
 MOST_MODEL_BYTES: Final = 500_000_000
 MOST_BYTES: Final = 50_000_000
 MOST_LINE: Final = 20_000_000
@@ -37,8 +38,8 @@ _WHAT: Final = "a file of cameras"
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _ORTHONORMAL: Final = 1e-4
-# A lens that is so near to another one is the same to any matcher; beyond the other limit its
-# error shows in an orthoimage.
+# A lens this close to another one is equivalent for any matcher; beyond the other limit its error
+# is visible in an orthoimage.
 NEGLIGIBLE_PX: Final = 0.05
 MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
@@ -48,14 +49,14 @@ _WIDEST_FITTED_DEG: Final = 355.0
 
 @dataclass(frozen=True, kw_only=True)
 class CentredLens:
-    """A lens whose file says nothing of the photo's size, and counts from the photo's middle.
+    """A lens whose file does not state the photo's size, and counts from the photo's centre.
 
     Attributes:
-        focal_px: focal length in pixels, or None where it is said by the photo's longer side.
+        focal_px: focal length in pixels, or None if it is relative to the photo's longer side.
         focal_share: focal length as a share of the photo's longer side, or None.
         off_middle: principal point from the middle, right and down, in shares of that side.
         radial: k1, k2, k3, k4.
-        tangential: two terms whose order and signs the file does not define; they are left out.
+        tangential: two terms whose order and signs the file does not define; they are omitted.
     """
 
     focal_px: float | None = None
@@ -65,7 +66,7 @@ class CentredLens:
     tangential: tuple[float, ...] = (0.0, 0.0)
 
     def of_size(self, width: int, height: int) -> tuple[Intrinsics | FisheyeLens, float]:
-        """Return the lens of a photo of so many pixels, and how many at most are left out."""
+        """Lens for a photo of this size, and the largest omitted distortion in pixels."""
         longest = max(width, height)
         focal = self.focal_px or (self.focal_share or 0.0) * longest
         k1, k2, k3, k4 = (*self.radial, 0.0, 0.0)[:4]
@@ -93,17 +94,17 @@ class CentredLens:
 
 @dataclass(frozen=True, kw_only=True)
 class GivenCamera:
-    """The orientation of one photo as a file has it.
+    """The orientation of one photo as in a file.
 
     Attributes:
-        name: of the photo, with the folders that the file states, separated by slashes; some
-            programs leave out its suffix.
-        lens: interior orientation, where the file says it.
-        rotation: (3, 3) camera_from_world; None where the file only says why there is none.
+        name: name of the photo, with the folders that the file states, separated by slashes; some
+            programs omit its suffix.
+        lens: interior orientation, if the file states it.
+        rotation: (3, 3) camera_from_world; None if the file only states why there is none.
         translation: (3,) camera_from_world, in the unit of the file.
-        sigma_wall_m: predicted error on the wall, where the file says it.
-        reason: why the photo has no orientation; empty where it has one.
-        note: what of it could not be taken over exactly, or was converted; empty without such.
+        sigma_wall_m: predicted error on the wall, if the file states it.
+        reason: why the photo has no orientation; empty if it has one.
+        note: what was approximated or converted; empty if nothing.
     """
 
     name: str
@@ -115,7 +116,7 @@ class GivenCamera:
     note: str = ""
 
     def of_face(self, face: str) -> GivenCamera:
-        """Return the camera of a face of the cube that a fisheye's photo becomes."""
+        """Return the camera of a face of the cube of a fisheye photo."""
         if not isinstance(self.lens, FisheyeLens) or self.rotation is None:
             return self
         problem = problem_of(self.lens)
@@ -135,7 +136,7 @@ class GivenCamera:
         )
 
     def panorama_faces(self) -> list[GivenCamera]:
-        """Return the cameras of a panorama's faces; itself where it has no pose."""
+        """Return the cameras of a panorama's faces; itself without a pose."""
         if self.rotation is None or self.translation is None:
             return [self]
         stem = str(PurePosixPath(self.name).with_suffix(""))
@@ -151,19 +152,19 @@ class GivenCamera:
 
 
 def text_of(path: Path) -> str:
-    """Text of a file of cameras.
+    """Return the text of a file of cameras.
 
     Raises:
-        InputError: it cannot be read, is no text, or larger than any such file.
+        InputError: it cannot be read, is not text, or is larger than any such file.
     """
     return text_of_file(path, MOST_BYTES, _WHAT)
 
 
 def lines_of(path: Path) -> Iterator[str]:
-    """Lines of a model, one after the other, without their ends.
+    """Yield the lines of a model, without their line ends.
 
     Raises:
-        InputError: it cannot be read, is no text, is larger than any such file, or has a longer
+        InputError: it cannot be read, is not text, is larger than any such file, or has a longer
             line.
     """
     with reading(path, MOST_MODEL_BYTES, _WHAT), open_text(path) as stream:
@@ -174,12 +175,12 @@ def lines_of(path: Path) -> Iterator[str]:
 
 
 def photo_path(text: str) -> str:
-    """Path of a photo with slashes, whichever way those of its program lean."""
+    """Return the path of a photo with forward slashes."""
     return PureWindowsPath(text.strip()).as_posix()
 
 
 def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
-    """Places (n, 2) in front of a lens, as x / z and y / z, that cover its image."""
+    """Return positions (n, 2) in front of a lens, as x / z and y / z, that cover its image."""
     u, v = np.meshgrid(np.linspace(0, lens.width, 25), np.linspace(0, lens.height, 19))
     return np.column_stack([(u.ravel() - lens.cx) / lens.fx, (v.ravel() - lens.cy) / lens.fy])
 
@@ -187,15 +188,15 @@ def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
 def nearest_lens(
     start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens of ours that is nearest to another program's, and by how many pixels not.
+    """Return our lens nearest to another program's, and the deviation in pixels.
 
     Args:
         start: focal length, principal point and size of the other lens.
         rays: (n, 3) directions that cover its image.
-        pixels: (n, 2) where it sees them.
+        pixels: (n, 2) their pixels.
 
     Returns:
-        OpenCV's model, or its fisheye where that is too far off; the worst deviation.
+        OpenCV's model, or its fisheye if that deviates too much; the largest deviation.
     """
     from scipy.optimize import least_squares
 
@@ -250,26 +251,26 @@ def _worst_px(residuals: NDArray[np.float64]) -> float:
 def lens_or_reason(
     whose: str, lens: Intrinsics | FisheyeLens, worst_px: float, way_out: str
 ) -> tuple[Intrinsics | FisheyeLens | str, str]:
-    """Return a lens with a note of what it leaves out, or the reason why it cannot be taken."""
+    """Return a lens with a note of omitted terms, or the reason why it cannot be used."""
     if worst_px <= NEGLIGIBLE_PX:
         return lens, ""
     size = f"{worst_px:.2g} pixels" if worst_px < _FAR_PX else "more than any pixels"
     if worst_px > MAX_LEFT_OUT_PX:
         return f"{whose} differs from the nearest lens of OpenCV by up to {size}: {way_out}", ""
-    return lens, f"{whose} is taken as OpenCV's nearest lens, up to {size} off"
+    return lens, f"{whose} is replaced by OpenCV's nearest lens, with a deviation of up to {size}"
 
 
 def damaged(path: Path, what: str, line: int | None = None) -> InputError:
-    """Build the error for a file of cameras that makes no sense."""
+    """Return the error for an invalid file of cameras."""
     where = path.name if line is None else f"{path.name}:{line}"
     return InputError(f"{where}: {what}; export the cameras again")
 
 
 def numbers_of(texts: Sequence[str], path: Path, what: str, line: int | None = None) -> list[float]:
-    """Turn words into finite numbers.
+    """Parse words as finite numbers.
 
     Raises:
-        InputError: one of them is none.
+        InputError: one of them is not a number.
     """
     try:
         values = [float(text) for text in texts]
@@ -281,26 +282,26 @@ def numbers_of(texts: Sequence[str], path: Path, what: str, line: int | None = N
 
 
 def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.float64]:
-    """Nine numbers as the nearest rotation matrix.
+    """Return nine numbers as the nearest rotation matrix.
 
     Raises:
         InputError: they are far from one.
     """
     matrix = np.array(values, dtype=np.float64).reshape(3, 3)
-    # LAPACK may look for the singular values of infinity for ever.
+    # LAPACK may not terminate for singular values of infinity.
     if (np.abs(matrix) <= 1.0 + _ORTHONORMAL).all():
         left, _, right = np.linalg.svd(matrix)
         rotation: NDArray[np.float64] = left @ right
         if np.abs(rotation - matrix).max() <= _ORTHONORMAL and np.linalg.det(rotation) > 0.0:
             return rotation
-    raise damaged(path, f"the rotation of {whose} is no rotation matrix")
+    raise damaged(path, f"the rotation of {whose} is not a rotation matrix")
 
 
 def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
-    """Return a lens that can be one.
+    """Return a lens if it is valid.
 
     Raises:
-        InputError: it cannot.
+        InputError: it is not.
     """
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):

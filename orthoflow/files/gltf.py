@@ -23,9 +23,9 @@ from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import JsonValue
 from orthoflow.version import __version__
 
-# What graphics cards of today's phones still take.
+# Largest texture that the graphics of current phones support.
 LONGEST_TEXTURE_PX: Final = 4096
-# Browsers take pages of some hundred megabytes; letters take a third more.
+# Browsers open pages of some hundred megabytes; text encoding adds a third.
 _INSIDE_MOST_BYTES: Final = 1 << 27
 _COMPONENTS: Final = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963
@@ -42,12 +42,12 @@ def write_room(
     """Write the walls; memory holds one texture at a time beside the file.
 
     A wall is a node with a matrix: its vertices are metres on the wall, its matrix places it
-    relative to `extras.offset_world` of the root, which makes y of the world's up. So large survey
-    coordinates stay out of the 32 bits of vertices. Empty cells are transparent; what is behind a
-    wall sees through it.
+    relative to `extras.offset_world` of the root, which makes the world's up y. So large survey
+    coordinates stay out of the 32 bits of vertices. Empty cells are transparent; seen from behind,
+    a wall is invisible.
 
     Args:
-        path: the new file, `.glb`.
+        path: output file, `.glb`.
         orthos: at least one.
         up: (3,) unit vector of the world.
         depths: GeoTIFF of the depths of each wall, by number, for walls in relief; without them
@@ -82,12 +82,12 @@ def write_room(
 
 
 def write_page(path: Path, model: Path) -> None:
-    """Write a page that shows a model without a server: the model is in it, up to some size.
+    """Write a page that shows a model without a server: the model is embedded, up to some size.
 
-    Of a larger one, or one that cannot be read, the page asks for the file.
+    For a larger or unreadable one, the page asks for the file.
 
     Args:
-        path: the new file, `.html`.
+        path: output file, `.html`.
         model: a file of `write_room`.
 
     Raises:
@@ -101,7 +101,7 @@ def write_page(path: Path, model: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Document:
-    """A glTF document as it grows, and the bytes that it points into."""
+    """A glTF document under construction, and its binary data."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[JsonValue] = field(default_factory=list)
@@ -112,7 +112,7 @@ class _Document:
     nodes: list[JsonValue] = field(default_factory=list)
 
     def add_wall(self, ortho: OrthoFile, offset: NDArray[np.float64], depth: Path | None) -> int:
-        """Add mesh, texture and node of a wall; gives the node's number."""
+        """Add mesh, texture and node of a wall; return the node's number."""
         frame = ortho.frame
         mesh = flat_mesh(frame) if depth is None else relief_mesh(frame, depth)
         attributes: dict[str, JsonValue] = {"POSITION": self._array(mesh.vertices, "VEC3")}
@@ -198,7 +198,7 @@ class _Document:
             },
             "extensions": {"KHR_materials_unlit": {}},
         }
-        # Colours are those of photographs, which have their light already.
+        # Colours are those of photos, which are already lit.
         if not is_whole:
             material |= {"alphaMode": "MASK", "alphaCutoff": 0.5}
         self.materials.append(material)
@@ -230,7 +230,7 @@ class _Document:
 
 
 def _columns(matrix: NDArray[np.float64]) -> JsonValue:
-    """Sixteen numbers column by column, as glTF wants matrices."""
+    """Return sixteen numbers column by column, as glTF requires for matrices."""
     return numbers(matrix.T.ravel())
 
 
@@ -238,7 +238,7 @@ def _with_alpha(rgb: NDArray[np.uint8], shown: NDArray[np.bool_]) -> bytes:
     return encode_png(np.dstack([rgb, np.where(shown, np.uint8(255), np.uint8(0))]))
 
 
-# Along the longest side of a wall; some 300,000 triangles, which phones still turn.
+# Along the longest side of a wall; some 300,000 triangles, which phones can still display.
 LONGEST_NODES: Final = 512
 
 
@@ -268,10 +268,10 @@ def flat_mesh(frame: WallFrame) -> WallMesh:
 
 
 def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
-    """Return the surface of a wall; its rectangle where nothing of its depth is known.
+    """Return the surface of a wall; its rectangle if no depth is known.
 
     Nodes are means of cells, at most `LONGEST_NODES` along a side. Triangles with a node of unknown
-    depth are left out; steps become slopes one node wide.
+    depth are omitted; steps become slopes one node wide.
 
     Args:
         frame: of the wall.
@@ -309,7 +309,7 @@ def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
 
 
 def _places(count: int) -> NDArray[np.float32]:
-    """Where nodes of a side lie, 0 to 1: in the middle of their cells, the outer at its ends."""
+    """Positions of nodes of a side, 0 to 1: at the centre of their cells, the outer at its ends."""
     places = (np.arange(count) + 0.5) / count
     places[0], places[-1] = 0.0, 1.0
     return places.astype(np.float32)

@@ -1,6 +1,6 @@
 """Photos and pictures as bytes: decode, encode, and small previews for the report.
 
-Arrays are RGB at this border; OpenCV's BGR stays inside. Nothing here turns a picture by its EXIF
+Arrays are RGB in this interface; OpenCV's BGR stays inside. Nothing here applies the EXIF
 orientation: the pixel frame is the stored array.
 """
 
@@ -30,18 +30,18 @@ from orthoflow.products import Photo
 if TYPE_CHECKING:
     from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# What photos end in; another file holds none, or one that must be converted first.
+# Suffixes of photos; other files are not photos, or must be converted first.
 PHOTO_SUFFIXES: Final = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"),
     *(".webp", ".heic", ".heif", ".hif", ".avif"),
 )
-# What cameras call their raw photos.
+# Suffixes of raw photos of cameras.
 RAW_SUFFIXES: Final = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# Larger images are averaged before they are shrunk, so many rows of the result at a time.
+# Larger images are averaged before they are reduced, this many rows of the result at a time.
 _IN_MEMORY_PX: Final = 1 << 26
 _BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
@@ -49,7 +49,7 @@ STRETCH_PERCENTILES: Final = (1.0, 99.0)
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
 Sampled = TypeVar("Sampled", bound=np.generic)
 Part = tuple[slice, slice]
-# Image (rows, cols[, 3]) of a part of a raster, and where it shows something.
+# Image (rows, cols[, 3]) of a part of a raster, and where it has content.
 Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
@@ -58,10 +58,11 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
 
     Args:
         encoded: the file's bytes.
-        name: what to call it in an error.
+        name: its name in an error.
 
     Raises:
-        InputError: the bytes are no JPEG, PNG, TIFF or WebP, or cut off, or too many pixels.
+        InputError: the bytes are not a JPEG, PNG, TIFF or WebP, or incomplete, or have too many
+            pixels.
     """
     return eight_bits(_decoded(encoded, name, is_deep=False))
 
@@ -76,14 +77,14 @@ def decode_levels(encoded: bytes, name: str = "image") -> Colours:
 
 
 def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
-    """Decode an image into RGB; of a PNG of 16 bits only 8 unless it is to be deep."""
+    """Decode an image into RGB; a PNG of 16 bits into 8 unless `deep`."""
     import cv2
 
     problem = unreadable(encoded)
     if problem:
         raise InputError(f"{name} {problem}")
     kind = photo_format(encoded)
-    # OpenCV makes room for a chunk of a PNG as long as it says that it is.
+    # OpenCV allocates memory for a chunk of a PNG of any stated length.
     if kind == "PNG" and not is_whole_png(encoded):
         raise InputError(_not_an_image(encoded, name))
     size = stated_size(encoded)
@@ -132,7 +133,7 @@ def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:
 
 
 def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
-    """Encode an image as lossy WebP: about a tenth of the bytes of PNG for what photos look like.
+    """Encode an image as lossy WebP, which for photos takes a tenth of the bytes of PNG.
 
     Args:
         image: (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA.
@@ -145,7 +146,7 @@ def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
 
 
 def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
-    """Rows and columns of a raster that a pixel of its preview covers."""
+    """Return the rows and columns of a raster that a pixel of its preview covers."""
     if max(shape) <= PREVIEW_SIDE_PX:
         return 1.0, 1.0
     factor = _averaged_px(shape, PREVIEW_SIDE_PX)
@@ -155,26 +156,26 @@ def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Grey picture of a raster: the 1st percentile is black, the 99th white, NaN is black."""
+    """Return a grey picture of a raster: 1st percentile black, 99th white, NaN black."""
     return _stretched(values, _stretch_of(values))
 
 
 def grey_cells(values: NDArray[np.floating]) -> Cells:
-    """Return the picture of `stretch_to_grey` part by part, with NaN for what is not shown.
+    """Yield the picture of `stretch_to_grey` part by part, with NaN for empty cells.
 
-    Of a raster (rows, cols) of more than 64 million cells the percentiles are those of some rows.
+    For a raster (rows, cols) of more than 64 million cells the percentiles are those of some rows.
     """
     stretch = _stretch_of(sampled_rows(values))
     return lambda part: (_stretched(values[part], stretch), np.isfinite(values[part]))
 
 
 def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
-    """Rows of a raster with at most some 64 million cells, evenly from all of it."""
+    """Return rows of a raster with at most 64 million cells, spread evenly."""
     return values[:: max(1, -(-values.size // _IN_MEMORY_PX))]
 
 
 def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
-    """Value that is black, and how much more is white; None of a raster that knows nothing."""
+    """Return the value of black, and the range to white; None without data."""
     known = values[np.isfinite(values)]
     if not known.size:
         return None
@@ -195,18 +196,18 @@ def _stretched(
 def preview_png(
     image: NDArray[np.uint8], shown: NDArray[np.bool_], *, longest_side_px: int = PREVIEW_SIDE_PX
 ) -> bytes:
-    """Return a small PNG of a raster, transparent where nothing is shown.
+    """Return a small PNG of a raster, transparent where empty.
 
     Args:
         image: (rows, cols) grey or (rows, cols, 3) RGB.
-        shown: (rows, cols), True where the image holds something.
-        longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
+        shown: (rows, cols), True where the image has content.
+        longest_side_px: larger images are averaged down to this; smaller ones are unchanged.
     """
     return encode_png(_preview(shown.shape, _cells_of(image, shown), longest_side_px))
 
 
 def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
-    """Return the PNG of `preview_png` of a raster that is made part by part, never as a whole."""
+    """Return the PNG of `preview_png` of a raster computed in parts, never as a whole."""
     return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
 
 
@@ -223,9 +224,9 @@ def preview_webp(
 def cells_webp(
     shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
 ) -> bytes:
-    """Return the WebP of `preview_webp` of a raster that is made part by part, never as a whole.
+    """Return the WebP of `preview_webp` of a raster computed in parts, never as a whole.
 
-    Where it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
+    If it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
     """
     image = _preview(shape, cells, longest_side_px)
     factor = min(-(-least_px // max(shape)), longest_side_px // max(shape))
@@ -233,10 +234,10 @@ def cells_webp(
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
-    """Return an encoded image as WebP whose longest side is at most so many pixels.
+    """Return an encoded image as WebP with a limited longest side.
 
     Raises:
-        InputError: the bytes are no image.
+        InputError: the bytes are not an image.
     """
     image = decode_image(encoded, name)
     if max(image.shape[:2]) > longest_side_px:
@@ -250,7 +251,7 @@ def _cells_of(image: NDArray[np.uint8], shown: NDArray[np.bool_]) -> Cells:
 
 def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDArray[np.uint8]:
     if max(shape) > longest_side_px:
-        # Averaged under the mask: black void must not darken the rim of what is shown.
+        # Averaged under the mask: black void must not darken the border of the content.
         summed, weight = _weighted(shape, cells, _averaged_px(shape, longest_side_px))
         summed = _shrink(summed, longest_side_px)
         weight = _shrink(weight, longest_side_px)
@@ -266,10 +267,10 @@ def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDAr
 def _weighted(
     shape: tuple[int, ...], cells: Cells, factor: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colours times their weight, and weights, averaged over squares of `factor` pixels.
+    """Return colours times their weight, and weights, averaged over squares of `factor` pixels.
 
-    A band of squares at a time, since float32 of a whole large image would not fit into memory.
-    What is left over at the right and below a whole number of squares is cut off.
+    A band of squares at a time, since float32 of a whole large image would not fit into memory. A
+    remainder at the right and below is cut off.
     """
     import cv2
 
@@ -293,7 +294,7 @@ def _weighted(
 
 
 def _averaged_px(shape: tuple[int, ...], longest_side_px: int) -> int:
-    """Side of the squares that are averaged before a picture is shrunk."""
+    """Return the side of the squares that are averaged before a picture is reduced."""
     return max(shape) // (2 * longest_side_px) if math.prod(shape) > _IN_MEMORY_PX else 1
 
 
@@ -339,7 +340,7 @@ def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
     )
 
 
-# Masks are black and white; what their compression made of it is one or the other.
+# Masks are black and white; compression artefacts are rounded to one or the other.
 _USED_LEAST: Final = 128
 _LONGEST_SIDE_PX: Final = 2048
 
@@ -348,18 +349,18 @@ def decode_mask(encoded: bytes, name: str) -> NDArray[np.bool_]:
     """Decode a picture of black and white: True (height, width) where pixels may be used.
 
     Raises:
-        InputError: the bytes are no picture.
+        InputError: the bytes are not a picture.
     """
     return np.asarray(decode_image(encoded, name).max(axis=2) >= _USED_LEAST, dtype=np.bool_)
 
 
 def used_pixels(photo: Photo) -> NDArray[np.bool_] | None:
-    """Which pixels (height, width) of a photo may be used; None where all may."""
+    """Return which pixels (height, width) of a photo may be used; None if all may."""
     return None if photo.mask is None else decode_mask(photo.mask, f"the mask of {photo.name}")
 
 
 def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
-    """Put what is masked of a photo right before its lens, so that it shows nothing behind."""
+    """Put masked parts of a photo directly in front of its lens so that it shows nothing behind."""
     used = used_pixels(photo)
     if used is None:
         return buffer
@@ -370,6 +371,6 @@ def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
         nearest = np.full(shape, buffer.nearest[0, 0], dtype=np.float32)
     rows, columns = (np.arange(0, side, reduction) for side in used.shape)
     whole = np.logical_and.reduceat(np.logical_and.reduceat(used, rows, axis=0), columns, axis=1)
-    # Nearer than anything, also before a camera that stands within the slab of a wall.
+    # Nearer than anything, also in front of a camera within the slab of a wall.
     nearest = np.where(whole, nearest, np.float32(-np.inf))
     return buffer._replace(nearest=np.ascontiguousarray(nearest), reduction=float(reduction))

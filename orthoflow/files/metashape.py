@@ -45,7 +45,7 @@ from orthoflow.products import Intrinsics
 MOST_TAGS: Final = 2_000_000
 _RADIAL: Final = ("k1", "k2", "k3", "k4")
 _SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"
-# Half the step in metres by which a coordinate system's axes are found at a place.
+# Half the step in metres by which the axes of a coordinate system are found at a position.
 _STEP_M: Final = 50.0
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
@@ -54,7 +54,7 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
     """Read the cameras of all chunks.
 
     Raises:
-        InputError: it is damaged, or no such file.
+        InputError: it is damaged, or not such a file.
     """
     root = _root(path)
     chunks = root.findall("chunk") or root.findall(".//chunk")
@@ -66,20 +66,20 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
 
 
 def _root(path: Path) -> ET.Element:
-    """Parse XML without anything that XML could do."""
+    """Parse XML without its dangerous features."""
     text = text_of(path)
-    # Entities are the bombs of XML, and only a document type can define them.
+    # Entities can expand without bound, and only a document type can define them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(
-            f"{path.name} defines a document type, which no export of Metashape does, so it is not "
-            "read"
+            f"{path.name} defines a document type, which no export of Metashape "
+            "contains, so it is not read"
         )
     if text.count("<") > MOST_TAGS:
         raise InputError(f"{path.name} has more than {MOST_TAGS} tags, too many for cameras")
     try:
         return ET.fromstring(text)
     except ET.ParseError as error:
-        raise damaged(path, f"it is no XML: {error.msg}", error.position[0]) from error
+        raise damaged(path, f"it is not XML: {error.msg}", error.position[0]) from error
 
 
 def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
@@ -116,10 +116,10 @@ _OFF: Final = ("false", "0")
 
 
 def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
-    """What leads from geocentric metres to the chunk's coordinate system; None where it has none.
+    """Return the transform from geocentric metres to the chunk's system; None without one.
 
     Raises:
-        InputError: the system is in degrees, or not known.
+        InputError: the system is in degrees, or unknown.
     """
     if not wkt.strip() or wkt.lstrip().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return None
@@ -127,7 +127,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
 
     try:
         stated = pyproj.CRS.from_wkt(wkt)
-        # Metashape leaves out parameters of projections that a code stands for.
+        # Metashape omits parameters of projections that a code implies.
         code = stated.to_json_dict().get("id", {})
         crs = pyproj.CRS.from_authority(code["authority"], code["code"]) if code else stated
         if crs.is_geocentric:
@@ -154,7 +154,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
         there = to_site(np.vstack([centre, places]))
         if not np.isfinite(there).all():
             raise damaged(path, f"{given.name} is nowhere in {crs.name}")
-        # The axes of the system at the camera; what is left of its scale and shear is dropped.
+        # The axes of the system at the camera; the remaining scale and shear are dropped.
         left, _, right = np.linalg.svd((there[1:4] - there[4:]).T / (2.0 * _STEP_M))
         turned = rotation @ (left @ right).T
         return replace(
@@ -208,7 +208,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
 
 
 class _Similarity:
-    """World from chunk: scale, rotation and shift; none where the chunk was not referenced."""
+    """World from chunk: scale, rotation and shift; none if the chunk was not referenced."""
 
     def __init__(self, transform: ET.Element | None, path: Path) -> None:
         self.rotation, self.shift, self.scale = np.eye(3), np.zeros(3), 1.0
@@ -239,7 +239,7 @@ def _some(
 
 
 class _Sensor:
-    """A sensor: its lens or why there is none, and where it stands in its rig."""
+    """A sensor: its lens or why there is none, and its pose in its rig."""
 
     def __init__(self, element: ET.Element, path: Path) -> None:
         self.label = element.get("label", element.get("id", ""))
@@ -288,7 +288,7 @@ class _Sensor:
     def _nearest(
         self, value: _Terms, exact: Intrinsics | FisheyeLens, *, is_fisheye: bool
     ) -> tuple[Intrinsics | FisheyeLens | str, str]:
-        """The lens of ours that is nearest to one with terms that ours has not."""
+        """Return our lens nearest to one with terms that ours lacks."""
         start = Intrinsics(
             width=exact.width,
             height=exact.height,
@@ -301,7 +301,7 @@ class _Sensor:
         xy = normalised_grid(start)
         rays = np.column_stack([xy, np.ones(len(xy))])
         if is_fisheye:
-            # A place of the grid is an angle off the axis here.
+            # Here a position of the grid is an angle off the axis.
             theta = np.hypot(*xy.T)[:, None]
             scale = np.sinc(theta / np.pi)
             rays = np.column_stack([xy * scale, np.cos(theta)])
@@ -311,7 +311,7 @@ class _Sensor:
 
 
 def _projected(value: _Terms, start: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of places (n, 2) by the whole formula of Metashape's manual."""
+    """Return pixels of positions (n, 2) by the complete formula of Metashape's manual."""
     x, y = xy.T
     r2 = x * x + y * y
     radial = np.polynomial.polynomial.polyval(r2, [1.0, *map(value, _RADIAL)])
@@ -329,12 +329,12 @@ def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
     words = [] if size is None else [size.get("width", ""), size.get("height", "")]
     values = numbers_of(words, path, f"the size of sensor {label}")
     if len(values) != 2 or min(values) < 1.0 or values[0] * values[1] > MOST_PIXELS:
-        raise damaged(path, f"sensor {label} does not say how many pixels it has")
+        raise damaged(path, f"sensor {label} does not state its size in pixels")
     return round(values[0]), round(values[1])
 
 
 class _Terms:
-    """The numbers of a calibration by their names; those that it leaves out are zero."""
+    """Return the numbers of a calibration by name; missing ones are zero."""
 
     def __init__(self, values: Mapping[str, str], path: Path, label: str) -> None:
         self._values, self._path, self._label = values, path, label
@@ -414,7 +414,7 @@ def _camera(
 
 
 def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
-    """What a rolling shutter that Metashape compensates for moves, where the file says how much."""
+    """Return the displacement by a compensated rolling shutter, if the file states it."""
     words = element.findtext("rolling_shutter", "").split()
     moved = ""
     try:

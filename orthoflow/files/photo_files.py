@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
     from rasterio.io import DatasetReader
 
-# What can be decoded; HEIC and AVIF where Pillow can.
+# Formats that can be decoded; HEIC and AVIF if Pillow supports them.
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
 HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
@@ -38,7 +38,7 @@ MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
 _TIFF_MAGICS: Final = {b"II*\0": "TIFF", b"MM\0*": "TIFF", b"II+\0": "BigTIFF", b"MM\0+": "BigTIFF"}
-# First bytes of what is met under the name of a photo and is not read.
+# First bytes of files named as photos that are not read.
 _MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"GIF8", "GIF"),
     (b"BM", "BMP"),
@@ -64,14 +64,15 @@ _AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
 _SUBFILE_TAG: Final = 254
 _PREVIEW, _MASK = 1, 4
 _WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG = 256, 257, 258, 262
-# Grey, RGB, palette, CMYK (which GDAL turns into RGB) and YCbCr.
+# Grey, RGB, palette, CMYK (which GDAL converts to RGB) and YCbCr.
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 _COLOURS_OF_TIFF: Final = (_WHITE_IS_ZERO, 1, 2, _PALETTE, 5, 6)
 _SUB_IFDS_TAG: Final = 330
 _DNG_TAG: Final = 50706
 _COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
 _MAX_PAGES: Final = 200
-# What libjpeg says of headers that cost no pixel; of anything else the rest of the photo is noise.
+# Warnings of libjpeg about headers that affect no pixel; after any other the rest of the photo is
+# noise.
 _HARMLESS: Final = ("jfif revision", "adobe color transform", "icc marker")
 _EXTRA_BYTES: Final = "extraneous bytes before marker 0xd9"
 _PADDING: Final = b"\0\xff"
@@ -80,7 +81,7 @@ _ANY_SIZE: Final = threading.Lock()
 
 
 def photo_format(encoded: bytes) -> str | None:
-    """Return the format of a file by its content; None where nobody knows it.
+    """Return the format of a file by its content; None if unknown.
 
     >>> photo_format(bytes.fromhex("ffd8ffe000104a464946"))
     'JPEG'
@@ -99,12 +100,13 @@ def photo_format(encoded: bytes) -> str | None:
 
 
 def unreadable(encoded: bytes) -> str:
-    """State what a file is that cannot be read as a photo, and the way out; empty where it can."""
+    """Return what an unreadable file is, and how to convert it; empty for photos."""
     kind = photo_format(encoded)
     if kind is None:
         return (
-            f"is no JPEG, PNG, TIFF, WebP or HEIC file ({len(encoded)} bytes), whatever its name "
-            "says: copy it again, or take it out"
+            f"is not a JPEG, PNG, TIFF, WebP or HEIC file ({len(encoded)} bytes), despite its "
+            "name: copy "
+            "it again, or remove it"
         )
     if kind == "HEIC":
         with opened(encoded) as image:
@@ -126,7 +128,7 @@ def _media_format(encoded: bytes) -> str:
 
 
 def _raw_in_tiff(encoded: bytes) -> str | None:
-    """The name of the camera raw that is laid out as TIFF, else None."""
+    """Return the name of a camera raw format based on TIFF, or None."""
     if encoded[8:10] == b"CR":
         return "camera raw (Canon CR2)"
     pages = tiff_pages(encoded)
@@ -177,7 +179,7 @@ def _is_photo(page: ImageFileDirectory_v2) -> bool:
 
 
 def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
-    """Return the page of a TIFF file that holds the photo: the largest that is no preview."""
+    """Return the page of a TIFF file that holds the photo: the largest that is not a preview."""
     pages = tiff_pages(encoded)
     return max(
         [item for item in pages if _is_photo(item[1])] or pages,
@@ -187,14 +189,14 @@ def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
 
 
 def count_pages(encoded: bytes) -> int:
-    """Return how many pages of a TIFF file are no previews or masks; 1 for another format."""
+    """Return the number of pages of a TIFF file without previews and masks; 1 for other formats."""
     if encoded[:4] not in _TIFF_MAGICS:
         return 1
     return max(1, sum(_is_photo(page) for _, page in tiff_pages(encoded)))
 
 
 def _from_page(encoded: bytes, start: int) -> bytes:
-    """Return a TIFF file that begins with one of its pages: decoders take the first."""
+    """Return a TIFF file that begins with one of its pages, because decoders read the first."""
     order: Literal["little", "big"] = "little" if encoded[:2] == b"II" else "big"
     place, size = (8, 8) if encoded[2:4] in (b"+\0", b"\0+") else (4, 4)
     return encoded[:place] + start.to_bytes(size, order) + encoded[place + size :]
@@ -202,7 +204,7 @@ def _from_page(encoded: bytes, start: int) -> bytes:
 
 @contextmanager
 def _tiff_page(encoded: bytes, start: int) -> Iterator[DatasetReader]:
-    """Open a page of a TIFF file by GDAL, which knows more layouts than OpenCV and Pillow.
+    """Open a page of a TIFF file with GDAL, which supports more layouts than OpenCV and Pillow.
 
     Raises:
         ValueError: it cannot be opened or read.
@@ -227,7 +229,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
     """Decode the photo of a TIFF file, (rows, cols, 3) of 8 or 16 bits.
 
     Raises:
-        ValueError: it is damaged, or of a kind that is no photo.
+        ValueError: it is damaged, or not a photo.
     """
     found = photo_page(encoded)
     if found is None:
@@ -254,7 +256,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
 
 
 def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
-    """Which pixels of a TIFF file are opaque, by its alpha or by a page that is a mask."""
+    """Return the opaque pixels of a TIFF file, from its alpha or from a mask page."""
     from rasterio.enums import ColorInterp
 
     found = photo_page(encoded)
@@ -288,7 +290,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
 
 @contextmanager
 def opened(encoded: bytes) -> Iterator[Image | None]:
-    """Open a photo by Pillow, without decoding it; None where it cannot."""
+    """Open a photo with Pillow, without decoding it; None if it cannot."""
     from PIL import Image
 
     found = photo_page(encoded) if encoded[:4] in _TIFF_MAGICS else None
@@ -297,7 +299,7 @@ def opened(encoded: bytes) -> Iterator[Image | None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with _ANY_SIZE:
-            # Pillow refuses less than `MOST_PIXELS`, which all who decode look at.
+            # Pillow refuses less than `MOST_PIXELS`, which all decoders here check.
             most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
                 image = Image.open(
@@ -315,7 +317,7 @@ def opened(encoded: bytes) -> Iterator[Image | None]:
 
 
 def _register_heic() -> None:
-    """Teach Pillow HEIC, where its plugin is installed."""
+    """Register HEIC with Pillow if its plugin is installed."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -324,9 +326,9 @@ def _register_heic() -> None:
 
 
 def stated_size(encoded: bytes) -> tuple[int, int] | None:
-    """Return width and height as a file states them; None where it does not."""
+    """Return width and height as stated in a file; None without."""
     if encoded.startswith(_PNG_MAGIC):
-        # Pillow refuses what is larger than it decodes.
+        # Pillow refuses files larger than it decodes.
         width, height = (int.from_bytes(encoded[at : at + 4], "big") for at in (16, 20))
         return (width, height) if encoded[12:16] == b"IHDR" else None
     if encoded[:4] in _TIFF_MAGICS:
@@ -340,7 +342,7 @@ def stated_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def stated_bits(encoded: bytes) -> int | None:
-    """Return the bits per channel as a PNG or TIFF file states them; None where it does not."""
+    """Return the bits per channel as stated in a PNG or TIFF file; None without."""
     if encoded.startswith(_PNG_MAGIC):
         return encoded[24] if encoded[12:16] == b"IHDR" and len(encoded) > 24 else None
     if encoded[:4] in _TIFF_MAGICS:
@@ -350,16 +352,16 @@ def stated_bits(encoded: bytes) -> int | None:
 
 
 def icc_profile(encoded: bytes) -> bytes | None:
-    """Return the ICC colour profile of a photo; None without a whole one."""
+    """Return the ICC colour profile of a photo; None without a complete one."""
     with opened(encoded) as image:
         found = None if image is None else image.info.get("icc_profile")
     return found if isinstance(found, bytes) and found else None
 
 
 def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
-    """Return which pixels (height, width) are not transparent; None where all are opaque."""
+    """Return which pixels (height, width) are not transparent; None if all are opaque."""
     opaque: NDArray[np.bool_] | None = None
-    # Damage is found by whoever decodes the colours.
+    # Damage is detected when the colours are decoded.
     if encoded[:4] in _TIFF_MAGICS:
         with suppress(ValueError):
             opaque = _tiff_alpha(encoded)
@@ -371,7 +373,7 @@ def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
 
 
 def is_whole_png(encoded: bytes) -> bool:
-    """Whether the chunks of a PNG file lead to its end: decoders make room for what they state."""
+    """Whether the chunks of a PNG lead to its end: decoders allocate their stated size."""
     position = len(_PNG_MAGIC)
     while position + 12 <= len(encoded):
         if encoded[position + 4 : position + 8] == b"IEND":
@@ -381,11 +383,11 @@ def is_whole_png(encoded: bytes) -> bool:
 
 
 def damage(encoded: bytes) -> tuple[str, bool]:
-    """Decode a photo and return what is damaged in it, and whether pixels are lost by that.
+    """Decode a photo and return its damage, and whether pixels are lost.
 
     Returns:
-        What was found, empty for a sound file; True where a part of the photo is missing or noise.
-        Of TIFF files nothing: `tiff_pixels` raises.
+        The damage, empty for a sound file; True if a part of the photo is missing or noise.
+        Empty for TIFF files: `tiff_pixels` raises.
     """
     if encoded[:4] in _TIFF_MAGICS:
         return "", False
@@ -407,7 +409,7 @@ def damage(encoded: bytes) -> tuple[str, bool]:
                 return "", False
             return text, not _is_padded(encoded, text)
         except KeyError:
-            # It names the kinds of sub-sampling that it knows; Pillow sees truncation.
+            # It reports the kinds of sub-sampling that it supports; Pillow detects truncation.
             pass
         else:
             return "", False
@@ -424,10 +426,10 @@ def damage(encoded: bytes) -> tuple[str, bool]:
 
 
 def _is_padded(encoded: bytes, text: str) -> bool:
-    """Whether libjpeg only passed over bytes between the scan and the end, as cameras write them.
+    """Whether libjpeg only skipped bytes between the scan and the end, as cameras write them.
 
-    These are a few of any kind, or many of padding; where it took a part of the padding for
-    pixels, that stands in the place of the scan.
+    These are a few of any kind, or much padding; if it decoded a part of the padding as pixels,
+    that replaces the scan.
     """
     if _EXTRA_BYTES not in text:
         return False
@@ -437,24 +439,24 @@ def _is_padded(encoded: bytes, text: str) -> bool:
     return abs(passed_over - n_padding) <= _FEW_BYTES
 
 
-# Levels that a step between two blocks of a JPEG has beyond the slope on both sides of it, and
-# share by which such steps go one way along a row of blocks. Of 32 photos none exceeds 0.13, of 23
-# with a flipped bit that shows 20 exceed 0.5.
+# Levels of a step between two blocks of a JPEG beyond the slope on both sides of it, and share of
+# such steps in one direction along a row of blocks. Of 32 photos none exceeds 0.13, of 23 with a
+# visible flipped bit 20 exceed 0.5.
 _STEP_LEVELS: Final = 3
 _SHIFTED_SHARE: Final = 0.4
 _SHORTEST_SEAM: Final = 0.05
 _FEWEST_PARTS: Final = 8
-# Of more rows it is the picture that has such steps.
+# With more rows it is the picture that has such steps.
 _MOST_ROWS: Final = 0.05
 _SEAM_PX: Final = 16
 
 
 def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
-    """Return the row from which on the colours of a JPEG are shifted; None where they are not.
+    """Return the row from which on the colours of a JPEG are shifted; None if they are not.
 
-    A flipped bit that decoders do not notice changes all blocks behind it by one amount. So colours
-    step along the upper sides of the blocks from there on to the right, and along the lower sides
-    of those to the left; nothing that is photographed lies like that on the grid of blocks.
+    A flipped bit that decoders do not notice changes all subsequent blocks by one amount. So
+    colours step along the upper sides of the blocks from there on to the right, and along the lower
+    sides of those to the left; no photographed object is aligned like that with the grid of blocks.
 
     Args:
         encoded: the file's bytes.
@@ -492,8 +494,8 @@ def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
 
 
 # Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by equal angle over the
-# diagonal, and the cameras we could check keep to it: a Redmi Note 9S (4.74 mm, sensor diagonal
-# 8.0 mm) writes 26 where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm)
+# diagonal, and the cameras that were checked comply: a Redmi Note 9S (4.74 mm, sensor diagonal 8.0
+# mm) writes 26 where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm)
 # writes 36 where the diagonal gives 36.2 and the width 37.5. For 3:2 pictures both are the same.
 FULL_FRAME_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 
@@ -514,13 +516,13 @@ _TAGS: Final = frozenset(
     | {_WIDTH, _HEIGHT, _RESOLUTION_X, _RESOLUTION_Y, _RESOLUTION_UNIT}
 )
 _MAX_TEXT: Final = 200
-# As long as an EXIF block may be.
+# Maximum length of an EXIF block.
 _ZEROS_BEHIND: Final = 1 << 16
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
 # Longest side of sensors, from the smallest phone to large format scanning backs.
 _SENSOR_MM: Final = (1.5, 130.0)
-# From fisheyes to telescopes, in front of any sensor; cameras that do not know write 0, 1 or 65535.
+# From fisheyes to telescopes, in front of any sensor; cameras without a value write 0, 1 or 65535.
 _FOCAL_MM: Final = (0.5, 3000.0)
 _EQUIVALENT_MM: Final = (4.0, 3000.0)
 _CROPPED: Final = 0.02
@@ -529,16 +531,16 @@ _CONTRADICTION: Final = 1.15
 
 @dataclass(frozen=True, kw_only=True)
 class Exif:
-    """What EXIF says of a photo; None, or an empty text, where it is silent.
+    """The EXIF data of a photo; None, or an empty text, if missing.
 
     Attributes:
-        orientation: 1..8, how to turn the stored array for looking at it.
+        orientation: 1..8, how to rotate the stored array for display.
         make: maker of the camera.
         model: model of the camera.
         focal_mm: focal length.
-        focal_35mm: full-frame equivalent of it.
-        resolution_px_per_mm: pixels of the picture as it was taken per millimetre of the sensor.
-        width: pixels of the picture as it was taken; it may have been made smaller since.
+        focal_35mm: its full-frame equivalent.
+        resolution_px_per_mm: pixels of the original picture per millimetre of the sensor.
+        width: pixels of the original picture, which may have been reduced since.
         height: pixels.
         is_damaged: some of it could not be read.
     """
@@ -555,7 +557,7 @@ class Exif:
 
     @property
     def camera(self) -> str:
-        """Maker and model, the maker not said twice."""
+        """Maker and model, without repeating the maker."""
         first_word = self.make.partition(" ")[0].lower()
         is_repeated = bool(first_word) and self.model.lower().startswith(first_word)
         return self.model if is_repeated else f"{self.make} {self.model}".strip()
@@ -566,9 +568,9 @@ class FocalLength:
     """A focal length from EXIF.
 
     Attributes:
-        value_px: pixels of the stored array, or None when EXIF does not tell it.
-        reason: what it was taken from, or why there is none.
-        doubt: what EXIF says that cannot be and was not used; empty without such.
+        value_px: pixels of the stored array, or None if EXIF does not state it.
+        reason: what it was computed from, or why there is none.
+        doubt: an impossible EXIF value that was not used; empty without one.
     """
 
     value_px: float | None
@@ -577,7 +579,7 @@ class FocalLength:
 
 
 def read_exif(encoded: bytes) -> Exif:
-    """Read the EXIF data of a photo; without any, everything is absent."""
+    """Read the EXIF data of a photo; without any, all fields are empty."""
     with opened(encoded) as image:
         if image is None:
             return Exif()
@@ -596,13 +598,13 @@ def read_exif(encoded: bytes) -> Exif:
 
 
 def _tags(image: Image) -> tuple[Mapping[int, object], bool]:
-    """The tags that count, and whether the block is damaged, which gives what is left of it."""
+    """Relevant tags, and whether the block is damaged, of which the readable part is used."""
     block = image.info.get("exif")
     if not isinstance(block, bytes):
         return _readable_tags(image.getexif)
     found, is_damaged = _readable_tags(lambda: _loaded(block))
     if is_damaged:
-        # Zeros stand for what is missing, so that one bad place does not end the reading.
+        # Missing bytes are replaced by zeros, so that one bad place does not end the reading.
         found = _readable_tags(lambda: _loaded(block + bytes(_ZEROS_BEHIND)))[0] | found
     return found, is_damaged
 
@@ -616,7 +618,7 @@ def _loaded(block: bytes) -> PillowExif:
 
 
 def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], bool]:
-    """Tags of the main and of the inner directory, and whether some could not be read."""
+    """Return tags of the main and of the inner directory, and whether some could not be read."""
     tags: dict[int, object] = {}
     is_damaged = False
     with warnings.catch_warnings(record=True) as noticed:
@@ -639,13 +641,13 @@ def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], b
 def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     """Focal length of a photo in pixels of its stored array.
 
-    The pixel pitch of the focal plane comes first, as it is exact where it is right; it follows
-    the picture when that was made smaller or turned since. It is left when it contradicts the
-    35 mm equivalent, which does not depend on the size of the picture. That one is taken over the
-    diagonal, see `FULL_FRAME_DIAGONAL_MM`. What no lens has is told and not used.
+    The pixel pitch of the focal plane has priority, as it is exact if it is right; it is scaled if
+    the picture was reduced or rotated since. It is not used if it contradicts the 35 mm equivalent,
+    which does not depend on the size of the picture. That one refers to the diagonal, see
+    `FULL_FRAME_DIAGONAL_MM`. Impossible values are reported and not used.
 
     Args:
-        exif: what EXIF says.
+        exif: the EXIF data.
         width: pixels of the stored array.
         height: pixels.
     """
@@ -663,7 +665,7 @@ def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) -> str:
-    """State that a value cannot be; empty when it can, or is absent."""
+    """Return why a value is impossible; empty if it is possible or missing."""
     shortest, longest = possible_mm
     if value_mm is None or shortest <= value_mm <= longest:
         return ""
@@ -679,7 +681,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
         return FocalLength(
             value_px=None,
             reason=f"the photo was cut after it was taken ({exif.width} x {exif.height} became "
-            f"{width} x {height}), so EXIF no longer speaks of it",
+            f"{width} x {height}), so its EXIF data no longer apply",
         )
     by_pitch = _by_pitch(exif, max(width, height))
     by_equivalent = (
@@ -699,7 +701,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _positive(value: object) -> float | None:
-    """Number of a tag, the first one where it has several, where it is finite and positive."""
+    """Return the number of a tag, the first one of several, if it is finite and positive."""
     if isinstance(value, bytes):
         value = tuple(value)
     first = value[0] if isinstance(value, tuple) and value else value
@@ -708,10 +710,10 @@ def _positive(value: object) -> float | None:
 
 
 def _text(value: object) -> str:
-    """Text of a tag up to its first NUL; empty where it is absent, long or a number."""
+    """Return the text of a tag up to its first NUL; empty if missing, long or a number."""
     if not isinstance(value, str) or len(value) >= _MAX_TEXT:
         return ""
-    # Pillow takes them for Latin-1, but these texts are ASCII.
+    # Pillow decodes them as Latin-1, but these texts are ASCII.
     plain = value.encode("latin-1", "replace").decode("ascii", "replace")
     return plain.split("\0")[0].strip()
 
@@ -725,7 +727,7 @@ def _is_cropped(exif: Exif, width: int, height: int) -> bool:
         return False
     taken = max(exif.width, exif.height) / min(exif.width, exif.height)
     stored = max(width, height) / min(width, height)
-    # One pixel of rounding more than the share, for pictures that were made very small.
+    # One pixel of rounding more than the share, for pictures that were reduced very much.
     return abs(taken / stored - 1.0) > _CROPPED + 1.0 / min(width, height)
 
 
@@ -748,7 +750,7 @@ def _whole(value: float | None) -> int | None:
 
 
 def _resolution(tags: Mapping[int, object]) -> float | None:
-    """Pixels per millimetre, the mean of both axes where both are there."""
+    """Return pixels per millimetre, the mean of both axes if both are present."""
     unit_mm = _UNIT_MM.get(int(_positive(tags.get(_RESOLUTION_UNIT)) or _INCH))
     known = [
         value

@@ -73,7 +73,7 @@ from orthoflow.products import (
 # Letters of a source that its file is called after.
 _LONGEST_SOURCE: Final = 100
 ERROR_CONTENT: Final = (
-    "expected error of a place measured in the orthoimage, one standard deviation along u and "
+    "expected error of a point measured in the orthoimage, one standard deviation along u and "
     "along v, metres, by pose, depth and parallax between photos; NaN = not assessed"
 )
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
@@ -147,7 +147,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
             "includes_walls": list(product.included[index]) if product.included else [],
         }
         publish = partial(_publish_raster, wall=wall, about=about, digest=digest)
-        depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+        depth = "depth in metres along the normal, positive towards the viewer; NaN = no data"
         in_metres = {"unit": "m"}
         stem = f"wall_{wall.plane_index}_depth"
         publish(folder / stem, wall.depth_m, content=depth, tags=in_metres)
@@ -163,7 +163,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
             publish(
                 folder / f"wall_{wall.plane_index}_intensity",
                 wall.intensity,
-                content=f"intensity 0..1 ({product.intensity_source}); NaN = nothing",
+                content=f"intensity 0..1 ({product.intensity_source}); NaN = no data",
                 tags={"unit": "1", "intensity_source": product.intensity_source},
             )
 
@@ -231,7 +231,7 @@ def _write_layers(
         number, name = called.get(layer.wall, (layer.wall, plane_name("wall", layer.wall)))
         source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)[:_LONGEST_SOURCE]
         stem = f"wall_{number}_layer_{nth}_{source}"
-        content = f"what {layer.source} shows of the wall"
+        content = f"the part of the wall shown by {layer.source}"
         tags = raster_tags(layer.frame, digest=digest, name=name, content=content, extra={})
         write_orthoimage(
             folder / f"{stem}.tif",

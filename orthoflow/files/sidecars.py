@@ -29,22 +29,22 @@ _LONGEST_SHOWN: Final = 100
 _UNIT: Final = 1e-6
 
 SURFACE_MASK_MEANINGS: Final[dict[SurfaceMask, str]] = {
-    SurfaceMask.VOID: "void: no point of the scan fell here",
-    SurfaceMask.MEASURED: "measured: points of the scan fell here",
-    SurfaceMask.RECOVERED: "recovered: taken from neighbouring cells",
+    SurfaceMask.VOID: "void: no point of the scan is in this cell",
+    SurfaceMask.MEASURED: "measured: points of the scan are in this cell",
+    SurfaceMask.RECOVERED: "recovered: interpolated from neighbouring cells",
 }
 LAYER_MASK_MEANINGS: Final[dict[LayerMask, str]] = {
     LayerMask.OUTSIDE: "outside: the source does not show this cell",
     LayerMask.PAINTED: "painted: the source shows this cell",
-    LayerMask.OCCLUDED: "occluded: something stands before it",
-    LayerMask.NO_SURFACE: "no surface: the scan does not know the surface here",
+    LayerMask.OCCLUDED: "occluded: an object is in front of it",
+    LayerMask.NO_SURFACE: "no surface: the scan has no surface here",
 }
 ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
     OrthoMask.NONE: "none: no source covers this cell",
     OrthoMask.PAINTED: "painted: a source shows this cell",
     OrthoMask.FILLED: "filled: inpainted from neighbouring cells",
     OrthoMask.OCCLUDED: "occluded: hidden in every source",
-    OrthoMask.NO_SURFACE: "no surface: the scan does not know the surface here",
+    OrthoMask.NO_SURFACE: "no surface: the scan has no surface here",
     OrthoMask.CONTRADICTED: "contradicted: painted by one photo alone, and the scan has another "
     "colour here",
 }

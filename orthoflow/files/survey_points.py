@@ -258,7 +258,7 @@ class _Table:
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
             if len(line) > MOST_LINE:
-                problem = f"the line is longer than {MOST_LINE} letters: this is no list"
+                problem = f"the line is longer than {MOST_LINE} letters: this is not such a table"
             elif place >= MOST_POINTS:
                 problem = f"the file holds more than {MOST_POINTS} {self.content}: split it"
             else:

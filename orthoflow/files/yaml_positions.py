@@ -461,7 +461,7 @@ class _Converter:
         except KeyError:
             self._refuse_tag(node, position, path)
         except ValueError:
-            self.log.add(position, path, f"{_cut(text)!r} is no {tag.removeprefix(_TAG)}")
+            self.log.add(position, path, f"{_cut(text)!r} is not a valid {tag.removeprefix(_TAG)}")
         return text
 
     def _refuse_tag(self, node: Node, position: Position, path: str) -> None:

@@ -1,4 +1,4 @@
-"""Two runs side by side: how far products lie apart, and what else differs."""
+"""Comparison of two runs: differences of products, and of everything else."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class Distance:
 
     Attributes:
         unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
-        largest: largest absolute difference in that unit; None where values cannot be subtracted
+        largest: largest absolute difference in that unit; None if values cannot be subtracted
             (another shape or type, missing, NaN against a number).
-        limit: what the type allows in the field that lies farthest apart.
+        limit: tolerance of the type in the field with the largest difference.
         field: that field, e.g. `walls/0/depth_m`.
-        n_values: how many values of the unit lie beyond their limit.
+        n_values: number of values of the unit beyond their limit.
     """
 
     unit: str
@@ -65,14 +65,14 @@ class Distance:
 
 @dataclass(frozen=True, kw_only=True)
 class ProductDistance:
-    """Two products that ought to be one.
+    """Two products that ought to be equal.
 
     Attributes:
-        cell: address of the cell that gave them.
+        cell: address of their cell.
         port: its output port.
         type_name: product type.
-        verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` where
-            the digests differ and the arrays of one of them are nowhere to be found.
+        verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` if the
+            digests differ and the arrays of one of them are not available.
         left: digest of the first, empty when it has none.
         right: digest of the second, empty when it has none.
         distances: one per unit in which they differ.
@@ -95,8 +95,8 @@ class RunProducts:
 
     Attributes:
         run: the run.
-        stores: where arrays may lie that the record names by digest only.
-        own: address by which a cell is asked for -> its own one, where the two differ.
+        stores: stores that may have arrays which the record names by digest only.
+        own: requested address of a cell -> its own one, if the two differ.
     """
 
     run: Run
@@ -104,17 +104,17 @@ class RunProducts:
     own: Mapping[str, str] = field(default_factory=dict)
 
     def outputs(self, address: str) -> Mapping[str, RecordedProduct]:
-        """Outputs of a cell by port; empty where the run has no such cell."""
+        """Return outputs of a cell by port; empty if the run has no such cell."""
         cell = self.run.cells.get(self.own.get(address, address))
         return {} if cell is None else cell.outputs
 
     def digest(self, address: str, port: str) -> str:
-        """Digest of an output, empty when the run has no such output."""
+        """Return the digest of an output, empty if the run has no such output."""
         output = self.outputs(address).get(port)
         return "" if output is None else output.digest
 
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
-        """Return arrays and metadata of an output; None when they are nowhere to be found."""
+        """Return arrays and metadata of an output; None if they are not available."""
         output = self.outputs(address)[port]
         if output.embedded:
             return self.run.payload(self.own.get(address, address), port)
@@ -133,7 +133,7 @@ def product_distances(
         left: one run.
         right: the other.
         addresses: the cells, each in both runs.
-        catalog: knows the product types and with them the tolerances.
+        catalog: has the product types and their tolerances.
     """
     found = []
     for address in addresses:
@@ -196,7 +196,7 @@ def _distance(
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
-    """Report a value that lies in a list by the name and the unit that stand beside it."""
+    """Identify a value in a list by the name and the unit beside it."""
     way = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
     for part in way[:-1]:
@@ -211,7 +211,7 @@ def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
 
 
 def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
-    """How far values of a field may lie apart; grey levels of 16 bits count in steps of 257."""
+    """Return the tolerance of values of a field; grey levels of 16 bits count in steps of 257."""
     is_deep = tolerance.unit == "grey" and any(
         array.dtype == np.uint16 and path.rpartition("/")[2] == name
         for path, array in payload.arrays.items()
@@ -239,19 +239,19 @@ def _farthest(differences: Sequence[ArrayDifference]) -> Distance:
 
 
 Side = TypeVar("Side")
-# Seconds and memory that methods measured themselves hang on the machine, too.
+# Seconds and memory measured by methods depend on the machine, too.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair(Generic[Side]):
-    """What two runs say about one thing.
+    """The values of two runs for one item.
 
     Attributes:
         cell: address of the cell it belongs to, empty for what belongs to the whole run.
-        name: what it is: name of an input, a parameter, a metric, a package.
-        left: what the first run says, None when it says nothing.
-        right: what the second run says, None when it says nothing.
+        name: name of an input, a parameter, a metric or a package.
+        left: value of the first run, None without one.
+        right: value of the second run, None without one.
     """
 
     cell: str = ""
@@ -261,17 +261,17 @@ class Pair(Generic[Side]):
 
     @property
     def is_same(self) -> bool:
-        """Whether both say the same."""
+        """Whether both are equal."""
         return self.left == self.right
 
     @property
     def is_shared(self) -> bool:
-        """Whether both say anything."""
+        """Whether both have a value."""
         return self.left is not None and self.right is not None
 
     @property
     def is_rounded(self) -> bool:
-        """Whether both are values of a metric that differ by no more than libraries round."""
+        """Whether both are values of a metric that differ by rounding only."""
         left, right = self.left, self.right
         return (
             isinstance(left, ComparedMetric)
@@ -282,12 +282,12 @@ class Pair(Generic[Side]):
 
     @property
     def is_moved(self) -> bool:
-        """Whether they differ, and by more than libraries round."""
+        """Whether they differ by more than rounding."""
         return not (self.is_same or self.is_rounded)
 
     @property
     def either(self) -> Side:
-        """What one of them says, the first where it does."""
+        """One of the values, preferably the first."""
         side = self.right if self.left is None else self.left
         if side is None:
             raise AssertionError("a pair stands for something that a run has")
@@ -296,14 +296,14 @@ class Pair(Generic[Side]):
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """In how many of some rows two runs differ.
+    """Numbers of differing rows of two runs.
 
     Attributes:
-        n_different: rows of which both say something, and not the same, but for rounding.
-        n_shared: rows of which both say something.
-        n_left: rows of which only the first does.
-        n_right: rows of which only the second does.
-        n_rounded: rows that differ by no more than libraries round.
+        n_different: rows with values in both runs that differ by more than rounding.
+        n_shared: rows with values in both runs.
+        n_left: rows with a value in the first run only.
+        n_right: rows with a value in the second run only.
+        n_rounded: rows that differ by rounding only.
     """
 
     n_different: int
@@ -328,11 +328,11 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterValue:
-    """A parameter as resolved.
+    """The resolved value of a parameter.
 
     Attributes:
         value: JSON.
-        is_set: written in the workflow or on the command line; else it is the method's default.
+        is_set: set in the workflow or on the command line; otherwise it is the method's default.
     """
 
     value: JsonValue
@@ -341,18 +341,18 @@ class ParameterValue:
 
 @dataclass(frozen=True, kw_only=True)
 class CellFacts:
-    """What decides a cell's results besides inputs and parameters.
+    """What determines a cell's results besides inputs and parameters.
 
     Attributes:
         status: ok, failed or skipped.
         method: method id.
-        distribution: name and version of what brought the method.
-        result_version: the method's own counter.
+        distribution: name and version of the method's distribution.
+        result_version: result version of the method.
         determinism: exact, seeded or loose.
-        seed: None when the method uses none.
-        code: digests of code that was not a released install; empty when all was.
-        tools: versions of libraries that decide results.
-        error: why it failed or was skipped, else empty.
+        seed: None if the method uses none.
+        code: digests of code that was not a released install; empty if all was.
+        tools: versions of libraries that affect results.
+        error: why it failed or was skipped, otherwise empty.
     """
 
     status: str
@@ -365,7 +365,9 @@ class CellFacts:
     tools: Mapping[str, str]
     error: str
 
-    def __str__(self) -> str:
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Each of them in words, status and method first."""
         parts = (
             self.status,
             f"{self.method} result version {self.result_version}"
@@ -377,21 +379,24 @@ class CellFacts:
             "" if self.seed is None else f"seed {self.seed}",
             self.error,
         )
-        return ", ".join(part for part in parts if part)
+        return tuple(part for part in parts if part)
+
+    def __str__(self) -> str:
+        return ", ".join(self.parts)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedMetric:
-    """One number of one cell; equal when value and unit are.
+    """One number of one cell; equal if value and unit are.
 
     Attributes:
         value: the number.
         unit: its unit.
-        is_cost: a time or memory, which depend on the machine and its load, whoever measured it.
+        is_cost: a time or memory, which depend on the machine and its load.
         is_cached: of a cell that an earlier run computed; its cost is that run's.
         environment: id of the environment it was computed in.
         better: which values are better; empty where none are.
-        headline: it says how good the result is.
+        headline: it states how good the result is.
     """
 
     value: float
@@ -403,7 +408,7 @@ class ComparedMetric:
     headline: bool = field(compare=False, default=False)
 
     def is_near(self, other: ComparedMetric | None) -> bool:
-        """Whether it is equal to another one but for rounding."""
+        """Whether it is equal to another one apart from rounding."""
         return (
             other is not None and self.unit == other.unit and is_rounding(self.value, other.value)
         )
@@ -411,18 +416,18 @@ class ComparedMetric:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
-    """Two runs side by side; rows that say the same on both sides are among them.
+    """Two runs compared; rows that are equal on both sides are included.
 
     Attributes:
         left: record of the first run.
         right: record of the second.
-        workflow: the first text against the second as a unified diff; empty when equal.
+        workflow: unified diff of the workflow texts; empty if equal.
         overrides: options that changed the workflow.
         inputs: files of every input, without folders.
         cells: method, version, seed and status of every cell, named as in the first run that has
             it.
-        readdressed: address in the second run -> that of its counterpart in the first, where the
-            two differ: a step alone, say, and a variant that sets what its defaults are.
+        readdressed: address in the second run -> that of its counterpart in the first, if the two
+            differ: e.g. a step alone, and a variant with the same parameters.
         parameters: resolved parameters of every cell.
         environment: Python, system, processor and packages; several values are joined by commas.
         metrics: numbers of every cell.
@@ -481,28 +486,28 @@ class RunComparison:
 
     @property
     def step_of(self) -> dict[str, str]:
-        """The step of each cell of either run."""
+        """Return the step of each cell of either run."""
         return {cell.address: cell.step for side in (self.left, self.right) for cell in side.cells}
 
     @property
     def of_shared_steps(self) -> str:
-        """State of which steps rows that `shared` leaves are; nothing where both runs have all."""
+        """Return to which steps the rows of `shared` belong; empty if both runs have all."""
         n_shared = sum(row.is_shared for row in self.cells)
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
         return "" if all_shared else f", of the {counted} that both have"
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
-        """Leave out what belongs to cells that only one of the runs has: it cannot differ."""
+        """Leave out rows of cells that only one of the runs has: they cannot differ."""
         alone = {row.cell for row in self.cells if not row.is_shared}
         return tuple(row for row in rows if row.cell not in alone)
 
     def metric_table(self) -> pd.DataFrame:
-        """Lay every number of both runs side by side.
+        """Return every number of both runs side by side.
 
         Returns:
-            Columns `cell`, `metric`, `left`, `right`, `difference` (right - left; NaN where one of
-            them lacks it) and `unit`.
+            Columns `cell`, `metric`, `left`, `right`, `difference` (right - left; NaN if one is
+            missing) and `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -517,16 +522,16 @@ class RunComparison:
 
 
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:
-    """Lay two runs side by side.
+    """Compare two runs.
 
-    Cells are the same when they are of one step, dataset and seed, and each step that varies on
-    their way has one method with the same parameters; else when their addresses are the same; else
-    when those steps have one method, and the same values of the parameters that vary in either run.
+    Cells correspond if they have the same step, dataset and seed, and each step that varies before
+    them has the same method and parameters; otherwise if their addresses are equal; otherwise if
+    those steps have the same method, and the same values of the parameters that vary in either run.
 
     Args:
         left: the first run.
         right: the second run.
-        stores: where arrays may lie that a record names by digest only.
+        stores: stores that may have arrays which a record names by digest only.
 
     Raises:
         RecordError: a record is damaged.
@@ -534,7 +539,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     readdressed = _readdressed(left, right)
-    # How the second run's cells are called here -> how the run itself calls them.
+    # Name of the second run's cells here -> name in the run itself.
     own = {_label(right, address, readdressed): address for address in right.cells}
     both = [address for address in left.cells if address in own]
     sides = (left.record, right.record)
@@ -559,14 +564,14 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
 
 
 def compare_metrics(left: Run, right: Run) -> tuple[Pair[ComparedMetric], ...]:
-    """Lay the numbers side by side of cells that both runs have by name; no times, no memory."""
+    """Return the numbers side by side of cells that both runs have; no times, no memory."""
     both = [address for address in left.cells if address in right.cells]
     rows = (
         row
         for address in both
         for row in _pairs(address, *(_metrics(run.cells[address]) for run in (left, right)))
     )
-    # A number that one side only calls a time is none.
+    # A number that only one side calls a time is not a time.
     return tuple(
         row for row in rows if not all(side.is_cost for side in (row.left, row.right) if side)
     )
@@ -598,14 +603,15 @@ def _per_cell(
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
     """Find cells of the second run that the first has under another address.
 
-    Names of variants are labels, not identity: what has the same method and parameters is the same,
-    then what has the same address, then what has the same values of the parameters that vary.
+    Names of variants are labels, not identity: cells with the same method and parameters
+    correspond, then those with the same address, then those with the same values of the parameters
+    that vary.
     """
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
     varying = _telling_parameters((left, right), varied)
-    # What was skipped has no inputs, so that nobody knows what it would have come from.
+    # A skipped cell has no inputs, so its origin is unknown.
     ours, theirs = (
         {at: _way(run, cell, varied, None) for at, cell in run.cells.items() if _has_run(cell)}
         for run in (left, right)
@@ -623,9 +629,9 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
 
 
 def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
-    """Return how a cell of the second run is called: as its partner in the first run."""
+    """Return the name of a cell of the second run: that of its counterpart in the first run."""
     if address not in readdressed and address in readdressed.values():
-        # It has no partner, and its address means another cell in the first run.
+        # It has no counterpart, and its address means another cell in the first run.
         return f"{address} ({right.record.run_id})"
     return readdressed.get(address, address)
 
@@ -639,7 +645,7 @@ def _pair(
     ours: Mapping[str, tuple[object, ...]],
     theirs: Mapping[str, tuple[object, ...]],
 ) -> None:
-    """Pair cells of the second run with those of the first that stand for the same."""
+    """Pair cells of the second run with the corresponding ones of the first."""
     taken = set(found.values())
     free: dict[tuple[object, ...], list[str]] = {}
     for address, way in ours.items():
@@ -653,7 +659,7 @@ def _pair(
 def _telling_parameters(
     runs: Sequence[Run], varied: Collection[str]
 ) -> dict[tuple[str, str], frozenset[str]]:
-    """Find the parameters that tell variants of a step and method apart, within one of the runs."""
+    """Find the parameters that distinguish variants of a step and method within one of the runs."""
     found: dict[tuple[str, str], set[str]] = {}
     for run in runs:
         values: dict[tuple[str, str, str], set[str]] = {}
@@ -674,13 +680,13 @@ def _way(
     varied: Collection[str],
     telling: Mapping[tuple[str, str], Collection[str]] | None,
 ) -> tuple[object, ...]:
-    """State what a cell stands for without the names of its variants.
+    """Return the identity of a cell without the names of its variants.
 
     Args:
-        run: that it belongs to.
+        run: the run of the cell.
         cell: the cell.
-        varied: steps that vary in either run; they count with what they call, as a step without
-            variants is the one variant that it has.
+        varied: steps that vary in either run; they count with their method, a step without variants
+            as its only variant.
         telling: by step and method the parameters that count; None for all.
     """
     called = {}
@@ -700,7 +706,7 @@ def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
 
 def _facts(cell: RecordedCell) -> CellFacts:
     if cell.status == "skipped":
-        # Its method decides nothing, and has its versions only where another cell has loaded it.
+        # A skipped method decides nothing, and has versions only if another cell has loaded it.
         unloaded = MethodIdentity(method=cell.method)
         cell = replace(cell, seed=None, **shared_fields(unloaded, MethodIdentity))
     preimage = read_preimage(cell.key_preimage)

@@ -1,4 +1,4 @@
-"""A run as a Provenance Run Crate: a folder that workflow archives and their tools understand."""
+"""A run as a Provenance Run Crate: a folder for workflow archives and their tools."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ _UNIT_CODES: Final = {
 
 
 def ref(identifier: str) -> dict[str, JsonValue]:
-    """Point at an entity."""
+    """Reference an entity."""
     return {"@id": identifier}
 
 
 def refs(identifiers: Iterator[str] | tuple[str, ...]) -> list[JsonValue]:
-    """Point at entities, each once."""
+    """Reference entities, each once."""
     return [ref(identifier) for identifier in dict.fromkeys(identifiers)]
 
 
@@ -115,13 +115,13 @@ def status_of(*, is_ok: bool) -> str:
 
 
 def value_type(value: JsonValue) -> str:
-    """Schema.org's name for the type of a setting; what is no scalar is written as JSON text."""
+    """Schema.org's name for the type of a setting; non-scalars are written as JSON text."""
     names = {bool: "Boolean", int: "Integer", float: "Float"}
     return names.get(type(value), "Text")
 
 
 def port_type(product: RecordedProduct) -> str:
-    """Schema.org's name for what a port takes: files of the user, or products of the record."""
+    """Schema.org's name for the type of a port: files of the user, or products of the record."""
     return "File" if product.type_name == "files" else "CreativeWork"
 
 
@@ -143,7 +143,7 @@ def formal(identifier: str, name: str, additional_type: str) -> Entity:
 
 
 def method_entities(record: RunRecord) -> Iterator[Entity]:
-    """Methods with their ports and settings, and the distributions that brought them."""
+    """Methods with their ports and settings, and their distributions."""
     by_tool: dict[str, list[RecordedCell]] = {}
     for cell in ran(record):
         by_tool.setdefault(tool_id(cell), []).append(cell)
@@ -183,7 +183,7 @@ def method_entities(record: RunRecord) -> Iterator[Entity]:
 
 
 def cell_entities(record: RunRecord) -> Iterator[Entity]:
-    """What happened: an action per cell, its control, its settings, costs and metrics."""
+    """The executions: an action per cell, its control, its settings, costs and metrics."""
     files = {entry.name: entry.files for entry in record.inputs}
     for cell in ran(record):
         action = action_id(cell)
@@ -313,23 +313,23 @@ def write_crate(
 ) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their description.
 
-    Input files are named by their digests, not copied: they may be large, and others' property.
+    Input files are named by their digests, not copied: they may be large, and property of others.
     An embedded record has them, see `write_embedded`.
 
     Args:
         run: the run.
         folder: existing folder, empty but for `record`.
         license_text: URL or name of the license of the results.
-        author: who made the results, by name or ORCID; empty where nobody says it.
-        record: the run with another record, which lies in the folder already.
+        author: who made the results, by name or ORCID; empty if unknown.
+        record: the run with another record, which is in the folder already.
 
     Returns:
         The files, the description first.
 
     Raises:
-        StoreError: the disk refuses.
-        RecordError: a name in the record cannot be that of a file, a link stands in the place of
-            a file, or a cell takes what none gave.
+        StoreError: the disk cannot be written.
+        RecordError: a name in the record cannot be a file name, a link replaces a file, or a cell
+            takes a product that none gave.
     """
     texts = {
         WORKFLOW_FILE: run.record.workflow_source,
@@ -351,22 +351,22 @@ def write_crate(
 
 def _write(folder: Path, name: str, text: str) -> None:
     with creating(folder, name) as stream:
-        # Halves of letters, which parameters may have, as JSON writes them.
+        # Unpaired surrogates, which parameters may contain, as JSON writes them.
         stream.write(text.encode("utf-8", "backslashreplace"))
 
 
 def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
-    """Copy record, report with its figures and published files; give their paths in the crate."""
+    """Copy record, report with its figures and published files; return their paths in the crate."""
     if record.path != folder / RECORD_FILE:
         with writing_to(folder):
             shutil.copyfile(record.path, folder / RECORD_FILE)
     pages = [REPORT_FILE, *pages_of(run).values()]
     wanted = [*pages]
-    # Which the report leads to, where it was written with them.
+    # Linked from the report, if it was written with them.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
     signed: tuple[str, ...] = ()
     if record is run and run.path.name == RECORD_FILE:
-        # Rasters that were made anew lie in a folder of their own.
+        # Recreated rasters are in a folder of their own.
         signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
         signed = copy_files(run.path.parent, folder, [signature], ())
     wanted += [
@@ -392,7 +392,7 @@ def crate_metadata(
         record: of the run.
         files: paths in the crate, with `/`.
         license_text: URL or name of the license of the results.
-        author: who made the results, by name or ORCID; empty where nobody says it.
+        author: who made the results, by name or ORCID; empty if unknown.
     """
     crate = _Crate(
         record=record, files=tuple(files), license_text=license_text, author=author.strip()
@@ -402,7 +402,7 @@ def crate_metadata(
 
 @dataclass(frozen=True, kw_only=True)
 class _Crate:
-    """One crate: the entities that stand for the run as a whole."""
+    """One crate: the entities that represent the run as a whole."""
 
     record: RunRecord
     files: tuple[str, ...]
@@ -499,7 +499,7 @@ class _Crate:
 
     @property
     def _final(self) -> dict[str, tuple[RecordedCell, str]]:
-        """Outputs that no other cell takes, by `address.port`."""
+        """Return outputs that no other cell takes, by `address.port`."""
         taken = {product.source for cell in self._cells for product in cell.inputs.values()}
         return {
             f"{cell.address}.{port}": (cell, port)
@@ -701,7 +701,7 @@ class _Crate:
 
 
 def _how_to_read(record: RunRecord) -> str:
-    """State how somebody who has the crate alone looks at the record and checks the files."""
+    """Return instructions for reading the record and checking the files of the crate."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
     source = "the input files" if given else "it alone"
@@ -726,7 +726,7 @@ def _output_id(source: str) -> str:
 
 
 def _source_id(source: str, outputs: Mapping[str, str]) -> str:
-    """Formal parameter that a port takes its product from."""
+    """Return the formal parameter from which a port takes its product."""
     owner, _, name = source.rpartition(".")
     if owner == "inputs":
         return _input_id(name)

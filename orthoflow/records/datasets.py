@@ -1,4 +1,4 @@
-"""One dataset of a run as a run of its own: what it computed, and what all of them share."""
+"""One dataset of a run as a run of its own: its cells, and those common to all datasets."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _DATASETS = "datasets"
 
 
 def datasets_of(run: Run) -> tuple[str, ...]:
-    """Names of the datasets that a run has cells of, in their order; none of most runs.
+    """Return the datasets of a run that has cells of them, in order; usually none.
 
-    What cannot be a name is left out: folders and pages are called after them.
+    Names that are invalid are left out, because folders and pages are named after them.
     """
     if not _resolved(run).get(_DATASETS):
         return ()
@@ -46,7 +46,7 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Return what belongs to each dataset of a run, what all share included, as a run of its own.
+    """Return the part of each dataset of a run, including common cells, as a run of its own.
 
     Their products are read from the record of the whole run.
     """
@@ -96,16 +96,16 @@ def _record_of(
 
 
 def write_part(part: Run, folder: Path, store: Store) -> Run:
-    """Write one dataset of a run as a run folder, whose record verifies and replays alone.
+    """Write one dataset of a run as a run folder, whose record can be verified and replayed alone.
 
     Args:
-        part: as `parts_of` gives it.
-        folder: a new folder, made by this, for the record and the published files.
-        store: has the products that were embedded and are not in the run's record any more.
+        part: from `parts_of`.
+        folder: a new folder for the record and the published files.
+        store: has the products that were embedded and are no longer in the run's record.
 
     Raises:
         RecordError: the run is damaged.
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     with writing_to(folder):
         folder.mkdir(parents=True)
@@ -135,7 +135,7 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
 
 
 def pages_of(run: Run) -> dict[str, str]:
-    """Where the page of each dataset lies: name -> path below the run folder, if several."""
+    """Return the page of each dataset: name -> path below the run folder, if several."""
     names = datasets_of(run)
     return {name: f"{PAGES_FOLDER}/{name}.html" for name in names} if len(names) > 1 else {}
 

@@ -21,23 +21,23 @@ WALLS_FILE: Final = "walls.json"
 _WALLS_LARGEST_BYTES: Final = 1 << 22
 _ORTHO: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.json")
 _DEPTH: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_depth\.json")
-# An image of which less is painted is no view of its wall.
+# An image with a smaller painted share is not a view of its wall.
 _LEAST_PAINTED_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeliveredWall:
-    """A wall, and whether its orthoimage is one to deliver.
+    """A wall, and whether its orthoimage should be delivered.
 
     Attributes:
         name: of the wall, with its number.
-        kind: `wall`, `floor`, `ceiling`, or what its method calls it.
-        recommended: its orthoimage is one to deliver.
+        kind: `wall`, `floor`, `ceiling`, or its method's own name for it.
+        recommended: its orthoimage should be delivered.
         reason: why, or why not, in words.
         area_m2: of the image; None without one.
         painted_share: of the cells of the image; None without one.
-        expected_mm: expected error of a point measured in the image, median; None where nothing
-            checked it.
+        expected_mm: expected error of a point measured in the image, median; None if it was not
+            checked.
     """
 
     name: str
@@ -50,7 +50,7 @@ class DeliveredWall:
 
 
 def delivered_walls(products: Path) -> tuple[DeliveredWall, ...]:
-    """Read `walls.json` of a run; empty where there is none that can be read."""
+    """Read `walls.json` of a run; empty if it is missing or unreadable."""
     path = products / WALLS_FILE
     try:
         if path.is_symlink() or path.stat().st_size > _WALLS_LARGEST_BYTES:
@@ -80,12 +80,12 @@ def _number(value: object) -> float | None:
 
 
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
-    """Write `walls.json` into the products of a run; nothing where it gave no orthoimages.
+    """Write `walls.json` into the products of a run; nothing without orthoimages.
 
-    Of several combinations the one that was run last counts, as for drawings.
+    With several combinations the last one is used, as for drawings.
 
     Args:
-        products: folder in which the files of all cells lie.
+        products: folder with the files of all cells.
         cells: of the run, in order.
     """
     pictured = [
@@ -124,7 +124,7 @@ def _sidecars(
 def _told(
     number: int, content: Mapping[str, object], image: str, *, is_of_photos: bool
 ) -> dict[str, JsonValue]:
-    """What is said of one orthoimage."""
+    """Return the entry of one orthoimage."""
     counts = content.get("mask_counts")
     counts = counts if isinstance(counts, dict) else {}
     total = sum(counts.values()) or 1
@@ -159,7 +159,7 @@ def _told(
 def _included(
     products: Path, cells: Sequence[RecordedCell], images: Mapping[int, object]
 ) -> Iterator[dict[str, JsonValue]]:
-    """Surfaces that a wall of these images shows already."""
+    """Return surfaces that a wall of these images already shows."""
     found: dict[int, int] = {}
     for cell in cells:
         for number, _, content in _sidecars(products / cell_file_name(cell.address), _DEPTH):
@@ -183,12 +183,12 @@ def _included(
 
 
 def _kind(name: str) -> str:
-    """The first word of a wall's name: wall, floor, ceiling, or what its method calls it."""
+    """Return the first word of a wall's name: wall, floor, ceiling, or its method's own."""
     return name.split(" ", maxsplit=1)[0] or "wall"
 
 
 def _rank(wall: Mapping[str, JsonValue]) -> tuple[bool, float, int]:
-    """Recommended ones first, of these the largest painted area."""
+    """Sort key: recommended ones first, of these the largest painted area."""
     area, share = wall["area_m2"], wall["painted_share"]
     painted = area * share if isinstance(area, float) and isinstance(share, float) else 0.0
     return not wall["recommended"], -painted, int(str(wall["number"]))

@@ -1,4 +1,4 @@
-"""The input files of a record, found again: by content wherever they lie now, or in the record."""
+"""Finding the input files of a record again: by content at any place, or in the record."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ from orthoflow.workflow.problems import (
     ProblemLog,
 )
 
-# Of a folder that files may lie in; what lies in a larger one is found by its name alone.
+# Maximum number of files of a folder that is searched by content; in a larger one only by name.
 _MOST_LISTED: Final = 10_000
 
 
-# A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
+# By default a run is in runs/<name>/ below the folder of its workflow.
 _FOLDERS_ABOVE: Final = 3
 
 
 class ChangedInputsError(RecordError):
-    """Input files are not what a record says; `problems` names them, and those that are missing."""
+    """Input files differ from the record; `problems` names them, and missing ones."""
 
     def __init__(self, problems: tuple[str, ...]) -> None:
         self.problems = problems
@@ -64,12 +64,12 @@ class ChangedInputsError(RecordError):
 
 @dataclass(frozen=True, kw_only=True)
 class InputSearch:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
         paths: input -> its files in the order of the record; inputs that were not given have none.
         problems: one sentence per file that is missing or was changed.
-        is_changed: one of them lies there with other content.
+        is_changed: one of them exists with other content.
     """
 
     paths: Mapping[str, tuple[Path, ...]]
@@ -87,20 +87,20 @@ def find_inputs(
     extracted: Mapping[str, tuple[Path, ...]] | None = None,
     noted: Sequence[FileDigests] = (),
 ) -> InputSearch:
-    """Look for files with the content that a record states; their names may be others.
+    """Search files with the content that a record states, under any name.
 
-    Looks where `given` says; else among the `extracted`; else at the places that the workflow
-    names, below the working directory, the run's folder and the folders above it, and in these
-    folders themselves; and where a store remembers that a run found them.
+    Searches where `given` says; otherwise the `extracted` files, the paths of the workflow, below
+    the working directory, the run's folder and its parents, and these folders themselves; and where
+    a store has noted that a run found them.
 
     Args:
         workflow: of the record.
         recorded: the record's inputs.
         run_folder: the folder of the record.
-        digests: remembers digests, so that each file is read once.
-        given: `NAME=PATH`, each as behind `--input`.
-        extracted: input -> files that lay in the record itself.
-        noted: of stores that may remember where files lay, besides `digests`.
+        digests: caches digests, so that each file is read once.
+        given: `NAME=PATH`, each as after `--input`.
+        extracted: input -> files from the record itself.
+        noted: caches of stores that may have noted positions of files, besides `digests`.
 
     Raises:
         InvalidArgumentsError: `given` names no input of the workflow.
@@ -126,10 +126,10 @@ def find_inputs(
 
 
 class LaidOutInputs:
-    """Input files of a record under its names, in a folder that vanishes with the context.
+    """Input files of a record under its names, in a temporary folder.
 
     Attributes:
-        extracted: input -> files that lay in the record itself.
+        extracted: input -> files from the record itself.
     """
 
     def __init__(self, beside: Path, stack: ExitStack) -> None:
@@ -142,7 +142,7 @@ class LaidOutInputs:
         """Make a new folder.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         with writing_to(self._beside):
             if not self._folders:
@@ -157,7 +157,7 @@ class LaidOutInputs:
         """Return the found files of an input under their recorded names, in the recorded order.
 
         Raises:
-            StoreError: the disk refuses.
+            StoreError: the disk cannot be written.
         """
         names = [file.name for file in entry.files]
         # Files of one name are sorted by their folders.
@@ -170,7 +170,7 @@ class LaidOutInputs:
         try:
             link.symlink_to(path)
         except OSError:
-            # Windows lets few people make links.
+            # On Windows most users cannot create links.
             with writing_to(link.parent):
                 shutil.copyfile(path, link)
         return link
@@ -178,15 +178,15 @@ class LaidOutInputs:
 
 @contextmanager
 def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
-    """Return the input files that lie in a record as files, as long as the context lasts.
+    """Return the input files in a record as files, as long as the context lasts.
 
     Args:
         run: the run.
-        beside: folder on a disk with room for them, made when missing.
+        beside: folder on a disk with enough space, created if missing.
 
     Raises:
         RecordError: the record is damaged.
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     with ExitStack() as stack:
         laid_out = LaidOutInputs(beside, stack)
@@ -199,7 +199,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Lost:
-    """A file that was not found: the sentence that says so, and whether another has its place."""
+    """A file that was not found: the sentence about it, and whether another has its place."""
 
     problem: str
     is_changed: bool = False
@@ -208,7 +208,7 @@ class _Lost:
 def _find(
     name: str, file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
 ) -> Path | _Lost:
-    """The file, or why there is none."""
+    """Return the file, or why there is none."""
     same_name: list[Path] = []
     seen: set[Path] = set()
     expected = f"{file.size_bytes} bytes with the SHA-256 {file.sha256[:12]}..."
@@ -222,7 +222,7 @@ def _find(
                 size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256
             )
         except InputError:
-            # Nobody said that this would be it.
+            # Nobody named this file explicitly.
             if path.name == file.name or places.files:
                 raise
             continue
@@ -249,7 +249,7 @@ def _find(
 
 
 def _size_of_file(path: Path) -> int | None:
-    """Size of what is a regular file and can be reached, else None."""
+    """Return the size of a regular, accessible file, else None."""
     try:
         state = path.stat()
     except (OSError, ValueError):
@@ -259,21 +259,21 @@ def _size_of_file(path: Path) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Where the files of one input may lie: in folders, or exactly here when a user says so."""
+    """Candidate positions of the files of one input: in folders, or only where a user said."""
 
     folders: tuple[Path, ...] = ()
     files: tuple[Path, ...] = ()
     listings: _Listings
 
     def candidates(self, name: str) -> Iterator[Path]:
-        """Paths at which a file of that name may be, the likeliest first."""
+        """Yield paths at which a file of that name may be, the likeliest first."""
         if name_problem(name):
             return
         yield from (path for path in self.files if path.name == name)
         yield from (folder / name for folder in self.folders)
 
     def others(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
-        """Paths at which a file may be that has another name, or lies elsewhere."""
+        """Yield paths at which a file with another name or folder may be."""
         if name_problem(file.name):
             return
         yield from self.files
@@ -288,12 +288,12 @@ class _Places:
 
 @dataclass(kw_only=True)
 class _Listings:
-    """Files directly in folders by their sizes, each folder looked into once."""
+    """Files directly in folders by size, each folder read once."""
 
     _known: dict[Path, Mapping[int, list[Path]]] = field(default_factory=dict)
 
     def of_size(self, folder: Path, size_bytes: int) -> Sequence[Path]:
-        """The files of a size, as far as the folder can be read."""
+        """Return the files of a size, as far as the folder can be read."""
         place = folder.absolute()
         if place not in self._known:
             self._known[place] = self._listed(folder)
@@ -327,7 +327,7 @@ def _places(
     roots = dict.fromkeys(
         (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
     )
-    # The resolved form has options in the place of what the file names, and no folders.
+    # The resolved form has options instead of the file's own text, and no folders.
     written = written_files(workflow.source)
     places: dict[str, _Places] = {}
     listings = _Listings()
@@ -352,7 +352,7 @@ def _places(
 def _of_all_datasets(
     options: Sequence[InputOption], specs: Mapping[str, WorkflowInputSpec]
 ) -> tuple[InputOption, ...]:
-    """Let `scan=FOLDER` stand for the `scan@...` of every dataset, where there is no other scan."""
+    """Let `scan=FOLDER` apply to the `scan@...` of every dataset, if there is no other scan."""
 
     def meant(name: str) -> Sequence[str]:
         own = [found for found in specs if found.partition("@")[0] == name]

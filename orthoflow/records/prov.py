@@ -118,7 +118,7 @@ def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[Rec
 
 
 def _add_cell(document: ProvDocument, cell: RecordedCell) -> None:
-    """Add what a cell did, with what, and what came of it."""
+    """Add the activity of a cell, with its inputs and outputs."""
     name = _name("cell", cell.address)
     attributes = _attributes(
         _type("Cell"),
@@ -166,7 +166,7 @@ def _add_cell(document: ProvDocument, cell: RecordedCell) -> None:
 def _add_published(
     document: ProvDocument, record: RunRecord, cells: Iterable[RecordedCell]
 ) -> None:
-    """Add the files that the run wrote for other programs, each of the cell that made it."""
+    """Add the files that the run published, each with its cell."""
     owners = {f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}": cell.address for cell in cells}
     for file in record.published:
         name = _name("published", file.path)
@@ -181,7 +181,7 @@ def _file(kind: str, label: str, file: RecordedFile | PublishedFile) -> Attribut
 
 
 def _source(product: RecordedProduct) -> str:
-    """Name of the entity that an input is: `inputs.name`, or `address.port` of another cell."""
+    """Name of the entity of an input: `inputs.name`, or `address.port` of another cell."""
     owner, _, name = product.source.partition(".")
     return _name("input", name) if owner == "inputs" else _name("product", product.source)
 
@@ -195,7 +195,7 @@ def _type(name: str) -> QualifiedName:
 
 
 def _name(part: str, name: str) -> str:
-    """Qualified name; whatever no local name may hold is written as %XX."""
+    """Return a qualified name; characters that a local name cannot contain are written as %XX."""
     return f"{part}:{quote(name, safe='') or '_'}"
 
 

@@ -24,7 +24,7 @@ from orthoflow.foreign_text import csv_text
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.deliverables import write_walls_json
 
-# As of fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
+# As for fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
 _ROUNDING: Final = 1e-6
 _UNITLESS: Final = ("1", "yes/no")
 _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
@@ -38,14 +38,14 @@ class MetricRow:
         cell: address of the cell.
         step: name of its step.
         method: method id.
-        metric: name, with its unit at the end where it has one.
+        metric: name, ending in its unit if it has one.
         value: finite number.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        label: what its method calls it; empty where it declares nothing.
+        label: label declared by its method; empty without one.
         better: which values are better, `lower`, `higher` or `one`; empty where none are.
-        description: what else to know of it.
-        headline: it is one of the numbers that say how good a result is.
-        counted_by: metric of the same step that says how many items it sums up.
+        description: further explanation.
+        headline: it is one of the numbers that state how good a result is.
+        counted_by: metric of the same step with the number of items it summarises.
     """
 
     cell: str
@@ -62,12 +62,12 @@ class MetricRow:
 
     @property
     def title(self) -> str:
-        """Its label; its name where its method declares none."""
+        """Its label; its name if its method declares none."""
         return self.label or self.metric
 
     @property
     def titled(self) -> str:
-        """Its title with the unit; counts, shares and what is yes or no stand alone."""
+        """Its title with the unit; counts, shares and yes/no have none."""
         return self.title if self.unit in _UNITLESS else f"{self.title} / {self.unit}"
 
 
@@ -97,10 +97,10 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
 
 
 def is_rounding(left: float, right: float) -> bool:
-    """Whether two values of a metric are equal or differ by what libraries round.
+    """Whether two values of a metric are equal or differ by rounding only.
 
-    By a millionth of the larger one that is, or by a millionth where that is below 1; counts are
-    never rounded.
+    That is by a millionth of the larger one, or by a millionth if it is below 1; counts are never
+    rounded.
 
     >>> is_rounding(0.84536087, 0.84536104), is_rounding(1.0, 1.00001), is_rounding(3e7, 3e7 + 1)
     (True, False, False)
@@ -112,7 +112,7 @@ def is_rounding(left: float, right: float) -> bool:
 
 
 def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
-    """Write rows with a header; numbers with every digit that they have."""
+    """Write rows with a header; numbers with all digits."""
     text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
     path.write_text(text, encoding="utf-8", newline="")
 
@@ -127,27 +127,27 @@ def publish_products(
     files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
     run_id: str,
 ) -> tuple[PublishedFile, ...]:
-    """Fill `products/` of a run folder; an older one, left by an interrupted run, is replaced.
+    """Fill `products/` of a run folder; an older one of an interrupted run is replaced.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
-        files_of: address -> output port -> files in the store, and the SHA-256 that each must have.
-        run_id: goes into the names of the coordinate systems of walls.
+        files_of: address -> output port -> files in the store, and the required SHA-256 of each.
+        run_id: is inserted into the names of the coordinate systems of walls.
 
     Returns:
-        What is there now, sorted by path.
+        The present files, sorted by path.
 
     Raises:
-        StoreError: a file cannot be copied, e.g. because the disk is full, or is not what it must
-            be.
+        StoreError: a file cannot be copied, e.g. because the disk is full, or differs from its
+            digest.
     """
     target = run_folder / PRODUCTS_FOLDER
     cells = tuple(cells)
     with writing_to(target):
         if target.is_symlink():
             target.unlink()
-        # What cannot be removed would be published as part of this run.
+        # A file that cannot be removed would be published as part of this run.
         with suppress(FileNotFoundError):
             shutil.rmtree(target)
         target.mkdir(parents=True, exist_ok=True)
@@ -182,10 +182,10 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
 
 
 def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
-    """Outputs, `address.port`, that a later cell takes and gives another of the same type for.
+    """Return outputs, `address.port`, that a later cell replaces by one of the same type.
 
-    Beside its successor, as planes whose sides are found anew, the first would contradict it. What
-    was read from files stays.
+    Beside its successor, e.g. planes whose sides were found later, the first would contradict it.
+    Products read from files stay.
     """
     made = {
         cell.address
@@ -210,7 +210,7 @@ def _publish_cell(
     files_of: Mapping[str, Mapping[Path, str]],
     run_id: str,
 ) -> None:
-    """Copy the files of a cell, by port, and name the run in them."""
+    """Copy the files of a cell, by port, and insert the run's name."""
     folder.mkdir()
     taken = [METRICS_FILE]
     for port, files in files_of.items():
@@ -220,7 +220,7 @@ def _publish_cell(
             names = (f"{mark}{file.name}" for mark in marks)
             name = next(name for name in names if not colliding([*taken, name]))
             taken.append(name)
-            # A copy, not a hard link: who edits a product must not change the store.
+            # A copy, not a hard link: editing a product must not change the store.
             copy = path_below(folder, name)
             shutil.copyfile(file, copy)
             if (found := file_sha256(copy)) != sha256:
@@ -230,9 +230,9 @@ def _publish_cell(
 
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
-    """Files of one cell below `products/`, wall 2 before wall 10; empty when there are none.
+    """Return files of one cell below `products/`, wall 2 before wall 10; empty without any.
 
-    Links are left out, whatever they lead to.
+    Links are ignored, whatever their target.
     """
     inside = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}"
     names = sorted(files_below(run_folder, inside), key=_by_number)
@@ -240,5 +240,5 @@ def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
 
 
 def _by_number(name: str) -> tuple[tuple[str, int], ...]:
-    """Sort key that takes numbers in a name as numbers."""
+    """Return a sort key that treats numbers in a name as numbers."""
     return tuple((text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name))

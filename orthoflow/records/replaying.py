@@ -1,4 +1,4 @@
-"""Replay: a recorded run planned again from its record alone, after everything was checked."""
+"""Replay: a recorded run planned again from its record alone, after all checks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 
 
 class UnreplayableRunError(RecordError):
-    """A run cannot be replayed as it was; `problems` says why, a sentence each."""
+    """A run cannot be replayed unchanged; `problems` has the reasons, a sentence each."""
 
     def __init__(self, problems: tuple[str, ...]) -> None:
         self.problems = problems
@@ -65,13 +65,13 @@ class MissingMethodsError(PluginError):
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """A replay that can start.
+    """A replay that is ready to start.
 
     Attributes:
-        workflow: of the record, for the record of the replay.
+        workflow: from the record, for the record of the replay.
         plan: its cells with the parameters and seeds as recorded.
-        notes: what is not as it was and may change results: code, libraries, Python, processor.
-        changed_methods: methods whose code is not that of the record, though its version is.
+        notes: changes that may affect results: code, libraries, Python, processor.
+        changed_methods: methods with different code but the same version as in the record.
         is_embedded: the record has the arrays of every product and all input files.
     """
 
@@ -92,23 +92,23 @@ def plan_replay(
     laid_out: LaidOutInputs | None = None,
     earlier: Sequence[Store] = (),
 ) -> Replay:
-    """Check that a run can be made again, and plan it. Nothing is computed.
+    """Check that a run can be repeated, and plan it. Nothing is computed.
 
     Args:
         run: the run.
         catalog: the installed plugins.
         store: where the replay keeps its results.
         options: of the replay.
-        inputs: `NAME=PATH`, each as behind `--input`.
-        laid_out: the files that lay in the record, and those that now have other names, see
-            `embedded_inputs`; without it the files must have their names.
-        earlier: stores that may remember where input files lay.
+        inputs: `NAME=PATH`, each as after `--input`.
+        laid_out: the files from the record, and those with other names now, see `embedded_inputs`;
+            without it the files must have their names.
+        earlier: stores that may have noted positions of input files.
 
     Raises:
         UnreplayableRunError: the record was changed, a method has another result version or takes
             other parameters, or an input file was changed.
-        MissingInputsError: nothing of that, but input files are not to be found.
-        MissingMethodsError: nothing is wrong but that methods or product types are not installed.
+        MissingInputsError: only input files are missing.
+        MissingMethodsError: only methods or product types are missing.
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
@@ -191,7 +191,7 @@ def _variant(cell: RecordedCell, workflow: Workflow) -> StepVariant | None:
 
 
 def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Workflow:
-    """Name the files that were found; inputs without files were not given then either."""
+    """Name the files that were found; inputs without files had none originally."""
     specs = {
         name: dataclasses.replace(
             spec,
@@ -204,7 +204,7 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
 
 
 def _inconsistencies(run: Run) -> Iterator[str]:
-    """Find cells that say something else than the key that they were computed under."""
+    """Find cells that contradict the key under which they were computed."""
     files = {f"inputs.{entry.name}": input_digest(entry.files) for entry in run.record.inputs}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -229,14 +229,14 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
-    """Find inputs of cells that neither an input of the run nor a cell before theirs gives."""
+    """Find inputs of cells that neither an input of the run nor an earlier cell gives."""
     inputs = {entry.name for entry in run.record.inputs}
     given: dict[str, set[str]] = {}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
             owner, _, name = product.source.rpartition(".")
             is_there = name in inputs if owner == "inputs" else owner in given
-            # What a skipped cell lacks may be just this.
+            # This may be what a skipped cell lacks.
             if is_there and owner != "inputs" and cell.status != "skipped":
                 is_there = name in given[owner]
             if not is_there:
@@ -246,7 +246,7 @@ def _loose_ends(run: Run) -> Iterator[str]:
 
 @dataclass(kw_only=True)
 class _MethodCheck:
-    """Compares the recorded methods with the installed ones; each problem is said once."""
+    """Compares the recorded methods with the installed ones; each problem is reported once."""
 
     catalog: Catalog
     missing: list[str] = field(default_factory=list)
@@ -260,7 +260,7 @@ class _MethodCheck:
             cls = self.catalog.method(cell.method).load()
             for product in cell.outputs.values():
                 found = self.catalog.product_class(product.type_name).encoding_version
-                # Older encodings are read; a newer one is of a later version of the type.
+                # Older encodings are read; a newer one belongs to a later version of the type.
                 if found < product.encoding_version:
                     _add(
                         self.others,
@@ -309,7 +309,7 @@ def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
         params=recorded.params,
         params_set=recorded.params_set,
         inputs={port: _source(product.source) for port, product in recorded.inputs.items()},
-        # A method without a seed is given a generator all the same, and does not use it.
+        # A method without a seed gets a generator all the same, and does not use it.
         seed=recorded.seed or 0,
         cores=variant.cores if variant else None,
         timeout_s=variant.timeout_s if variant else None,
@@ -376,13 +376,13 @@ class ReplayedMetric:
     Attributes:
         cell: address of its cell.
         metric: its name.
-        recorded: what the record states, None when nothing.
-        recorded_unit: in which unit.
-        replayed: what the replay computed, None when nothing.
-        replayed_unit: in which unit.
-        verdict: `same` bits; within `rounding`; moved with `products` of its step that are not the
-            same bits, though within their tolerance or not measured; `not in the record`; of a
-            step behind which a method's `code changed`; else `different`.
+        recorded: value in the record, None without one.
+        recorded_unit: its unit.
+        replayed: value of the replay, None without one.
+        replayed_unit: its unit.
+        verdict: `same` bits; within `rounding`; changed with `products` of its step that do not
+            have the same bits, though within their tolerance or not measured; `not in the record`;
+            of a step with a method whose `code changed`; else `different`.
     """
 
     cell: str
@@ -405,8 +405,8 @@ def replayed_metrics(
     Args:
         original: the run that was replayed.
         made: the replay.
-        distances: of all their products.
-        changed_methods: ids of the methods whose code is not that of the record.
+        distances: differences of all their products.
+        changed_methods: ids of the methods with different code than in the record.
     """
     identical = {f"{item.cell}.{item.port}" for item in distances if item.verdict == "identical"}
     is_changed = {

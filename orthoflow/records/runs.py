@@ -1,4 +1,4 @@
-"""The read API: a finished run as Python objects, its files, and its inputs where they lie now."""
+"""The read API: a finished run as Python objects, its files, and its inputs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from orthoflow.sdk.lines import one_line
 
 REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"
-_AWAY: Final = "; take another copy of it, `orthoflow verify` says whether that one is whole"
+_AWAY: Final = "; use another copy, and check it with `orthoflow verify`"
 FIGURES_FOLDER: Final = "figures"
 GRAPH_FILE: Final = "graph.svg"
 # Of a run on several datasets, a page for each.
@@ -71,13 +71,12 @@ class Run:
     Attributes:
         path: the record file.
         record: everything the record says except the products' arrays.
-        output: reads an output by address and port from the record that is held open; None where
-            it is opened for it.
-        files_folder: what stands for the folder of the record, where its files lie elsewhere.
-        home: the run folder of a run that is not finished, whose record lies elsewhere.
-        content_sha256: the digest that seals the record; empty where it was not read from a file.
-        later_name: name that the record file gets once all beside it is written; empty where it has
-            its name.
+        output: reads an output by address and port from the open record; None to open it for each.
+        files_folder: replaces the folder of the record if its files are elsewhere.
+        home: the run folder of an unfinished run, whose record is elsewhere.
+        content_sha256: the digest that seals the record; empty if it was not read from a file.
+        later_name: final name of the record file, once everything beside it is written; empty if it
+            has it already.
     """
 
     path: Path
@@ -90,14 +89,14 @@ class Run:
 
     @property
     def file_name(self) -> str:
-        """What the record file is called in what is read of the run afterwards, such as a page."""
+        """The name of the record file in documents about the run, such as a page."""
         return self.later_name or self.path.name
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
-        """Return the run with its record held open, for whoever reads often.
+        """Return the run with its record held open, for frequent reading.
 
-        To open a record is to look at all of it: once for each of many datasets would be too often.
+        Opening a record checks all of it, which would take too long for each of many datasets.
 
         Raises:
             RecordError: the record is damaged, or gone.
@@ -109,12 +108,12 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """The folder the record lies in, with `products/` and the report beside it."""
+        """The folder of the record, with `products/` and the report beside it."""
         return self.files_folder or self.path.parent
 
     @property
     def home_folder(self) -> Path:
-        """The folder that what is made of the run goes to."""
+        """The folder for files derived from the run."""
         return self.home or self.folder
 
     @cached_property
@@ -139,10 +138,10 @@ class Run:
         return self.cells[address]
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
-        """Return a cell and all that it comes from, the nearest first."""
+        """Return a cell and all cells it depends on, the nearest first."""
         waiting, seen = [address], {address}
         for name in waiting:
-            # Grows while it is walked.
+            # Grows during iteration.
             yield self.cells[name]
             for given in self.cells[name].inputs.values():
                 before = given.source.rpartition(".")[0]
@@ -157,7 +156,7 @@ class Run:
         return shown(f"<Run {said}>")
 
     def with_failure(self, sentence: str) -> str:
-        """Add to what is said of a run which step failed first and why, if one did."""
+        """Append to a sentence about a run which step failed first and why, if one did."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed:
             return sentence
@@ -166,7 +165,7 @@ class Run:
         return f"{sentence}; {failed[0].address} failed{more}: {why}"
 
     def metric_rows(self) -> tuple[MetricRow, ...]:
-        """Every number of every cell, those that the engine measured included."""
+        """Return every number of every cell, including those measured by the engine."""
         return tuple(row for cell in self.record.cells for row in cell_metrics(cell))
 
     def figure(self, address: str, name: str) -> RecordedFigure:
@@ -193,12 +192,12 @@ class Run:
         return next(self.payloads([(address, port)]))
 
     def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
-        """Return outputs, each an address and a port, one after the other; opens the record once.
+        """Yield outputs, each an address and a port, one after the other; opens the record once.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell no such output.
             RecordError: the record holds only the digest of an output, is damaged, or has an output
-                that is not what its digest says.
+                that does not match its digest.
         """
         for address, port in places:
             self._check_embedded(address, port)
@@ -259,7 +258,7 @@ class Run:
 
     @property
     def orthoimages(self) -> tuple[Path, ...]:
-        """The orthoimages among the published files, in the order of the graph."""
+        """Return the orthoimages among the published files, in the order of the graph."""
         return tuple(
             file
             for files in self.files.values()
@@ -274,11 +273,11 @@ class Run:
 
 
 def read_run(path: Path, *, later_name: str = "") -> Run:
-    """Read a record file, whatever it is called.
+    """Read a record file of any name.
 
     Args:
         path: the file.
-        later_name: as of `Run`.
+        later_name: see `Run`.
 
     Raises:
         RecordError: the record is damaged, no record at all, or of another format.
@@ -293,7 +292,7 @@ def read_run(path: Path, *, later_name: str = "") -> Run:
 
 
 def find_record(path: str | Path) -> Path:
-    """Return the record file of a run folder; a file stands for itself.
+    """Return the record file of a run folder; a file is returned unchanged.
 
     Raises:
         ArgumentError: nothing is there, or the folder holds no finished run.
@@ -305,10 +304,10 @@ def find_record(path: str | Path) -> Path:
             return inside
         if is_running(given):
             raise ArgumentError(
-                f"{given} holds no {RECORD_FILE} yet: its run is under way; wait for its end"
+                f"{given} holds no {RECORD_FILE} yet: its run has not ended yet; wait for it"
             )
         raise ArgumentError(
-            f"{given} holds no {RECORD_FILE}: it is no run folder, or its run was not finished; "
+            f"{given} holds no {RECORD_FILE}: it is not a run folder, or its run was not finished; "
             f"repeat the run with -o {given} to finish it"
         )
     if not given.exists():
@@ -322,10 +321,10 @@ def find_record(path: str | Path) -> Path:
 
 @contextmanager
 def record_errors(path: Path) -> Iterator[None]:
-    """Turn whatever goes wrong while reading a record into one sentence.
+    """Convert any error while reading a record into one sentence.
 
     Raises:
-        RecordError: in place of every error but orthoflow's own and missing permission.
+        RecordError: instead of every error except orthoflow's own and missing permission.
     """
     try:
         yield
@@ -337,14 +336,14 @@ def record_errors(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        # h5py reports damage with any of these, depending on which structure is hit.
+        # h5py reports damage with any of these, depending on the affected structure.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
-            raise ArgumentError(f"{path} is no file; give a run folder or its run.h5") from error
-        raise RecordError(f"{path} is no record or is damaged: {error}{_AWAY}") from error
+            raise ArgumentError(f"{path} is not a file; give a run folder or its run.h5") from error
+        raise RecordError(f"{path} is not a record or is damaged: {error}{_AWAY}") from error
 
 
 def _with_path(path: Path, sentence: str) -> str:
-    """Name the file as the user did; the format's own sentences begin with its bare name."""
+    """Name the file as the user did; sentences of the format begin with its bare name."""
     if sentence.startswith(path.name):
         return f"{path}{sentence.removeprefix(path.name)}"
     return f"{path}: {sentence}"
@@ -354,10 +353,10 @@ _ALWAYS_COPIED_BYTES: Final = 64 << 20
 
 
 def path_inside(folder: Path, name: str) -> Path:
-    """Make the path of a file that is called after something in a record.
+    """Return the path of a file named after something in a record.
 
     Raises:
-        RecordError: no file can be called so.
+        RecordError: no file can have this name.
     """
     try:
         return path_below(folder, name)
@@ -366,7 +365,7 @@ def path_inside(folder: Path, name: str) -> Path:
 
 
 def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFigure]:
-    """Name the files of the figures of cells: path below a folder -> figure.
+    """Return names of the files of figures of cells: path below a folder -> figure.
 
     Raises:
         RecordError: a cell or a figure has a name or a type that no file can have.
@@ -387,17 +386,18 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
 
 
 def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]) -> int:
-    """Write files below a folder, through no link; a file of that name is replaced.
+    """Write files below a folder, without following links; existing files are replaced.
 
     Args:
         folder: made when missing.
-        contents: path below it -> what gives the bytes, called in threads; None for no file.
+        contents: path below it -> function that returns the bytes, called in threads; None for no
+            file.
 
     Returns:
         How many were written.
 
     Raises:
-        StoreError: the disk refuses, or a link stands in the way.
+        StoreError: the disk cannot be written, or a link is in the way.
     """
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -417,21 +417,20 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
 def copy_files(
     source: Path, target: Path, paths: Iterable[str], published: Iterable[PublishedFile]
 ) -> tuple[str, ...]:
-    """Copy regular files that lie below one folder to below another.
+    """Copy regular files from below one folder to below another.
 
     Args:
-        source: the folder that they lie below.
+        source: the source folder.
         target: existing folder.
         paths: below both.
-        published: what the record says of those that it names.
+        published: the record's statement about those that it names.
 
     Returns:
-        Those that were there.
+        Those that exist.
 
     Raises:
-        RecordError: a link or a device stands in the place of a file, or it is not what the
-            record says.
-        StoreError: the disk refuses.
+        RecordError: a link or a device replaces a file, or it differs from the record.
+        StoreError: the disk cannot be written.
     """
     copied: list[str] = []
     known = {file.path: file for file in published}
@@ -457,7 +456,7 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
     """Write one file below a folder; it gets its name when it is complete.
 
     Raises:
-        StoreError: the disk refuses, or a link stands in the way.
+        StoreError: the disk cannot be written, or a link is in the way.
     """
     try:
         with writing_to(folder), create_below(folder, path) as stream:
@@ -480,7 +479,7 @@ def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | Non
             f"{path} has {found.st_size} bytes, but was published with {expected.size_bytes}: it "
             "was changed"
         )
-    # A hole of a terabyte would fill the disk.
+    # A sparse file of a terabyte would fill the disk.
     if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:
         raise RecordError(f"{path} says it has {found.st_size} bytes, but most of it is a hole")
 
@@ -491,6 +490,6 @@ def _suffix(run: Run, figure: RecordedFigure) -> str:
             f"{run.path}: the figure {figure.name!r} must be {', '.join(FIGURE_SUFFIXES)}, got "
             f"{figure.media_type!r}"
         )
-    # What papers and word processors take.
+    # Format for papers and word processors.
     shown = "image/png" if figure.media_type == "image/webp" else figure.media_type
     return FIGURE_SUFFIXES[shown]

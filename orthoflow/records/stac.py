@@ -25,7 +25,7 @@ _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _GEOTIFF: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _ORTHO: Final = "_ortho.tif"
-# Beside an orthoimage, by the end of its name: key, media type, roles.
+# Files beside an orthoimage, by the end of its name: key, media type, roles.
 _BESIDE: Final = {
     "_ortho.tif": ("image", _GEOTIFF, ["data"]),
     "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
@@ -33,7 +33,7 @@ _BESIDE: Final = {
     "_ortho.json": ("placing", "application/json", ["metadata"]),
 }
 _EVERYWHERE: Final = (-180.0, -90.0, 180.0, 90.0)
-# Sizes that sha2-256 has in a multihash: its code and 32 bytes.
+# Prefix of sha2-256 in a multihash: its code and 32 bytes.
 _MULTIHASH: Final = "1220"
 
 
@@ -44,7 +44,7 @@ class _Ortho:
     Attributes:
         path: below the folder of the export.
         address: of the cell that made it.
-        place: where it lies.
+        place: its position.
     """
 
     path: PurePosixPath
@@ -53,12 +53,12 @@ class _Ortho:
 
     @property
     def item_path(self) -> PurePosixPath:
-        """The file of its item; `wall_0_ortho.json` says already where the wall is."""
+        """The file of its item; `wall_0_ortho.json` already states where the wall is."""
         return self.path.with_name(f"{self.path.stem}.item.json")
 
 
 def write_stac(run: Run, folder: Path) -> int:
-    """Copy the orthoimages of a run and write items and a collection; gives how many there are.
+    """Copy the orthoimages of a run and write items and a collection; return their number.
 
     Args:
         run: the run, with its published files.
@@ -66,8 +66,8 @@ def write_stac(run: Run, folder: Path) -> int:
 
     Raises:
         ArgumentError: the run published no orthoimage, or they are gone.
-        RecordError: a published file is not what it was.
-        StoreError: the disk refuses.
+        RecordError: a published file was changed.
+        StoreError: the disk cannot be written.
     """
     inside = {
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address

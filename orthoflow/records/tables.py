@@ -1,4 +1,4 @@
-"""Records as tables: CSV, several records joined, diagnostics as JSON, points that all found."""
+"""Records as tables: CSV, several records joined, diagnostics as JSON, common points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonPoints:
-    """What one cell's inspection gives over the points that all cells beside it found.
+    """Statistics of one cell's inspection over the points that all comparable cells found.
 
     Attributes:
         cell: address of the inspection.
@@ -54,14 +54,14 @@ class CommonPoints:
 
     @property
     def n_lost(self) -> int:
-        """Points of this cell that do not count, because another cell did not find them."""
+        """Points of this cell that are not counted, because another cell did not find them."""
         return self.n_found - self.n_common
 
 
 def common_points(run: Run) -> tuple[CommonPoints, ...]:
     """Compare the inspections of each step over common points, per dataset, seed and repeat.
 
-    Inspections that share no point, such as those that match features, give no rows; neither do
+    Inspections without common points, such as those that match features, give no rows; neither do
     those whose products are not in the record.
 
     Raises:
@@ -88,8 +88,8 @@ def over_common_points(
     """Yield rows of all inspections over the points that each of them found, class by class.
 
     Args:
-        inspections: address of the cell -> what it found; points are the same where their
-            coordinates and their class are.
+        inspections: address of the cell -> its points; points are the same if their coordinates and
+            their class are.
         step: of the cells.
     """
     places = {cell: _rows_of_points(found) for cell, found in inspections.items()}
@@ -129,15 +129,15 @@ Row: TypeAlias = Sequence[Value]
 
 
 def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
-    """Write the tables of a run, each with a header; numbers with every digit that they have.
+    """Write the tables of a run, each with a header; numbers with all digits.
 
     Args:
         run: the run.
         folder: existing folder.
 
     Returns:
-        The files: cells, metrics, parameters, inputs, products, environments, and where cells of a
-        comparison found the same check points, what each gives over those that all found.
+        The files: cells, metrics, parameters, inputs, products, environments, and if cells of a
+        comparison found the same check points, the statistics of each over the common ones.
     """
     tables = {
         "cells.csv": _cells(run.record),
@@ -209,7 +209,7 @@ def _environments(record: RunRecord) -> Iterator[Row]:
             yield (entry.id, package, version)
 
 
-# What a step calls: its method and, as JSON, the parameters.
+# The call of a step: its method and, as JSON, the parameters.
 Choice: TypeAlias = tuple[str, str]
 
 _BEHIND: Final = ("unit", "better", "step", "cell", "repeat", "runs", "environments")
@@ -222,8 +222,8 @@ class JoinedCell:
 
     Attributes:
         found: run and cell, in the order of the runs.
-        choices: step that varies -> what it calls on the way to this cell.
-        dataset: name; empty where the run has but one.
+        choices: step that varies -> its call for this cell.
+        dataset: name; empty if the run has only one.
         seed: of the workflow, or as swept.
     """
 
@@ -255,12 +255,12 @@ class JoinedCell:
 class RunSet:
     """Several runs whose cells are one table.
 
-    Cells are the same where method, result version, parameters, seed and repeat, and those of all
-    cells behind them, down to the bytes of the input files, are the same, whatever variants, inputs
-    and datasets are called. What a variant is called comes from the first record that has it.
+    Cells are the same if method, result version, parameters, seed and repeat, and those of all
+    cells before them, down to the bytes of the input files, are the same, whatever the names of
+    variants, inputs and datasets. The name of a variant comes from the first record that has it.
 
     Attributes:
-        runs: in the order in which they were given.
+        runs: in the given order.
     """
 
     runs: tuple[Run, ...]
@@ -277,7 +277,7 @@ class RunSet:
 
     @cached_property
     def cells(self) -> tuple[JoinedCell, ...]:
-        """Each cell once that came to a result in any of the runs."""
+        """Yield each cell once that has a result in any of the runs."""
         found: dict[str, list[tuple[Run, RecordedCell]]] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -342,7 +342,7 @@ class RunSet:
 
     @cached_property
     def _variant_names(self) -> dict[tuple[str, Choice], str]:
-        """What each choice of a step is called; one name for several gets their parameters."""
+        """Name of each choice of a step; one name for several is completed by their parameters."""
         first: dict[tuple[str, Choice], str] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -374,7 +374,7 @@ class RunSet:
         known = self._identities.get((run.path, cell.address))
         if known is not None:
             return known
-        # Against records that lead round in a circle: no cell is behind itself.
+        # Against circular records: no cell depends on itself.
         self._identities[run.path, cell.address] = ""
         inputs: dict[str, JsonValue] = {}
         for port, given in cell.inputs.items():
@@ -416,7 +416,7 @@ def _choice(cell: RecordedCell) -> Choice:
 
 
 def _told_apart(choice: Choice, others: Sequence[Choice]) -> str:
-    """Return in what a choice differs from others of its name; empty where there are none."""
+    """Return how a choice differs from others of its name; empty if there are none."""
     if len(set(others)) < 2:
         return ""
     params = json.loads(choice[1])
@@ -440,7 +440,7 @@ _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 def diagnostics_of(cell: CellOutcome, step: str, address: str) -> Iterator[dict[str, JsonValue]]:
-    """Return what a cell reported, and why it failed where it did.
+    """Return diagnostics of a cell, and why it failed.
 
     The code of a failure is the class of its error in lower case: `InputError` is `input-error`.
     """

@@ -1,7 +1,7 @@
-"""A run that goes on, or was broken off, as far as it is: from its outline, journal and store.
+"""A running or interrupted run, as far as it has results: from its outline, journal and store.
 
 The outline is written when a run begins: the record of a run in which nothing was computed yet.
-What the journal says has ended since comes from the store.
+Cells that ended since, according to the journal, come from the store.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ OUTLINE_FILE: Final = ".outline.json"
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run; one that goes on or was broken off as far as it is.
+    """Open a run; a running or interrupted one as far as it has results.
 
     Args:
         path: a run folder, or the `run.h5` in it.
@@ -74,17 +74,17 @@ def write_outline(
     sources: Mapping[str, Mapping[str, str]],
     embedded: Collection[str],
 ) -> None:
-    """Keep what a run is about to compute, for whoever looks at it before it is finished.
+    """Keep what a run is about to compute, so that it can be shown before it is finished.
 
     Args:
         record: of the run, with every cell skipped.
         run_folder: existing folder.
         store: where its results go.
-        sources: address -> input port -> where it comes from.
+        sources: address -> input port -> its source.
         embedded: product types whose arrays go into a record.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     content = {
         "store": str(store.folder.absolute()),
@@ -102,14 +102,14 @@ def has_outline(folder: Path) -> bool:
 
 
 def open_unfinished(folder: Path) -> Run:
-    """Open a run that is not finished; what has no result yet is skipped in it.
+    """Open an unfinished run; cells without a result yet are skipped in it.
 
-    Its record lies in a folder that vanishes with this process, as do its published files where the
+    Its record is in a folder that is removed with this process, as are its published files if the
     run folder does not have them. The run folder is not written to.
 
     Raises:
-        ArgumentError: its outline or its store are gone or cannot be read.
-        StoreError: the disk refuses.
+        ArgumentError: its outline or its store is missing or unreadable.
+        StoreError: the disk cannot be written.
     """
     from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run
 
@@ -131,7 +131,7 @@ def open_unfinished(folder: Path) -> Run:
     began = next((line for line in lines if isinstance(line, RunBegan)), None)
     record = dataclasses.replace(
         record,
-        # One that was gone on with keeps its first id.
+        # A resumed run keeps its first id.
         run_id=began.run_id if began else record.run_id,
         started=began.time if began else record.started,
         ended=lines[-1].time if lines else record.ended,
@@ -159,7 +159,7 @@ def open_unfinished(folder: Path) -> Run:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)
     except RecordFormatError as error:
         raise StoreError(f"the record of {folder} cannot be assembled: {error}") from error
-    # A run that was broken off has left them; one that goes on is not touched.
+    # An interrupted run has left them; a running one is not touched.
     is_there = all(published_state(folder, file) == "same" for file in published)
     return dataclasses.replace(
         read_run(path), files_folder=folder if is_there else aside, home=folder
@@ -173,7 +173,7 @@ def _environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironmen
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Filled:
-    """A cell of the outline, and what its result is recorded with."""
+    """A cell of the outline, and the data to record with its result."""
 
     cell: RecordedCell
     sources: Mapping[str, str]
@@ -181,7 +181,7 @@ class _Filled:
     is_cached: bool
 
     def with_result(self, result: CellResult | None, store: Store) -> RecordedCell:
-        """Return the cell as it is recorded with a result; as it is without one."""
+        """Return the cell as recorded with a result; unchanged without one."""
         if result is None:
             return self.cell
         return dataclasses.replace(

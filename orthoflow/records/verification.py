@@ -1,4 +1,4 @@
-"""Verification of a record and its files, and signatures: who vouches for a record."""
+"""Verification of a record and its files, and signatures of records."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ _LARGEST_BYTES: Final = 64 << 10
 
 @dataclass(frozen=True, kw_only=True)
 class Signature:
-    """What a signature file says; nothing of it is true before it was checked.
+    """The content of a signature file, untrusted until it was checked.
 
     Attributes:
         content_sha256: content digest of the record that was signed.
-        public_key: of the signer, as OpenSSH writes it: `ssh-ed25519 ...`.
+        public_key: key of the signer in OpenSSH format: `ssh-ed25519 ...`.
         signature: 64 bytes.
     """
 
@@ -73,23 +73,23 @@ class Signature:
 
     @property
     def fingerprint(self) -> str:
-        """Name of the key, as `ssh-keygen -l` gives it."""
+        """Fingerprint of the key, as printed by `ssh-keygen -l`."""
         return _fingerprint(self.public_key)
 
 
 def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Signature:
-    """Sign the seal of a record that was verified, into a file beside it.
+    """Sign the seal of a verified record, into a file beside it.
 
     Args:
         path: the record file.
         key_file: private Ed25519 key, OpenSSH or PEM.
-        password: asked for when the key is protected.
+        password: called if the key is protected.
 
     Raises:
-        InputError: the file is no such key, or the password does not open it.
-        ArgumentError: a signature of another key lies beside the record.
+        InputError: the file is not such a key, or the password is wrong.
+        ArgumentError: a signature of another key is beside the record.
         RecordError: the record is damaged.
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
         PluginError: the library cryptography is missing.
     """
     key = _private_key(key_file, password)
@@ -119,10 +119,10 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
 
 
 def read_signature(record: Path) -> Signature | None:
-    """Read the signature beside a record, unchecked; None when there is none.
+    """Read the signature beside a record, unchecked; None without one.
 
     Raises:
-        RecordError: what stands there is no signature.
+        RecordError: the file is not a signature.
     """
     name = f"{record.name}{SIGNATURE_SUFFIX}"
     if not os.path.lexists(record.with_name(name)):
@@ -131,11 +131,11 @@ def read_signature(record: Path) -> Signature | None:
         with open_below(record.parent, name) as stream:
             return _parsed(stream.read(_LARGEST_BYTES))
     except (UnsafeFileError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise RecordError(f"{name} is no signature, or damaged: {error}") from error
+        raise RecordError(f"{name} is not a signature, or is damaged: {error}") from error
 
 
 def check_signature(record: Path, signer: Path) -> Signature:
-    """Return the signature of a record that was verified, if it is that of a signer.
+    """Return the signature of a verified record, if it is that of a signer.
 
     Args:
         record: the record file.
@@ -143,7 +143,7 @@ def check_signature(record: Path, signer: Path) -> Signature:
 
     Raises:
         RecordError: it is missing, another's, or does not fit the record.
-        InputError: the file is no such key.
+        InputError: the file is not such a key.
         PluginError: the library cryptography is missing.
     """
     key = _public_key(signer)
@@ -230,11 +230,11 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
         try:
             key = load(data, password=None)
         except TypeError:
-            # Protected; an empty password would be taken for none.
+            # Protected; an empty password would count as none.
             key = load(data, password=password().encode("utf-8") or b"\0")
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise InputError(
-            f"{path} is no private key in OpenSSH or PEM format, or the password is another one: "
+            f"{path} is not a private key in OpenSSH or PEM format, or the password is wrong: "
             f"{error}"
         ) from error
     if not isinstance(key, ed25519.Ed25519PrivateKey):
@@ -257,7 +257,7 @@ def _public_key(path: Path) -> Ed25519PublicKey:
         key = load(data)
     except (ValueError, UnsupportedAlgorithm) as error:
         raise InputError(
-            f"{path} is no public key in OpenSSH or PEM format: {error}; the signer's file ends "
+            f"{path} is not a public key in OpenSSH or PEM format: {error}; the signer's file ends "
             "with .pub"
         ) from error
     if not isinstance(key, ed25519.Ed25519PublicKey):
@@ -285,10 +285,10 @@ def _need_library() -> None:
         ) from error
 
 
-# What shows the record; its digests would have to be in it.
+# Pages that show the record; its digests would have to be in it.
 _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 
-# What a record contradicts itself in: it may have been written so.
+# Contradictions within a record: it may have been written like that.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # A crate has its description, two files of the workflow and one per environment.
 _UNCOVERED_MOST: Final = 8
@@ -321,28 +321,28 @@ class Note:
 
     @property
     def is_harmless(self) -> bool:
-        """Whether a strict check passes over it."""
+        """Whether a strict check ignores it."""
         return self.code == "uncovered"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """What a check of a record found.
+    """The result of checking a record.
 
     Attributes:
         path: the record file.
-        findings: one sentence per difference; empty when all is as it was written.
-        wrong: what the findings are of, in words; empty without any.
-        notes: what could not be checked, or is not of the record.
-        seal: the digest that seals the record, 64 hexadecimal digits, as sheets show it; empty
-            where the record itself is not as it was written.
+        findings: one sentence per difference; empty if nothing was changed.
+        wrong: subject of the findings, in words; empty without any.
+        notes: what could not be checked, or does not belong to the record.
+        seal: the digest that seals the record, 64 hexadecimal digits, as printed on sheets; empty
+            if the record itself was changed.
         n_named: products that the record names by their digests alone.
-        n_products: products whose arrays lie in the record and were compared with their digest.
-        n_inputs: input files that lie in the record and were compared with their digest.
-        n_published: files beside the record that are as they were published.
-        n_pages: report pages beside the record that show it and are as they were written.
-        signed_with: fingerprint of the key that the record is signed with, empty unless that was
-            asked for and is so.
+        n_products: products whose arrays are in the record and were compared with their digest.
+        n_inputs: input files that are in the record and were compared with their digest.
+        n_published: unchanged published files beside the record.
+        n_pages: unchanged report pages beside the record that show it.
+        signed_with: fingerprint of the key with which the record is signed, empty unless requested
+            and valid.
     """
 
     path: Path
@@ -363,16 +363,16 @@ def verify_run(
 ) -> Verification:
     """Check seal, digests, cache keys and required fields of a record, and the published files.
 
-    Published files that are not beside the record are a note: a record may travel alone.
+    Missing published files are a note, because a record may be passed on alone.
 
     Args:
         path: a run folder, or the `run.h5` in it.
-        also_published: check the files beside the record too.
+        also_published: also check the files beside the record.
         signer: public key that the record must be signed with.
 
     Raises:
         ArgumentError: nothing is there, or the folder holds no finished run.
-        InputError: `signer` is no public key.
+        InputError: `signer` is not a public key.
         PluginError: `signer` is given, and the library cryptography is missing.
     """
     record_path = find_record(path)
@@ -412,9 +412,9 @@ def verify_run(
 
 
 def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
-    """Compare the metrics of an inspection with the findings of the product that it gave.
+    """Compare the metrics of an inspection with the findings of its product.
 
-    A metric is a finding of one wall, of all together, or with the wall's number before its name.
+    A metric is a finding of one wall, of all together, or prefixed by the wall's number.
     """
     places = [
         port
@@ -441,7 +441,7 @@ def _payload(opened: OpenRecord, address: str, port: str) -> Payload:
 
 
 def sealed_page(text: str, runs: Sequence[Run]) -> str:
-    """Return a report page with the digests of the records that it shows and of its own text."""
+    """Return a report page with the digests of its records and of its own text."""
     digests = [run.content_sha256 for run in runs if run.content_sha256]
     sealed = f"{text}\n<!-- {_PAGE_MARK} {' '.join(digests)} "
     return f"{sealed}page {hashlib.sha256(sealed.encode('utf-8')).hexdigest()} -->\n"
@@ -454,7 +454,7 @@ def page_of(page: str, run: Run) -> str:
 
 
 def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
-    """Page beside a record -> whether it shows that record and is as it was written."""
+    """Return for pages beside a record whether they show that record and are unchanged."""
     names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
     names += [f"{PAGES_FOLDER}/{name}" for name in sorted(files_below(folder, PAGES_FOLDER))]
     return {name: _is_own_page(folder, name, content_sha256) for name in names}
@@ -483,14 +483,14 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return what of a record was changed since it was sealed; empty where nothing is found.
+    """Return what of a record was changed since it was sealed; empty if nothing was found.
 
-    The arrays of products and input files are not looked at, so that this costs little: whoever
-    reads those of a product compares their digest (`Run.payloads`), and `verify_run` looks at all.
+    The arrays of products and input files are not checked, so that this is fast: reading those of a
+    product compares their digest (`Run.payloads`), and `verify_run` checks all.
 
     Args:
         run: the run.
-        of_all: look at everything, for whoever hands on all of the record.
+        of_all: check everything, for passing on the whole record.
     """
     findings = verify_record(run.path, with_arrays=of_all)
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
@@ -500,7 +500,7 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
 
 
 def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck) -> str:
-    """Name what differs beside a record that is whole."""
+    """Report what differs beside an intact record."""
     wrong = [
         *(["its signature is not the one asked for"] if signature.findings else []),
         *(["published files beside it are not as they were written"] if check.changed else []),
@@ -509,7 +509,7 @@ def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck)
 
 
 def _check_signature(record: Path, signer: Path | None) -> Verification:
-    """What is to be said of the signature alone."""
+    """Return notes about the signature alone."""
     try:
         if signer is not None:
             found = check_signature(record, signer)
@@ -543,7 +543,7 @@ def _check_published(path: Path, record: RunRecord) -> _PublishedCheck:
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
     notes = [Note(code="missing", text=_missing_note(missing, len(checked)))] if missing else []
-    # A record that travels alone lies among files that are none of its own.
+    # A record that is passed on alone is among unrelated files.
     if len(missing) < len(checked) or not checked:
         foreign, others = _unnamed(path, record)
         if foreign:
@@ -561,11 +561,11 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
 
     Args:
         folder: of the run.
-        file: what the record says of it.
+        file: its entry in the record.
     """
     try:
         with open_below(folder, file.path) as stream:
-            # A sparse file of a terabyte is told by its size.
+            # A sparse file of a terabyte is recognised by its size.
             if os.fstat(stream.fileno()).st_size != file.size_bytes:
                 return "changed"
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -579,7 +579,7 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
 
 
 def require_unchanged(run: Run, *paths: Path) -> None:
-    """Refuse published files that are not as the record says: what is made of them would lie.
+    """Refuse published files that differ from the record: their derivatives would be wrong.
 
     Args:
         run: the run.
@@ -593,7 +593,7 @@ def require_unchanged(run: Run, *paths: Path) -> None:
         expected = known.get(path.relative_to(run.folder).as_posix())
         if expected is None:
             raise RecordError(
-                f"{path} is not named in the record of the run, so nothing vouches for it"
+                f"{path} is not named in the record of the run, so it cannot be checked"
             )
         state = published_state(run.folder, expected)
         if state == "changed":
@@ -606,7 +606,7 @@ def require_unchanged(run: Run, *paths: Path) -> None:
 
 
 def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
-    """Return what a record does not name: below `products/`, and beside it; sorted."""
+    """Return files that a record does not name: below `products/`, and beside it; sorted."""
     known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, JOURNAL, LOGS, *_VIEWS}
     _, folders, files = next(os.walk(path.parent), ("", [], []))
     named = {file.path for file in record.published}

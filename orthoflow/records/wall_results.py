@@ -1,4 +1,4 @@
-"""What a run gives of each wall by its published files, which are made anew where they lack."""
+"""The results of a run per wall from its published files, which are recreated if missing."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ _TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
 
 @contextmanager
 def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
-    """Return a run that has the rasters that it published.
+    """Return a run with the rasters that it published.
 
-    Those beside the record are taken. Where none of its files is there, they are made of the walls
-    and orthoimages that the record holds, in a folder that lasts as long as the block.
+    Those beside the record are used. If there are none, they are created from the walls and
+    orthoimages in the record, in a folder that exists as long as the block.
 
     Args:
         run: the run.
-        tell: takes a sentence, where files are made.
+        tell: called with a sentence if files are created.
 
     Raises:
         RecordError: the record is damaged.
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     published = run.record.published
     if not published or any((run.folder / file.path).exists() for file in published):
@@ -93,8 +93,8 @@ def _published(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
 
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
-# Of the accuracy that inspections found, what a drawing says: names of two numbers, the statement,
-# and which number says of how many of what it is.
+# Accuracy statements from inspections for drawings: names of two numbers, the statement, and the
+# number of items with its name.
 _ACCURACY: Final = (
     ("rmse_x_mm", "rmse_y_mm", "rmse", ("n_found", "n_pairs")),
     ("rmse_u_mm", "rmse_v_mm", "rmse", ()),
@@ -111,18 +111,18 @@ _COUNTED: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class WallResult:
-    """What a run gives of one wall.
+    """The results of a run for one wall.
 
     Attributes:
-        number: of the wall, as its files have it.
-        name: what the run calls it.
-        plane_index: its plane's place in `planes.json`, or None where nothing says it.
-        frame: where the largest of its rasters lies.
-        rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, those that are there.
-        accuracy: statements on the expected error of its orthoimage, its plane's noise, and what
-            inspections of this wall found; all by evidence on this wall alone.
-        colours: what was done to the colours of the photos; None without an orthoimage.
-        intensity_source: `laser`, or `luminance` where the grey of colours stands in for it.
+        number: number of the wall, as in its files.
+        name: name of the wall.
+        plane_index: its plane's place in `planes.json`, or None if unknown.
+        frame: frame of the largest of its rasters.
+        rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
+        accuracy: statements on the expected error of its orthoimage, its plane's noise, and the
+            inspections of this wall; all from evidence on this wall alone.
+        colours: how the colours of the photos were changed; None without an orthoimage.
+        intensity_source: `laser`, or `luminance` if the grey of colours is used instead.
     """
 
     number: int
@@ -137,11 +137,11 @@ class WallResult:
 
 @dataclass(frozen=True, kw_only=True)
 class UncountedPoints:
-    """Check points that a run was given, of which none counts.
+    """Check points of a run of which none is used.
 
     Attributes:
-        cell: address of the inspection that failed over them; empty where none looked for them.
-        sentence: the rest of a sentence on what was not measured, with the reason.
+        cell: address of the inspection that failed because of them; empty if none used them.
+        sentence: the end of a sentence about what was not measured, with the reason.
     """
 
     cell: str
@@ -150,15 +150,15 @@ class UncountedPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class RoomResults:
-    """What a run gives of a room.
+    """The results of a run for a room.
 
     Attributes:
-        address: cell that gave the pictures.
+        address: cell of the pictures.
         walls: those with a raster, by number.
-        planes: all planes, None where the record has none.
-        checkpoints: surveyed points, None without.
-        inspections: address -> displacements found in these pictures; its walls are numbers here.
-        openings: of these walls, by number, from the left.
+        planes: all planes, None if the record has none.
+        checkpoints: surveyed points, or None.
+        inspections: address -> displacements found in these pictures, with numbers of walls.
+        openings: openings of these walls, by number, from the left.
     """
 
     address: str
@@ -174,10 +174,10 @@ class RoomResults:
 
 
 def uncounted_points(run: Run) -> UncountedPoints | None:
-    """State why none of the check points counts that a run was given.
+    """Return why none of the check points of a run is used.
 
     Returns:
-        None where it was given none, and where an inspection has counted some.
+        None if it has none, or if an inspection has used some.
     """
     looking = [
         (cell, given.source)
@@ -185,7 +185,7 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         for given in cell.inputs.values()
         if given.type_name == CheckPoints.type_name
     ]
-    # Those of a simulated room were not given by anyone.
+    # Those of a simulated room were not given by a person.
     read = [name for name, cell in run.cells.items() if cell.method.startswith("read.")]
     sources = [source.rpartition(".")[0] for _, source in looking]
     place = _upstream_product(run, tuple(sources or read), CheckPoints.type_name)
@@ -201,18 +201,18 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
 
 
 def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> RoomResults:
-    """Gather what a run gives of its walls.
+    """Collect the results of a run for its walls.
 
     Args:
-        run: a finished run, whose published files are beside its record as it names them.
-        cell: address of the cell whose orthoimages, or else rasters of walls, are meant; without
-            it the last one that gave orthoimages, or else walls.
-        wall: number of the only wall that is wanted, so that no file of another is needed; all
-            where there is no such wall.
+        run: a finished run with the published files that its record names.
+        cell: address of the cell of the orthoimages, or else of rasters of walls; by default the
+            last one that gave orthoimages, or else walls.
+        wall: number of the only requested wall, so that no file of another is needed; all if there
+            is no such wall.
 
     Raises:
         ArgumentError: there is no such cell, or nothing to draw.
-        RecordError: a published file is not what the record says, or an orthoimage is gone.
+        RecordError: a published file differs from the record, or an orthoimage is missing.
     """
     address = _pictured(run, cell)
     _require_orthoimages(run, address, wall)
@@ -223,19 +223,19 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         for name in upstream
         if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}
     ]
-    # What lies behind is looked at first, so that what the chosen cell itself gave counts.
+    # Later cells are searched first, so that products of the chosen cell itself take precedence.
     for name in reversed(pictured):
         for path in published_files(run.folder, name):
             if found := _RASTER.fullmatch(path.name):
                 files.setdefault(int(found[1]), {})[found[2]] = path
     if not files:
         raise ArgumentError(
-            f"no rasters of walls lie beside {run.path}, below {run.products_folder}: give the "
-            "run folder as the run left it"
+            f"no rasters of walls lie beside {run.path}, below {run.products_folder}: pass the "
+            "unmodified run folder"
         )
     planes = _upstream_product(run, upstream, "planes")
     points = _upstream_product(run, (*upstream, *run.cells), "checkpoints")
-    # Rasters are made in the order of the planes, so places in `Walls` are places among them.
+    # Rasters are made in the order of the planes, so an index in `Walls` is an index among them.
     numbers = sorted(
         {number for name in pictured for number, kind in _rasters(run, name) if kind == "depth"}
     )
@@ -260,7 +260,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
 
 
 def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
-    """Rasters that a cell published, by wall and kind; below the folder of the run."""
+    """Return rasters published by a cell, by wall and kind; below the folder of the run."""
     folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
     return {
         (int(found[1]), found[2]): file.path
@@ -270,7 +270,7 @@ def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
 
 
 def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
-    """Refuse to go on without an orthoimage that was published: another raster would stand in."""
+    """Refuse to continue without a published orthoimage: another raster would replace it."""
     for (number, kind), path in _rasters(run, address).items():
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():
@@ -281,7 +281,7 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
 
 
 def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:
-    """Those that the last cell found on the walls behind the pictures."""
+    """Return those that the last cell found on the walls of the pictures."""
     walls = {
         output.digest
         for address in upstream
@@ -325,7 +325,7 @@ def _pictured(run: Run, cell: str | None) -> str:
 def _upstream_product(
     run: Run, addresses: tuple[str, ...], type_name: str
 ) -> tuple[str, str] | None:
-    """Address and port of the first product of a type that the record holds."""
+    """Return address and port of the first product of a type in the record."""
     for address in addresses:
         for port, output in run.cells[address].outputs.items():
             if output.type_name == type_name and output.embedded:
@@ -343,7 +343,7 @@ def _inspections(run: Run, address: str) -> Iterator[tuple[str, Inspection]]:
 
 
 def _numbered(inspection: Inspection, numbers: list[int]) -> Inspection:
-    """Return an inspection with numbers of walls in the place of places in `Walls`."""
+    """Return an inspection with numbers of walls instead of indices in `Walls`."""
     number_of = dict(enumerate(numbers))
     walls = [number_of.get(place, -1) for place in inspection.wall.tolist()]
     return replace(
@@ -391,7 +391,7 @@ def _wall_result(
 
 
 def _check_kind(kind: str, path: Path) -> None:
-    """Refuse a raster that does not hold what its name says."""
+    """Refuse a raster whose content does not match its name."""
     with RasterParts(path) as raster:
         found = (raster.bands, raster.dtype)
     wanted = ((3, "uint8"), (3, "uint16")) if kind == "ortho" else ((1, "float32"),)
@@ -403,7 +403,7 @@ def _check_kind(kind: str, path: Path) -> None:
 
 
 def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
-    """Add what inspections found, or that nothing says how exact an orthoimage is."""
+    """Add the findings of inspections, or that the accuracy of an orthoimage is unknown."""
     if not measured and "ortho" in wall.rasters:
         unmeasured = _unmeasured(run)
         is_stated = {"expected_error", "not_checked"} & {said.key for said in wall.accuracy}
@@ -440,7 +440,7 @@ def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> Iterat
 
 
 def _colours(run: Run, address: str) -> Phrase:
-    """What the record says was done to the colours of photos or of points."""
+    """Return how the colours of photos or of points were changed, according to the record."""
     cell = run.cells[address]
     whence = tuple(run.upstream(address))
     given = (one for before in whence for one in before.inputs.values())

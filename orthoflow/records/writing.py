@@ -1,4 +1,4 @@
-"""Writing a finished run: published products, then the record, whose name says it is complete."""
+"""Writing a finished run: published products, then the record, whose name marks completion."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
-NOT_YET: Final = "not computed yet: the run was broken off"
+NOT_YET: Final = "not computed yet: the run was interrupted"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +66,8 @@ class WrittenRun:
 
     Attributes:
         run: the finished run.
-        outcome: what the engine gave.
-        kept: addresses that the run folder had before, from an interrupted attempt.
+        outcome: the result of the engine.
+        kept: addresses that the run folder already had, from an interrupted attempt.
     """
 
     run: Run
@@ -87,16 +87,16 @@ def write_run(
 ) -> Run:
     """Write `products/` and `run.h5` of a run.
 
-    `run.h5` gets its name last: a folder that has one is finished, everything else in it is
-    written again by the same command.
+    `run.h5` gets its name last: a folder with it is finished, everything else is written again by
+    the same command.
 
     Args:
-        outcome: what the engine's run gave.
-        plan: what it was asked to do.
-        workflow: the document behind the plan.
-        run_folder: the folder, made when missing.
+        outcome: the result of the engine.
+        plan: the plan of the run.
+        workflow: the document of the plan.
+        run_folder: the folder, created if missing.
         store: holds the products and pictures of the run.
-        embed: put every product into the record, also those of scan size, and the input files.
+        embed: put every product into the record, including large ones, and the input files.
         before_finish: called with the run before the record gets its name, e.g. for the report.
 
     Returns:
@@ -104,10 +104,10 @@ def write_run(
 
     Raises:
         DamageError: something that the record needs was damaged in the store; it has been set
-            aside, and the same run, gone on with, computes it again.
-        StoreError: the disk refuses, or refused a step what it wanted to read or write.
+            aside, and the same run, continued, computes it again.
+        StoreError: the disk cannot be written, or a step could not read or write it.
         InputError: an input file to embed was changed during the run.
-        ArgumentError: another run goes on in the folder meanwhile.
+        ArgumentError: another run uses the folder.
     """
     _check_failures(outcome, run_folder)
     try:
@@ -127,12 +127,12 @@ def write_run(
 
 
 def _check_failures(outcome: RunOutcome, run_folder: Path) -> None:
-    """Refuse to finish a run in which a step failed for the disk's sake, not for its method's."""
+    """Refuse to finish a run in which a step failed because of the disk, not of its method."""
     for address, result in outcome.failed.items():
         if result.error_type in (StoreError.__name__, DamageError.__name__):
             raise StoreError(
-                f"{address} failed: {result.error_message}; what is finished is kept, and the same "
-                f"command with -o {run_folder} goes on from there"
+                f"{address} failed: {result.error_message}; finished steps are kept, and "
+                f"the same command with -o {run_folder} goes on from there"
             )
 
 
@@ -150,7 +150,7 @@ def _write_run(
     with writing_to(run_folder):
         if before_finish is not None:
             before_finish(_under_way(unfinished))
-        # All that the record names, before its own name says that it is there.
+        # Everything that the record names must exist before the record gets its name.
         sync_tree(run_folder)
         finished = unfinished.replace(run_folder / RECORD_FILE)
         (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
@@ -167,7 +167,7 @@ def _publish(
     *,
     embed: bool,
 ) -> Path:
-    """Fill `products/` and write the record under the name that it has until it is finished."""
+    """Fill `products/` and write the record under its temporary name."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
         run_folder.mkdir(parents=True, exist_ok=True)
@@ -195,19 +195,19 @@ def show_unfinished(
     store: Store,
     show: Callable[[Run], None],
 ) -> bool:
-    """Publish what a run has that was broken off, and show it; the run stays unfinished.
+    """Publish and show the results of an interrupted run; the run stays unfinished.
 
     Args:
-        outcome: what there is, as `execute` gives it to `on_interruption`.
-        plan: what was to be done.
-        workflow: the document behind the plan.
+        outcome: the results, as passed by `execute` to `on_interruption`.
+        plan: the plan of the run.
+        workflow: the document of the plan.
         run_folder: its folder.
         store: holds the products and pictures.
-        show: gets a run whose record goes away again, e.g. to write the report; what has no
-            result yet is skipped in it.
+        show: called with a run whose record is temporary, e.g. to write the report; cells without a
+            result yet are skipped in it.
 
     Returns:
-        False when it cannot be shown, as on a full disk: the run itself loses nothing by that.
+        False if it cannot be shown, e.g. on a full disk: the run itself loses nothing.
     """
     whole = _with_missing(outcome, plan)
     try:
@@ -227,7 +227,7 @@ def begin_run(
     """Keep the outline of a run that begins, see `records.unfinished`.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
     """
     from orthoflow.engine.environment import now  # noqa: PLC0415 - runs alone begin
     from orthoflow.engine.scheduler import RunOutcome  # noqa: PLC0415
@@ -249,7 +249,7 @@ def begin_run(
 
 
 def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
-    """Return an outcome in which what has no result yet is skipped."""
+    """Return an outcome in which cells without a result yet are skipped."""
     missing = {
         item.cell.address: CellResult(
             status="skipped",
@@ -269,14 +269,14 @@ def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
 def executed_and_written(
     execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
 ) -> WrittenRun:
-    """Execute a run and write it; what the store turns out to have lost is computed again.
+    """Execute a run and write it; results that the store has lost are computed again.
 
     Args:
-        execute: goes on with the run each time it is called, as `engine.scheduler.execute` does.
+        execute: continues the run each time it is called, as `engine.scheduler.execute` does.
         write: calls `write_run`.
 
     Raises:
-        DamageError: the store loses things faster than they can be computed.
+        DamageError: the store loses results faster than they can be computed.
     """
     outcome = execute()
     kept = outcome.resumed
@@ -284,7 +284,7 @@ def executed_and_written(
         with suppress(DamageError):
             return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
         outcome = execute()
-        # Of what the first attempt computed, the second says that it was there before.
+        # Results of the first attempt are cached in the second.
         kept &= outcome.resumed
     return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
 
@@ -316,12 +316,12 @@ def build_record(
     *,
     embed: bool = False,
 ) -> RunRecord:
-    """Turn what the engine gave into what a record says.
+    """Convert the engine's outcome into a record.
 
     Raises:
         DamageError: the store lost a picture of the run.
     """
-    # What was left out on purpose is no difference of the results: a record says so.
+    # Deliberate omissions are not differences of the results; the record states them.
     overrides = (*workflow.overrides, *plan.options.selection.options)
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
@@ -355,7 +355,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         run: the run.
         path: the new record; its folder exists.
         store: holds the products that the run's record names by digest only.
-        inputs: `NAME=PATH`, each as behind `--input`; other files are looked for by content.
+        inputs: `NAME=PATH`, each as after `--input`; other files are searched by content.
 
     Returns:
         The run, with the new record.
@@ -364,7 +364,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         InputError: an input file is missing.
         ChangedInputsError: an input file was changed.
         ArgumentError: a product is in neither record nor store.
-        StoreError: the disk refuses.
+        StoreError: the disk cannot be written.
         InvalidArgumentsError: `inputs` names no input of the workflow.
     """
     _check_products(run, store)
@@ -407,7 +407,7 @@ class _CellRecorder:
     embed: bool
 
     def record(self, cell: Cell, result: CellResult) -> RecordedCell:
-        """Return what the record says of one cell."""
+        """Return the recorded form of one cell."""
         return RecordedCell(
             **shared_fields(result, CellOutcome),
             address=cell.address,

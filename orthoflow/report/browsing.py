@@ -133,7 +133,7 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise ArgumentError(f"{folder} is no folder: give folders that runs lie in")
+            raise ArgumentError(f"{folder} is not a folder: give folders that contain runs")
         found.update(dict.fromkeys(_below(folder)))
     return list(found)
 
@@ -450,7 +450,7 @@ def _unfinished(folder: Path) -> RunSummary:
     return RunSummary(
         folder=folder,
         state="running" if is_under_way else "unfinished",
-        reason="" if is_under_way else f"goes on with the same command and -o {folder}",
+        reason="" if is_under_way else f"continues with the same command and -o {folder}",
         workflow=str(said.get("workflow", "")),
         run_id=str(said.get("run_id", "")),
         started=str(said.get("time", "")),

@@ -1,4 +1,4 @@
-"""How the parts of a workflow fit together: wiring, comparison, and what can hardly be meant."""
+"""How the parts of a workflow fit together: wiring, comparison, and implausible values."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def check_wiring(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> None:
-    """Report everything that is wrong with how steps are wired.
+    """Report all mistakes in the wiring of steps.
 
     Args:
         steps: all steps that could be read.
-        step_names: names of all steps in the file, readable or not.
+        step_names: names of all steps in the file, including unreadable ones.
         input_names: names of all inputs.
-        log: takes the problems.
+        log: receives the problems.
     """
     wiring = _Wiring(
         steps={step.name: step for step in steps},
@@ -64,7 +64,7 @@ def check_wiring(
 
 
 def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
-    """All references of a step, each with its port and its place."""
+    """Yield all references of a step, each with its port and its place."""
     for port, references in step.inputs.items():
         for index, reference in enumerate(references):
             yield port, (*step.location, "in", port, index), reference
@@ -100,7 +100,7 @@ class _Wiring:
         self._check_required(step)
 
     def _type_of(self, location: Location, reference: Reference) -> str | None:
-        """Return the product type behind a reference; None when unknown, which is reported."""
+        """Return the product type of a reference; None if unknown, which is reported."""
         if reference.is_input:
             if reference.name in self.input_names:
                 return FILES
@@ -141,13 +141,13 @@ class _Wiring:
                     )
 
     def _wired(self, step: DraftStep) -> Collection[str]:
-        # Ports whose references cannot be read are wired all the same.
+        # Ports with unreadable references count as wired.
         table = self.log.value((*step.location, "in"))
         return {entry.key for entry in table} if isinstance(table, Table) else step.inputs
 
 
 def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
-    """Port -> product type of a step; None when its kind is unknown."""
+    """Return port -> product type of a step; None if its kind is unknown."""
     for call in step.calls:
         if call.kind is not None and not call.kind.is_source:
             return call.kind.outputs if are_given else call.kind.inputs
@@ -258,12 +258,12 @@ def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
 
 
 def _variant_names(step: DraftStep) -> list[str]:
-    # A variant that was swept is still known by its own name.
+    # A swept variant is still known by its own name.
     return list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
 
 
 def _families(step: DraftStep) -> dict[str, list[str]]:
-    """Of variants that were swept: name -> the variants that its values became."""
+    """Return for swept variants: name -> the variants of its values."""
     found: dict[str, list[str]] = {}
     for call in step.calls:
         if call.family:
@@ -272,10 +272,10 @@ def _families(step: DraftStep) -> dict[str, list[str]]:
 
 
 def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
-    """Return the variant that a name stands for once overrides are in.
+    """Return the variant that a name refers to once overrides are applied.
 
-    Of a call that the file sweeps and the command line gives one value, the names of swept values
-    stand for the call: empty for a step without other variants.
+    If the file sweeps a call and the command line sets one value, the names of swept values refer
+    to the call: empty for a step without other variants.
     """
     draft = next((one for one in steps if one.name == step), None)
     fitting = [
@@ -289,7 +289,7 @@ def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
 def _spelled_out(
     assignment: Mapping[str, str], steps: Sequence[DraftStep]
 ) -> Iterator[dict[str, str]]:
-    """Return an assignment for each value of a swept variant that it names, in their order."""
+    """Return an assignment for each value of a swept variant that it names, in order."""
     families = {step.name: _families(step) for step in steps}
     several = [
         families.get(step, {}).get(variant, [variant]) for step, variant in assignment.items()
@@ -299,7 +299,7 @@ def _spelled_out(
 
 
 def first_variants(steps: Sequence[DraftStep]) -> dict[str, str]:
-    """The first variant of every varied step."""
+    """Return the first variant of every varied step."""
     return {step.name: step.calls[0].name for step in steps if step.is_varied and step.calls}
 
 
@@ -309,7 +309,7 @@ def _known(
     names: Mapping[str, Sequence[str]],
     log: ProblemLog,
 ) -> dict[str, str]:
-    """Keep what names a factor and one of its levels; report the rest."""
+    """Keep entries that name a factor and one of its levels; report the others."""
     chosen: dict[str, str] = {}
     for factor, level in assignment.items():
         known = names.get(factor)
@@ -335,7 +335,7 @@ def _known(
 
 
 def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
-    """Return why a pattern of metrics finds nothing; empty where it may find something."""
+    """Return why a pattern of metrics finds nothing; empty if it may find something."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
         return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
@@ -370,10 +370,10 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
 
 
 def _may_match(declared: str, metric: str) -> bool:
-    """Whether a declared name and what is asked for may be the same; either may have wildcards."""
+    """Whether a declared name and a requested one may be the same; either may have wildcards."""
     if fnmatchcase(metric, declared) or fnmatchcase(declared, metric):
         return True
-    # What two patterns have in common is not searched for.
+    # The intersection of two patterns is not searched.
     return _has_wildcard(declared) and _has_wildcard(metric)
 
 
@@ -387,14 +387,14 @@ _GSD: Final = "gsd_m"
 _CROP: Final = "crop"
 # The kind whose methods find photos on walls.
 _MATCHING: Final = "match."
-# Cells of walls and plans: finer than any scan, coarser than anything that is drawn of a building.
+# Cells of walls and plans: finer than any scan, coarser than anything drawn of a building.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
 _MILLIMETRES: Final = 1000.0
 
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
-    """Return a sentence for each thing that is allowed and can hardly be meant."""
+    """Return a sentence for each implausible setting."""
     return (
         *_unused_inputs(workflow),
         *_idle_datasets(workflow),
@@ -450,7 +450,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
         for step in workflow.steps.values()
         if any(variant.method.startswith(_MATCHING) for variant in step.variants)
     ]
-    # Whose cameras are given needs no matching.
+    # Given cameras need no matching.
     if any(step.unless and workflow.inputs[step.unless].files for step in matching):
         return
     for first in matching[:1]:
@@ -463,7 +463,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
 
 
 def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
-    """Whose, of which step and how: all calls, of datasets those that set the parameter."""
+    """Return whose parameter it is, of which step and how: all calls, or datasets that set it."""
     for step in workflow.steps.values():
         for variant in step.variants:
             yield "", step.name, variant

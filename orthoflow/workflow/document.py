@@ -88,11 +88,11 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         only_data: names of datasets, each as given with `--only-data`.
         set_files: YAML files of `step.parameter: value`, as given with `--set-file`; what is
             given with `--set` takes precedence.
-        also_files: of a file with problems, input files that are missing are reported with them.
+        also_files: for a file with problems, missing input files are reported with them.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
-        InvalidArgumentsError: the file is fine, what came with it is not.
+        InvalidArgumentsError: the file is correct, the options are not.
         UnusablePluginError: only plugins that the workflow needs are broken or missing.
         WorkflowError: there is no such file, or it cannot be read at all.
     """
@@ -112,7 +112,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         if tree.get(key) is None:
             log.report((key,), needed)
     if tree.get(_STEPS) is None:
-        # All else names steps: each of these names would be one more complaint.
+        # All others name steps: each of these names would be another problem.
         _sections(tree, log)
         log.raise_any()
     reader = _Reader(
@@ -129,7 +129,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     )
     workflow = reader.read()
     if also_files and log.has_any:
-        # Else they are looked for by who needs them.
+        # Otherwise they are searched when needed.
         add_missing_inputs(workflow, log)
     log.raise_any()
     return workflow
@@ -146,7 +146,7 @@ def _sections(tree: Table, log: ProblemLog) -> WorkflowFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Profile:
-    """What a file of `--set-file` holds, and the log of that file."""
+    """The content of a file of `--set-file`, and the log of that file."""
 
     settings: Mapping[str, JsonValue]
     log: ProblemLog
@@ -168,7 +168,7 @@ def _read_profile(path: Path, log: ProblemLog) -> _Profile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reader:
-    """Reads one document; everything wrong goes to the log."""
+    """Reads one document; all problems go to the log."""
 
     path: Path
     source: str
@@ -255,14 +255,14 @@ class _Reader:
         return file.name or self.path.stem
 
     def _overrides(self, steps: Sequence[DraftStep]) -> Overrides:
-        """Return what files of `--set-file` and then `--set` set of each call."""
+        """Return the settings of `--set-file` and then `--set` for each call."""
         return joined(
             *(overrides_of_settings(one.settings, (), steps, one.log) for one in self.profiles),
             overrides_of_options(self.sets, steps, self.log),
         )
 
     def _set_options(self) -> Iterator[str]:
-        # A record holds no files of profiles: they stand there as if each had been set.
+        # A record contains no settings files: their entries are kept as if each had been set.
         for profile in self.profiles:
             for key, value in profile.settings.items():
                 yield f"--set {key}={json.dumps(value, ensure_ascii=False)}"

@@ -1,4 +1,4 @@
-"""A first workflow for given files: what they are, and a shipped recipe that names them."""
+"""A first workflow for given files: their types, and a shipped recipe that names them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SCAN_SUFFIXES: Final = tuple(
 )
 _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
-# What a run leaves in its folder: pictures in there are no photos.
+# Files in a run folder: pictures in there are not photos.
 _OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
 DEEPEST: Final = 3
 MOST_FILES: Final = 20_000
@@ -51,19 +51,19 @@ MOST_FILES: Final = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class Recognised:
-    """A file, or a folder that is one thing.
+    """A file, or a folder that is one item.
 
     Attributes:
-        kind: what it is; `unknown` for what no method reads.
-        path: as it was found.
-        summary: what is in it, in words; why nothing is known of it.
+        kind: its type; `unknown` if no method reads it.
+        path: its path as found.
+        summary: its content, in words; why nothing is known of it.
         n_points: points of a scan.
-        n_photos: photos in it, also those in a scan.
+        n_photos: number of photos, including those in a scan.
         n_posed: photos in a scan whose lens and pose it states.
-        fields: what the points of a scan have besides coordinates, empty fields left out.
-        lens: camera and focal length of a photo, as its EXIF data state them.
-        up: axis that surfaces show to be up, where that is plainly another one than z.
-        advice: what to set or to give, as far as the data show it.
+        fields: the point attributes of a scan besides coordinates, without empty ones.
+        lens: camera and focal length of a photo, from its EXIF data.
+        up: the up axis suggested by surfaces, if it is clearly not z.
+        advice: suggested settings and inputs, as far as the data show them.
     """
 
     kind: FileKind
@@ -79,10 +79,10 @@ class Recognised:
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
-    """State what files are, and what lies in folders, by looking into them.
+    """Recognise files, and the contents of folders, by inspecting them.
 
     Raises:
-        InputError: a path leads nowhere, there are too many files, or a scan is damaged.
+        InputError: a path does not exist, there are too many files, or a scan is damaged.
     """
     found: list[Recognised] = []
     for path in paths:
@@ -114,7 +114,7 @@ def _file(path: Path) -> Recognised:
     if not path.is_file():
         return Recognised(kind="unknown", path=path, summary="a pipe or a device")
     if text_of_path(path) is None:
-        return Recognised(kind="unknown", path=path, summary="its path is no UTF-8: rename it")
+        return Recognised(kind="unknown", path=path, summary="its path is not UTF-8: rename it")
     suffix = path.suffix.lower()
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
         return Recognised(kind="other", path=path, summary="an orthoimage with its frame beside it")
@@ -143,7 +143,7 @@ def _raw(path: Path) -> Recognised:
 def _photo(path: Path) -> Recognised:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    # HEIC is opened, and the rest of its kind is told by the first bytes.
+    # HEIC is opened, and related formats are recognised by the first bytes.
     problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
     if problem:
         return Recognised(kind="unknown", path=path, summary=problem)
@@ -198,19 +198,19 @@ def _scan(path: Path) -> Recognised:
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
-    """What the first points of a scan show: fields that hold something, points (n, 3) in metres."""
+    """Return from the first points of a scan: non-empty fields, points (n, 3) in metres."""
 
     fields: frozenset[str]
     points_m: NDArray[np.float64]
 
     @property
     def extent_m(self) -> float:
-        """The largest along an axis; 0 without a point."""
+        """Return the largest extent along an axis; 0 without points."""
         return float(np.ptp(self.points_m, axis=0).max()) if len(self.points_m) else 0.0
 
     @property
     def axis_up(self) -> str:
-        """The axis that is up where that is plainly not z, else empty."""
+        """Return the up axis if it is clearly not z, else ""."""
         if not len(self.points_m):
             return ""
         offsets = (self.points_m - np.median(self.points_m, axis=0)).astype(np.float32)
@@ -236,7 +236,7 @@ def _seen_in(scan: ScanFile, unit_m: NDArray[np.float64]) -> _Seen:
 
 
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
-    """Ask for the unit where a scan is larger or smaller than what is scanned."""
+    """Ask for the unit if a scan is larger or smaller than usual."""
     if extent_m > _MAX_EXTENT_M:
         size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
     elif 0 < extent_m < _MIN_EXTENT_M:
@@ -247,17 +247,17 @@ def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
     return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
 
 
-# Longer, and shorter, than what is scanned from a tripod.
+# Larger, and smaller, than what is scanned from a tripod.
 _MAX_EXTENT_M: Final = 2000.0
 _MIN_EXTENT_M: Final = 0.2
-# Points of a scan that are looked at, and bytes of a photo: EXIF stands at its beginning.
+# Number of points of a scan that are read, and bytes of a photo: EXIF is at its beginning.
 _LOOKED_AT: Final = 1_000_000
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
 def _table(path: Path) -> Recognised:
-    """A table of points or ties, else a scan in text: of which a name stands in no line."""
+    """Recognise a table of points or ties, else a scan in text, which has no names in its lines."""
     for kind, reader, noun in _TABLES:
         try:
             rows = reader(path)
@@ -296,7 +296,7 @@ _COLUMNS: Final[Mapping[FileKind, frozenset[str]]] = {
 }
 
 
-# Of a list of cameras; no scan has them.
+# Column of a list of cameras; no scan has it.
 _CAMERA_COLUMNS: Final = frozenset(("heading", "pitch", "roll"))
 
 
@@ -312,13 +312,13 @@ def _column_names(path: Path) -> frozenset[str]:
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
-    """Whether what was read as names are coordinates: nobody calls a point 12.345."""
+    """Whether the names that were read are coordinates: no point is named 12.345."""
     names = [str(getattr(row, "name", "")) for row in rows]
     return all(re.fullmatch(r"[-+]?\d+\.\d*(e[-+]?\d+)?", name) for name in names)
 
 
 def _yaml(path: Path) -> Recognised:
-    """A calibration; a workflow, which `new` may have written before, is reported as one."""
+    """Recognise a calibration; a workflow, e.g. an earlier one of `new`, is reported as one."""
     found = _read("calibration", path, _calibration_summary)
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
@@ -347,13 +347,13 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
 
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 
-# What stands in for a scan where there is none.
+# Replaces a missing scan.
 _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# Paragraphs of a recipe's heading that are not about files of one's own: its commands, stand-ins.
+# Paragraphs of a recipe's heading that are not about one's own files: its commands, replacements.
 _NOT_OWN: Final = ("#   ", "# Without a scan of your own")
 
 
@@ -362,11 +362,11 @@ class Draft:
     """A workflow to be written.
 
     Attributes:
-        recipe: name of the shipped one that it follows.
+        recipe: name of the shipped recipe that it follows.
         text: of the file.
-        inputs: what each input holds, in words.
+        inputs: content of each input, in words.
         left_out: files that no input takes, and why.
-        advice: what to set or to give, as far as the data show it.
+        advice: suggested settings and inputs, as far as the data show them.
     """
 
     recipe: Recipe
@@ -380,13 +380,13 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     """Write the workflow that fits some files.
 
     Args:
-        found: what the files are.
-        target: where the workflow will lie; paths in it start there.
-        recipe: the one that it shall follow, or None: photos on the scan where there are photos,
-            the scan's own colours otherwise.
+        found: the recognised files.
+        target: path of the workflow; paths in it are relative to its folder.
+        recipe: the recipe to follow, or None: photos on the scan if there are photos, the scan's
+            own colours otherwise.
 
     Raises:
-        InputError: there is no scan, or no photo where the recipe needs some.
+        InputError: there is no scan, or no photo although the recipe needs some.
     """
     by_kind: dict[FileKind, list[Recognised]] = {}
     for item in found:
@@ -412,7 +412,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
     has_posed = any(scan.n_posed for scan in own_photos)
-    # What has no pose is mostly a picture for people, which matching would not find on the walls.
+    # Pictures without a pose are mostly for people, and matching would not find them on the walls.
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
@@ -425,7 +425,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
             "scan with its colours (--recipe direct writes the workflow all the same)"
         )
     if own_photos and "photos" not in by_kind:
-        # Photos that a scanner took lie in its file, with their poses.
+        # Photos taken by a scanner are in its file, with their poses.
         inside = [replace(scan, summary="the photos in it", n_points=0) for scan in own_photos]
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
@@ -435,7 +435,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
 
 @dataclass(frozen=True, kw_only=True)
 class _Drafting:
-    """The text, from the recipe's."""
+    """Return the text, from the recipe's."""
 
     by_kind: Mapping[FileKind, Sequence[Recognised]]
     target: Path
@@ -460,7 +460,7 @@ class _Drafting:
         )
 
     def _steps(self, steps: str) -> str:
-        """The steps of the recipe, with the axis that is up where scans show it."""
+        """Return the steps of the recipe, with the up axis if scans show it."""
         text = _without_stand_ins(steps)
         axes = {item.up for item in self.by_kind["scan"]}
         (up,) = axes if len(axes) == 1 else ("",)
@@ -489,7 +489,7 @@ class _Drafting:
         return advice
 
     def _assigned(self, inputs: str) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
-        """Which input takes which files, and what is left over."""
+        """Assign files to inputs, and return the remaining ones."""
         names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
         taken: dict[str, Sequence[Recognised]] = {}
         left_out = []
@@ -523,10 +523,10 @@ class _Drafting:
         return f"  {name}:  # {_seen(_described(items))}\n    files:\n{listed}"
 
     def _place(self, path: Path) -> str:
-        """A path as the workflow names it: from its folder."""
+        """Return a path relative to the workflow's folder."""
         here, place = (Path(os.path.normpath(one.absolute())) for one in (self.target.parent, path))
         if not place.is_relative_to(here):
-            # `..` behind a link leads elsewhere than it reads.
+            # `..` after a link leads elsewhere than it reads.
             here, place = here.resolve(), place.resolve()
         return Path(os.path.relpath(place, here)).as_posix()
 
@@ -542,7 +542,7 @@ class _Drafting:
             f"#   orthoflow plan {run}        what would run",
             f"#   orthoflow run {run} --set wall.gsd_m=0.02    a coarse first look; then without",
             "#",
-            "# What follows are the recipe's own words.",
+            "# The following comments are those of the recipe.",
             "#",
         ]
         paragraphs = start.rstrip("\n").split("\n#\n")
@@ -551,13 +551,13 @@ class _Drafting:
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
-    """Paths of photos; a folder stands for all that lie in it."""
+    """Return paths of photos; a folder stands for all files in it."""
     paths = [item.path for item in items]
     places: dict[Path, None] = {}
     for path in paths:
         inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
         whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
-        # A folder among whose files are scans would bring these along.
+        # A folder that also contains scans would include these.
         whole = whole and len(inside) > 1 and _holds_photos_only(path.parent)
         places[path.parent if whole else path] = None
     return list(places)
@@ -568,7 +568,7 @@ def _holds_photos_only(folder: Path) -> bool:
 
 
 def _described(items: Sequence[Recognised]) -> str:
-    """What some files are, in one line."""
+    """Describe some files in one line."""
     if len(items) == 1 or (len(items) <= _FEW_SCANS and all(item.n_points for item in items)):
         return "; ".join(f"{_word(item.path.name)}, {item.summary}" for item in items)
     n_photos = sum(item.n_photos for item in items)
@@ -585,7 +585,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _word(name: str) -> str:
-    """A file's name within a comment, where a line end would end it."""
+    """Return a file's name for a comment, without line ends."""
     return json.dumps(name, ensure_ascii=False)[1:-1]
 
 
@@ -594,7 +594,7 @@ def _quoted(text: str) -> str:
 
 
 def _seen(text: str) -> str:
-    """Write every letter that has no shape as YAML has it: some of them end lines and comments."""
+    """Escape every invisible character as in YAML: some of them end lines and comments."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
@@ -602,7 +602,7 @@ def _seen(text: str) -> str:
 
 
 def _without_stand_ins(steps: str) -> str:
-    """Take the simulated room out of the steps, and what only it is inspected with."""
+    """Remove the simulated room from the steps, and inspections that only it allows."""
     blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
     has_room = any(block.startswith("  room:") for block in blocks)
     kept = [

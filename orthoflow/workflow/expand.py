@@ -1,6 +1,6 @@
-"""Cells: what a workflow's steps and variants become, one per method call that really differs.
+"""Cells: the method calls that result from a workflow's steps and variants.
 
-All of them first; `--only`, `--from` and `--until` then choose among them.
+All of them first; `--only`, `--from` and `--until` then select among them.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from orthoflow.workflow.parameters import SWEEP, MethodInfo, describe_method
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]
 MOST_CELLS: Final = 20_000
-# The product of methods that measure how good the results of others are.
+# The product of methods that measure the quality of others' results.
 _JUDGEMENT: Final = "inspection"
-# How the reason of a cell begins that lacks optional data, unlike one behind a failure.
+# Beginning of the reason of a cell without optional data, unlike one after a failure.
 NOT_ASKED_FOR: Final = "only "
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
@@ -67,23 +67,22 @@ class Cell:
     """One method call of a run.
 
     Attributes:
-        address: `step`, or `step@step=variant,...` with the variants that reach it in graph
-            order, `data=name` and `seed=n` in front where it depends on them, and `#n` behind it
-            for repeats 1, 2, ...
+        address: `step`, or `step@step=variant,...` with the variants before it in graph order,
+            preceded by `data=name` and `seed=n` if it depends on them, and followed by `#n` for
+            repeats 1, 2, ...
         step: name of the step.
-        assignment: step -> variant for every varied step that reaches this cell, itself included,
-            with `data` -> dataset and `seed` -> seed in front.
-        repeat: 0 for the first, which downstream cells use; repeats reach the steps that the
-            workflow compares, and those between.
+        assignment: step -> variant for every varied step that influences this cell, including
+            itself, preceded by `data` -> dataset and `seed` -> seed.
+        repeat: 0 for the first, which later cells use; repeats reach the steps that the workflow
+            compares, and those between.
         method: method id.
         params: resolved parameters, defaults included, JSON.
         params_set: parameters as written in the file or set on the command line, JSON.
-        inputs: port -> where it comes from; ports that the method ignores and optional ones that
-            are absent are left out.
+        inputs: port -> source; ports that the method ignores and absent optional ones are omitted.
         seed: derived from (seed of the workflow or of the assignment, method id, repeat).
-        cores: cores asked for in `resources`, or None for all.
+        cores: requested number of cores, or None for all.
         timeout_s: seconds, or None.
-        skip_reason: why the cell will not run (optional data absent), empty when it will.
+        skip_reason: why the cell will not run (optional data absent), empty if it will.
     """
 
     address: str
@@ -101,28 +100,28 @@ class Cell:
 
     @property
     def setting(self) -> str:
-        """How its parameters are named where they are set: `step`, or `step.variant`."""
+        """Return the prefix of its parameters in settings: `step`, or `step.variant`."""
         variant = self.assignment.get(self.step)
         return f"{self.step}.{variant}" if variant else self.step
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Addresses of the cells that it takes products of."""
+        """Return addresses of the cells whose products it takes."""
         return tuple(one.address for one in self.inputs.values() if isinstance(one, CellOutput))
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:
-    """Whether nothing varies, so that each step is its only cell."""
+    """Whether nothing varies, so that each step has a single cell."""
     return all(cell.address == cell.step for cell in cells)
 
 
 def variants_text(assignment: Mapping[str, str]) -> str:
-    """Write which variants are chosen, `plane=ransac, orient=pnp`; empty for none."""
+    """Format the chosen variants, `plane=ransac, orient=pnp`; empty without any."""
     return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
 
 
 def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
-    """Return the variants whose names are an index, each with the values that it stands for."""
+    """Return the variants named by an index, each with its values."""
     return [
         (
             f"{step.name}={variant.name}",
@@ -135,7 +134,7 @@ def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
 
 
 def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
-    """Derive the seed of a cell: the same method gets the same seed wherever it stands."""
+    """Derive the seed of a cell: the same method gets the same seed in every step."""
     preimage = json.dumps(["orthoflow/seed", 1, workflow_seed, method_id, repeat])
     digest = hashlib.sha256(preimage.encode()).digest()
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
@@ -157,11 +156,11 @@ class StepGraph:
     users: Mapping[str, Collection[str]]
 
     def before(self, name: str) -> set[str]:
-        """All that a step needs, directly or not."""
+        """Return all steps that a step needs, directly or not."""
         return _reached(self.sources, [name])
 
     def after(self, name: str) -> set[str]:
-        """All that need a step, directly or not."""
+        """Return all steps that need a step, directly or not."""
         return _reached(self.users, [name])
 
 
@@ -187,7 +186,7 @@ def step_graph(steps: Mapping[str, WorkflowStep]) -> StepGraph:
 
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
-    """Order steps so that each stands behind all it needs, else in the order of the file."""
+    """Sort steps so that each follows all it needs, otherwise in the order of the file."""
     graph, names = step_graph(steps), tuple(steps)
     rank = {name: index for index, name in enumerate(names)}
     n_missing = {name: len(sources) for name, sources in graph.sources.items()}
@@ -207,14 +206,14 @@ def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Names of steps; what is given together narrows the selection.
+    """Names of selected steps; several options together narrow the selection.
 
     Attributes:
         only: these steps.
         from_: these steps and what follows from them.
-        until: these steps and what they are made from.
+        until: these steps and those they depend on.
 
-    Whatever the chosen steps need comes along, from the cache where it is there.
+    The steps that the chosen ones need are included, from the cache if possible.
     """
 
     only: tuple[str, ...] = ()
@@ -228,7 +227,7 @@ class Selection:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """The options, each as given; none where nothing is left out."""
+        """Return the options as given; empty if nothing is omitted."""
         named = self.by_option.items()
         return tuple(f"{option} {name}" for option, names in named for name in names)
 
@@ -237,7 +236,7 @@ EVERYTHING: Final = Selection()
 
 
 def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
-    """Refuse names of steps that are not there, e.g. of `--force`.
+    """Refuse unknown names of steps, e.g. of `--force`.
 
     Raises:
         ArgumentError: a name is unknown.
@@ -286,7 +285,7 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
 
     Args:
         workflow: the workflow.
-        steps: the steps that matter, in graph order: the step itself and what lies before it.
+        steps: the relevant steps, in graph order: the step itself and its predecessors.
     """
     varied = {
         name: tuple(variant.name for variant in workflow.steps[name].variants)
@@ -324,10 +323,10 @@ def _count(workflow: Workflow, steps: Sequence[str]) -> int:
 
 
 def _require_few(workflow: Workflow, count: int) -> None:
-    """Refuse more cells than anybody can run.
+    """Refuse more cells than are practical.
 
     Raises:
-        WorkflowError: there are.
+        WorkflowError: there are too many.
     """
     if count <= MOST_CELLS:
         return
@@ -344,7 +343,7 @@ def _require_few(workflow: Workflow, count: int) -> None:
 
 
 def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
-    """Whether an assignment contains a combination that the comparison leaves out."""
+    """Whether an assignment contains a combination that the comparison excludes."""
     excluded = workflow.compare.exclude if workflow.compare else ()
     return any(combination.items() <= assignment.items() for combination in excluded)
 
@@ -355,13 +354,13 @@ def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
 def expand_cells(
     workflow: Workflow, catalog: Catalog, *, selection: Selection = EVERYTHING
 ) -> tuple[Cell, ...]:
-    """Expand a workflow into cells, each behind all it needs.
+    """Expand a workflow into cells, each after all it needs.
 
-    Looks at the files of optional inputs, because absent data decide which cells can run.
+    Checks the files of optional inputs, because absent data decide which cells can run.
 
     Raises:
-        ArgumentError: the selection names steps that are not there, or leaves nothing.
-        InputError: an optional input was named on the command line and is not there.
+        ArgumentError: the selection names unknown steps, or leaves nothing.
+        InputError: an optional input was named on the command line and is missing.
         PluginError: a method cannot be loaded.
     """
     expansion = _Expansion(
@@ -379,13 +378,13 @@ def expand_cells(
 
 @dataclass(frozen=True, kw_only=True)
 class _Node:
-    """A cell together with what decides whether it is there.
+    """A cell together with what determines whether it exists.
 
     Attributes:
         cell: the cell.
-        dependence: the factors that its product depends on; for a skipped cell, those that its
-            being skipped depends on, which may be fewer than its address names.
-        causes: with or without which inputs it would not be skipped.
+        dependence: the factors on which its product depends; for a skipped cell, those on which the
+            skipping depends, which may be fewer than its address names.
+        causes: inputs with or without which it would not be skipped.
     """
 
     cell: Cell
@@ -395,7 +394,7 @@ class _Node:
 
 @dataclass(frozen=True, kw_only=True)
 class _Choice:
-    """What a port takes: the first candidate that is present, or none."""
+    """The source of a port: the first candidate that is present, or none."""
 
     source: CellOutput | WorkflowInput | None
     dependence: Assignment
@@ -403,7 +402,7 @@ class _Choice:
 
 
 class _ExcludedError(Exception):
-    """The combination is left out of the comparison."""
+    """The combination is excluded from the comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -447,7 +446,7 @@ class _Expansion:
                         for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
                             cells[cell.address] = cell
                         _require_few(workflow, len(cells))
-        # What leads only to an inspection that is skipped needs no repeats.
+        # Cells that only lead to a skipped inspection need no repeats.
         judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
         needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}
         return tuple(
@@ -457,12 +456,12 @@ class _Expansion:
         )
 
     def _own_repeats(self, cell: Cell) -> int:
-        """Return how often the file has a cell repeated."""
+        """Return how many repeats the file requests for a cell."""
         step = self.workflow.steps[cell.step]
         return step.variant(cell.assignment.get(step.name, "")).repeat
 
     def _outer(self, steps: Iterable[str]) -> list[Assignment]:
-        """Return the datasets and seeds that a step runs on, as far as they may reach it."""
+        """Return the datasets and seeds on which a step runs, as far as they may influence it."""
         workflow = self.workflow
         is_random = workflow.has_seeds and any(map(self._is_random, steps))
         by_data = any(map(self._takes_data, steps)) or (is_random and workflow.has_data_seeds)
@@ -476,14 +475,14 @@ class _Expansion:
         ]
 
     def _is_random(self, name: str) -> bool:
-        """Whether seeds change something of a step itself."""
+        """Whether seeds change a step itself."""
         return any(map(self._uses_seed, self.workflow.steps[name].variants))
 
     def _uses_seed(self, variant: StepVariant) -> bool:
         return self.methods[variant.method].method.determinism != "exact"
 
     def _takes_data(self, name: str) -> bool:
-        """Whether datasets change something of a step itself."""
+        """Whether datasets change a step itself."""
         step = self.workflow.steps[name]
         names = step.conditions | {one.name for one in step.references if one.is_input}
         calls = ((name, variant.name) for variant in step.variants)
@@ -495,9 +494,9 @@ class _Expansion:
     def _repeats(
         self, cell: Cell, before: Mapping[str, Cell], *, is_reached: bool
     ) -> Iterator[Cell]:
-        """Return the repeats 1, 2, ... of a cell: its own, and those of what it is made of.
+        """Yield the repeats 1, 2, ... of a cell: its own, and those of its predecessors.
 
-        Repeat n of a cell takes repeat n of all that has one, and the first of all else.
+        Repeat n of a cell takes repeat n of all that have one, and the first of all others.
         """
         if cell.skip_reason:
             return
@@ -521,7 +520,7 @@ class _Expansion:
             yield replace(cell, address=address, repeat=repeat, inputs=inputs, seed=seed)
 
     def _differs(self, address: str, before: Mapping[str, Cell]) -> bool:
-        """Whether there is a repeat of that address, and it may differ from the first.
+        """Whether a repeat of that address exists and may differ from the first.
 
         Repeats of a method without randomness only time it.
         """
@@ -573,7 +572,7 @@ class _Expansion:
         return _Node(cell=cell, dependence=dependence, causes=choice.causes)
 
     def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
-        """Return why a step is skipped, whatever it takes; empty where it is not."""
+        """Return why a step is skipped, whatever its inputs; empty if it is not."""
         if step.unless and self._input_name(step.unless, full) in self.present:
             return f"without the input {step.unless}"
         if step.only_if and self._input_name(step.only_if, full) not in self.present:
@@ -593,7 +592,7 @@ class _Expansion:
                 causes[f"with the input {reference.name}"] = None
                 continue
             node = self._upstream(reference.source, full)
-            # What a passed-over candidate depends on decides this choice as well.
+            # The dependences of a rejected candidate determine this choice as well.
             dependence |= node.dependence
             if not node.cell.skip_reason:
                 output = CellOutput(address=node.cell.address, port=reference.name)
@@ -602,7 +601,7 @@ class _Expansion:
         return _Choice(source=None, dependence=dependence, causes=tuple(causes))
 
     def _input_name(self, name: str, full: Mapping[str, str]) -> str:
-        """The own name of an input: that of the dataset, where it names files for it."""
+        """Return the name of an input: that of the dataset, if it names files for it."""
         dataset = self.workflow.datasets.get(full.get(DATA, ""))
         return dataset.inputs[name].name if dataset and name in dataset.inputs else name
 
@@ -629,7 +628,7 @@ class _Expansion:
         inputs: Mapping[str, CellOutput | WorkflowInput],
         skip_reason: str,
     ) -> Cell:
-        # The dataset and the seed stand before the steps.
+        # The dataset and the seed precede the steps.
         rank = {DATA: -2, SEED: -1, **self.rank}
         ordered = dict(sorted(assignment.items(), key=lambda item: rank[item[0]]))
         listed = ",".join(f"{name}={chosen}" for name, chosen in ordered.items())
@@ -649,7 +648,7 @@ class _Expansion:
 
 
 def _compared_steps(workflow: Workflow, methods: Mapping[str, MethodInfo]) -> set[str]:
-    """Return the steps that the workflow compares, which repeats of what lies before them reach.
+    """Return the steps that the workflow compares, which repeats of their predecessors reach.
 
     The steps that `compare.metrics` names and all inspections that its wildcards cover, without
     `metrics` all inspections.
@@ -671,5 +670,5 @@ def _compared_steps(workflow: Workflow, methods: Mapping[str, MethodInfo]) -> se
 
 
 def _reason(*causes: str) -> str:
-    """Return why a cell is skipped: any of the causes would do."""
+    """Return why a cell is skipped: any of the causes suffices."""
     return f"{NOT_ASKED_FOR}{' or '.join(causes)}"

@@ -11,7 +11,7 @@ from typing import Annotated, Final, Literal
 
 from orthoflow.products.product import JsonValue
 
-# Each unit in the first of its family, under the ends that names of parameters have.
+# Each unit in the first of its family, by the suffixes of parameter names.
 _FAMILIES: Final[tuple[Mapping[str, float], ...]] = (
     {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "um": 1e-6, "µm": 1e-6},
     {"deg": 1.0, "rad": 180.0 / math.pi, "°": 1.0, "gon": 0.9},
@@ -40,7 +40,7 @@ def written_form(annotation: object, description: str) -> str:
 
     Args:
         annotation: the type of a parameter.
-        description: of it; where it writes such a value itself, this is returned.
+        description: its description; if it contains such a value, that is returned.
 
     >>> written_form(tuple[tuple[float, float], ...] | None, "")
     '[[number, number], ...]'
@@ -61,7 +61,7 @@ def _alternatives(annotation: object) -> tuple[object, ...]:
 
 
 def _form(annotation: object) -> str:
-    """Return how a value of a type is written; empty where parts of it are no plain values."""
+    """Return how a value of a type is written; empty if parts of it are not plain values."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         return _form(parts[0])
@@ -79,7 +79,7 @@ def _form(annotation: object) -> str:
 
 
 def _bracketed(text: str) -> Iterator[str]:
-    """Lists and mappings that a text writes, outermost brackets each."""
+    """Yield lists and mappings in a text, outermost brackets each."""
     depth, start = 0, 0
     for place, letter in enumerate(text):
         if letter in "[{":
@@ -92,7 +92,7 @@ def _bracketed(text: str) -> Iterator[str]:
 
 
 def meant_number(parameter: str, text: object) -> str:
-    """Return how a number is written that was given as text; empty where it looks like none.
+    """Return how a number given as text is written; empty if it does not look like one.
 
     >>> meant_number("tolerance_m", "0,02")
     '; decimals have a point: 0.02'
@@ -115,7 +115,7 @@ def meant_number(parameter: str, text: object) -> str:
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
-    """Name the parameter that holds the same in another unit; empty where there is none.
+    """Return the parameter with the same meaning in another unit; empty if there is none.
 
     >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
     ' (it is gsd_m, in metres: gsd_m: 0.05)'
@@ -133,7 +133,7 @@ def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
 
 
 def _factor(given: str, wanted: str) -> float | None:
-    """By what a number in one unit is multiplied to be one in the other."""
+    """Return the factor between two units."""
     for family in _FAMILIES:
         if given in family and wanted in family:
             return family[given] / family[wanted]

@@ -1,4 +1,4 @@
-"""Inputs and datasets of a workflow: what names files, what takes their place, what is there."""
+"""Inputs and datasets of a workflow: names of files, overrides, and existing files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ from orthoflow.workflow.source import (
     validate,
 )
 
-# Files and folders that are looked at for one input: `/**` would go on for hours.
+# Files and folders that are examined for one input: `/**` would take hours.
 MOST_LOOKED_AT: Final = 100_000
 MOST_TABLE_BYTES: Final = 4_000_000
 MOST_DATASETS: Final = 10_000
@@ -70,12 +70,12 @@ _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
 _DATASETS: Final = "datasets"
 _NUMBER: Final = re.compile(r"-?(0|[1-9]\d{0,14})(\.\d{1,15})?")
-# The first of them that the header has.
+# The first of them in the header is used.
 _SEPARATORS: Final = (";", "\t", ",")
 
 
 class MissingInputsError(InputError):
-    """Input files are missing; `problems` names them, of many the first."""
+    """Input files are missing; `problems` names them, or the first of many."""
 
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
@@ -104,7 +104,7 @@ def input_specs(
 
 
 def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
-    """Return what the text of a workflow file names for each input, without `--input`."""
+    """Return the files that a workflow names for each input, without `--input`."""
     log = ProblemLog(file="")
     tree = log.parse(source)
     section = tree.get("inputs") if isinstance(tree, Table) else None
@@ -135,7 +135,7 @@ class InputOption:
 
     @property
     def without_folder(self) -> str:
-        """The option as a record keeps it, which names no folder of this machine."""
+        """Return the option for a record, without folders of this machine."""
         return f"--input {self.name}={Path(self.path).name}"
 
 
@@ -186,7 +186,7 @@ def check_shared_inputs(
 
 
 def some_of(names: Collection[str]) -> str:
-    """Name what there is, of many only the first.
+    """Name the existing ones, or the first of many.
 
     >>> some_of(["scan", "photos"]), some_of([])
     ('scan, photos', 'none')
@@ -198,7 +198,7 @@ def some_of(names: Collection[str]) -> str:
 
 
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
-    """Find the files of every input, sorted by name; None for optional data that are absent.
+    """Find the files of every input, sorted by name; None for absent optional data.
 
     A file stands for itself, a folder for the files in it and its subfolders (hidden ones left
     out), a pattern for the files it matches (`**` for folders at any depth).
@@ -223,7 +223,7 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
 
 
 def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
-    """Add to the problems of a workflow the inputs whose files are missing."""
+    """Add inputs with missing files to the problems of a workflow."""
     for spec in workflow.input_specs.values():
         try:
             _resolve(spec)
@@ -233,7 +233,7 @@ def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
-    """Names of the inputs that are there; those that are not optional always count as there."""
+    """Return names of the present inputs; those that are not optional always count as present."""
     return frozenset(
         spec.name
         for spec in workflow.input_specs.values()
@@ -274,7 +274,7 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         files = []
         missing = f"{pattern}{where} is a link to {path.readlink()}, which is not there"
     elif glob.has_magic(pattern):
-        # Names may themselves hold brackets; only what is no existing path is taken as a pattern.
+        # Names may contain brackets; only a path that does not exist is treated as a pattern.
         files = [match for match in look.for_pattern(spec.folder, pattern) if match.is_file()]
         missing = f"no file matches {pattern}{where}"
     else:
@@ -289,7 +289,7 @@ def _place(spec: WorkflowInputSpec) -> str:
 
 
 def _meant(path: Path) -> str:
-    """Ask whether a file beside it was meant, empty where none has a similar name."""
+    """Suggest a file with a similar name beside it, or return ""."""
     with suppress(OSError):
         beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
         return did_you_mean(path.name, beside)
@@ -297,17 +297,17 @@ def _meant(path: Path) -> str:
 
 
 class _Look:
-    """Looks into folders, and counts what it sees there."""
+    """Lists folders, and counts what it sees there."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._n_seen = 0
 
     def into(self, folder: Path) -> Iterator[Path]:
-        """Return what lies in a folder, nothing when it cannot be read.
+        """Return the contents of a folder, empty if it cannot be read.
 
         Raises:
-            InputError: it was too much.
+            InputError: there are too many.
         """
         try:
             with os.scandir(folder) as entries:
@@ -334,16 +334,16 @@ class _Look:
                     yield path
 
     def for_pattern(self, folder: Path, pattern: str) -> list[Path]:
-        """Return what a pattern matches below a folder, as `glob` does with `recursive`.
+        """Yield what a pattern matches below a folder, as `glob` does with `recursive`.
 
         Raises:
-            InputError: it was too much.
+            InputError: there are too many.
         """
         anchor = Path(pattern).anchor
         found = [folder / anchor]
         for part in Path(pattern).parts[bool(anchor) :]:
             matches = (path for place in found for path in self._matches(place, part))
-            # `**/**` comes to one place by many ways.
+            # `**/**` reaches one place in many ways.
             found = list(dict.fromkeys(matches))
         return found
 
@@ -366,7 +366,7 @@ class _Look:
 
 
 def read_seeds(value: Value | None, log: ProblemLog, location: Location) -> tuple[int, ...]:
-    """Read a seed, or a sweep of seeds; empty for nothing usable."""
+    """Read a seed, or a sweep of seeds; empty if invalid."""
     if value is None:
         return ()
     data = plain(value)
@@ -421,15 +421,15 @@ class _Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetReader:
-    """Reads datasets against what a workflow has.
+    """Reads datasets and checks them against a workflow.
 
     Attributes:
         folder: of the workflow.
-        inputs: of the workflow, with those of `--input`.
+        inputs: inputs of the workflow, with those of `--input`.
         steps: of the workflow.
-        overrides: of `--set`, which go over those of datasets.
+        overrides: overrides of `--set`, which precede those of datasets.
         calls: (step, variant) -> the call without datasets; those with mistakes are missing.
-        log: takes the problems.
+        log: receives the problems.
     """
 
     folder: Path
@@ -442,12 +442,12 @@ class DatasetReader:
     def read(
         self, section: Value | None, table: str | Mapping[str, JsonValue]
     ) -> dict[str, Dataset]:
-        """Read the table of `--datasets`, else the section, which may name a table itself.
+        """Read the table of `--datasets`, otherwise the section, which may name a table itself.
 
         Args:
             section: of the workflow file.
-            table: of the command line, relative to the working directory; empty for none. From
-                Python it may be what the section would state, with paths from there, too.
+            table: from the command line, relative to the working directory; empty for none. From
+                Python it may be the content of the section, with paths relative to the same folder.
         """
         if isinstance(table, Mapping):
             log = self.log.beside("datasets=", "")
@@ -486,14 +486,14 @@ class DatasetReader:
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
     def _named(self, origin: _Origin) -> dict[str, Dataset]:
-        """Read the mapping that stands under `datasets` in the origin's tree."""
+        """Read the mapping under `datasets` in the origin's tree."""
         log = origin.log
         check_no_step(self.steps, DATA, log, (_DATASETS,))
         value = log.value((_DATASETS,))
         assert isinstance(value, Table)  # noqa: S101 - by the callers
         if not value.entries:
             log.report((_DATASETS,), "expected at least one dataset")
-        # What names no input gets no second problem for its value.
+        # A key that names no input gets no second problem for its value.
         known = {"set", *self.inputs}
         data: dict[str, JsonValue] = {}
         for entry in value:
@@ -546,7 +546,7 @@ class DatasetReader:
         if key == SEED or (parameter and any(one.name == step for one in self.steps)):
             meant = f"; parameters go in set: {{set: {{{key}: VALUE}}}}"
         elif origin.table:
-            # A table has parameters by the dot in the names of their columns.
+            # In a table, columns of parameters have a dot in their names.
             meant = "; columns of parameters are called step.parameter"
         origin.log.report(
             location,
@@ -573,7 +573,7 @@ class DatasetReader:
                     continue
                 call = self.calls.get(name)
                 overrides = (*assigned[name], *self.overrides.get(name, ()))
-                # Of a call with mistakes of its own, those are reported at their places, and once.
+                # Mistakes of the call itself are reported at their places, and once.
                 resolved = resolve_call(draft, overrides, self.log, blame if call else None)
                 if call is not None:
                     calls[name] = resolved
@@ -581,7 +581,7 @@ class DatasetReader:
 
 
 def _unplaced(value: JsonValue) -> Value:
-    """Return what a document would hold for a value that comes from none."""
+    """Return the document form of a value that comes from no document."""
     nowhere = Position(line=0, column=0)
     if isinstance(value, dict):
         entries = [
@@ -603,7 +603,7 @@ def choose_data(
             if name in datasets:
                 chosen[name] = None
             elif not datasets and log.has_any:
-                # The names in a table that cannot be read are unknown.
+                # The names in an unreadable table are unknown.
                 continue
             elif not datasets:
                 log.report_option(f"--only-data {text}", "the workflow has no datasets")
@@ -622,10 +622,9 @@ def choose_data(
 def read_rows(log: ProblemLog) -> Table:
     """Read the lines of a table as a mapping from names to datasets, with their places.
 
-    Columns are separated by semicolons, tabs or commas. A column with a dot in its name, or called
-    `seed`, goes into the dataset's `set`, its values read as YAML; empty places are left out. Keys
-    have the position of their column in the header, so that what is wrong with a column is reported
-    once.
+    Columns are separated by semicolons, tabs or commas. A column with a dot in its name, or named
+    `seed`, goes into the dataset's `set`, its values read as YAML; empty fields are omitted. Keys
+    have the position of their column in the header, so that a problem of a column is reported once.
     """
     rows = _rows(log)
     header = next(rows, None)
@@ -654,7 +653,7 @@ def read_rows(log: ProblemLog) -> Table:
 
 
 def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
-    """Return the fields of every line that holds something, each a text with its place."""
+    """Return the fields of every non-empty line, each a text with its place."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
         start = Position(line=number, column=1)
@@ -671,7 +670,7 @@ def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
             continue
         placed, at = [], 0
         for field in fields:
-            # A field with doubled quotes is not found as it is written; its place is about right.
+            # A field with doubled quotes is not found as written; its place is approximate.
             at = max(at, line.find(field, at))
             position = Position(line=number, column=at + 1)
             placed.append(Text(position=position, value=field.strip()))
@@ -680,7 +679,7 @@ def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
 
 
 def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, tuple[int, Position]]:
-    """Return index and position of the columns by name; those without one are left out."""
+    """Return index and position of the columns by name; those without a name are omitted."""
     columns: dict[str, tuple[int, Position]] = {}
     start = header[0].position
     if len(header) > MOST_COLUMNS:
@@ -707,7 +706,7 @@ def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, tuple[int, 
 def _row(
     row: tuple[Text, ...], columns: Mapping[str, tuple[int, Position]], log: ProblemLog
 ) -> Entry | None:
-    """Return what a line states of its dataset."""
+    """Return the dataset of a line."""
     start = row[0].position
     places = [index for index, field in enumerate(row) if field.value]
     if not places:
@@ -742,7 +741,7 @@ def _as_yaml(field: Text, key: str, log: ProblemLog) -> Value | None:
     """Read what stands in a column of parameters, as given with `--set`."""
     text = str(field.value)
     if _NUMBER.fullmatch(text):
-        # A thousand rooms have a thousand numbers, and to read each as YAML takes milliseconds.
+        # A thousand rooms have a thousand numbers, and reading each as YAML takes milliseconds.
         return replace(field, value=float(text) if "." in text else int(text))
     own = ProblemLog(file="")
     value = own.parse(text)

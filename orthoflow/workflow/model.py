@@ -1,7 +1,7 @@
-"""The workflow format: what a file may hold, and the checked workflow that it becomes.
+"""The workflow format: the content of a file, and the checked workflow that it becomes.
 
-The models of the file are the format: its checks, the JSON Schema and `docs/workflow-format.md`
-are made of them. What one key has to do with another is checked in `document` and `checks`.
+The models of the file are the format: its checks, the JSON Schema and `docs/workflow-format.md` are
+made of them. Relations between keys are checked in `document` and `checks`.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from orthoflow.products.product import JsonValue
 from orthoflow.workflow.problems import Problem
 
 FORMAT: Final = 1
-# Errors of the models whose message is shown as it is.
+# Errors of the models whose message is shown unchanged.
 FORMAT_TOO_NEW: Final = "format_too_new"
 NOT_A_NAME: Final = "not_a_name"
 MOST_REPEATS: Final = 10_000
-# More values than a reader follows in a curve, and more runs than anybody waits for.
+# More values than are readable in a curve, and more runs than are practical.
 MOST_SWEPT: Final = 100
 MOST_EXCLUDED: Final = 500
 # Records keep numbers of fewer than a hundred digits.
 _MOST_OF_A_NUMBER: Final = 10**80
 INPUTS: Final = "inputs"
-# Factors of addresses beside the steps: which dataset, and which seed.
+# Factors of addresses besides the steps: dataset and seed.
 DATA: Final = "data"
 SEED: Final = "seed"
 NAME_RULE: Final = (
@@ -61,10 +61,10 @@ _METRIC: Final = r"[^.]+\.(.|\n)+"
 
 @dataclass(frozen=True)
 class Expected:
-    """How messages and the documentation name what a value must be.
+    """The expected form of a value in messages and the documentation.
 
     Attributes:
-        words: what is expected: `true or false`.
+        words: the expected form: `true or false`.
         noun: one item of a list.
         choices: the words of a choice.
     """
@@ -75,10 +75,10 @@ class Expected:
 
 
 def check_name(name: str) -> str:
-    """Return a name that addresses and files can have.
+    """Return a name if addresses and files can have it.
 
     Raises:
-        PydanticCustomError: it is none; a `ValueError`.
+        PydanticCustomError: it is invalid; a `ValueError`.
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise PydanticCustomError(
@@ -88,7 +88,7 @@ def check_name(name: str) -> str:
 
 
 def seconds_in(raw: object) -> float | None:
-    """Return the seconds that a time stands for, e.g. 1800 for `30min`; None for no time.
+    """Return a time in seconds, e.g. 1800 for `30min`; None for no time.
 
     >>> seconds_in("30min"), seconds_in(2), seconds_in("soon")
     (1800.0, 2.0, None)
@@ -110,7 +110,7 @@ def _seconds(raw: object) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """Where a port may take its product from.
+    """The source of a port's product.
 
     Attributes:
         source: name of a step, or `inputs`.
@@ -162,7 +162,7 @@ _Name: TypeAlias = Annotated[
 ]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1), Expected("a text")]
 _Flag: TypeAlias = Annotated[bool, Strict(), Expected("true or false")]
-# Whole numbers; `true` is none.
+# Integers; `true` is not one.
 _Positive: TypeAlias = Annotated[
     int,
     Strict(),
@@ -211,7 +211,7 @@ _InputSource: TypeAlias = Annotated[
 _Metric: TypeAlias = Annotated[
     str, Strict(), Field(pattern=rf"^{_METRIC}$"), Expected("step.metric, * allowed")
 ]
-# A seed is a level as any other.
+# A seed is a level like any other.
 _Level: TypeAlias = Annotated[
     str,
     Field(min_length=1),
@@ -253,7 +253,7 @@ _Metrics: TypeAlias = Annotated[
 
 
 class FileSection(BaseModel):
-    """A mapping of the file whose keys the format fixes."""
+    """A mapping of the file with fixed keys."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
@@ -509,7 +509,7 @@ class WorkflowFile(FileSection):
 
 
 def annotation_at(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[object, Expected]:
-    """Return the type of what stands at a location of a model, and what is expected there."""
+    """Return the type expected at a location of a model, and its description."""
     here: object = model
     expected = Expected("a mapping")
     for part in loc:
@@ -530,7 +530,7 @@ def annotation_at(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[obj
 
 
 def _unwrapped(annotation: object) -> tuple[object, tuple[object, ...]]:
-    """Return a type without `Annotated` and `| None`, and what it was annotated with."""
+    """Return a type without `Annotated` and `| None`, and its annotation."""
     metadata: tuple[object, ...] = ()
     while True:
         arguments = typing.get_args(annotation)
@@ -547,15 +547,15 @@ def _unwrapped(annotation: object) -> tuple[object, tuple[object, ...]]:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInputSpec:
-    """An input as the file or the command line names it; nothing is looked up yet.
+    """An input as named in the file or on the command line; files are not searched yet.
 
     Attributes:
         name: name of the input.
-        files: files, folders and glob patterns; empty when none were given.
+        files: files, folders and glob patterns; empty if none were given.
         optional: steps that need it are skipped when it is absent.
-        folder: what relative paths start from: the workflow's folder, or the working directory
-            for paths from the command line.
-        is_given: named with `--input`, so it must exist even when optional.
+        folder: base of relative paths: the workflow's folder, or the working directory for paths
+            from the command line.
+        is_given: named with `--input`, so it must exist even if it is optional.
         table: the table of datasets and the line in it that name the files, `rooms.csv:3`; empty
             for the workflow itself.
         place: where they are named; None for what comes from no file.
@@ -579,8 +579,8 @@ class StepVariant:
         method: method id.
         params: resolved parameters, defaults included, JSON.
         params_set: parameters as written in the file or set on the command line, JSON.
-        repeat: how many runs, with seeds of their own where the method is random.
-        cores: cores asked for, None for all.
+        repeat: number of runs, with seeds of their own if the method is random.
+        cores: requested number of cores, None for all.
         timeout_s: seconds, None for no limit.
         swept: parameters that are swept -> the values of this variant; a part of `params_set`.
     """
@@ -602,9 +602,9 @@ class WorkflowStep:
     Attributes:
         name: name of the step.
         variants: alternatives in the order of the file.
-        inputs: port -> references; the first that is present wins.
-        only_if: the step is skipped when this input is absent; empty for always.
-        unless: the step is skipped when this input is present; empty for always.
+        inputs: port -> references; the first that is present is used.
+        only_if: the step is skipped if this input is absent; empty for always.
+        unless: the step is skipped if this input is present; empty for always.
         is_varied: the file lists variants, even if only one.
     """
 
@@ -621,16 +621,16 @@ class WorkflowStep:
 
     @property
     def conditions(self) -> frozenset[str]:
-        """Inputs whose presence alone decides whether the step runs."""
+        """Return inputs whose presence alone decides whether the step runs."""
         return frozenset((self.only_if, self.unless)) - {""}
 
     @property
     def references(self) -> tuple[Reference, ...]:
-        """Where the ports may take their products from."""
+        """Return the possible sources of the ports."""
         return tuple(item for references in self.inputs.values() for item in references)
 
     def upstream(self) -> tuple[str, ...]:
-        """Names of the steps that the ports may take products from, each once."""
+        """Return names of the steps whose products the ports may take, each once."""
         return tuple(dict.fromkeys(one.source for one in self.references if not one.is_input))
 
 
@@ -643,8 +643,8 @@ class Dataset:
         inputs: input -> its files; that of the input `scan` has the name `scan@<dataset>`.
         sets: parameters as written, `step.parameter` -> JSON.
         seeds: roots of all seeds on this dataset; empty for those of the workflow.
-        calls: (step, variant) -> the method call with these parameters, where they change it; not
-            kept in records, whose cells state it.
+        calls: (step, variant) -> the method call with these parameters, if they change it; not kept
+            in records, whose cells state it.
     """
 
     name: str
@@ -661,7 +661,7 @@ class Comparison:
     Attributes:
         design: all combinations of variants, or the baseline and every single deviation from it.
         baseline: step -> variant, for every varied step.
-        exclude: combinations to leave out; a cell whose assignment contains one is dropped.
+        exclude: combinations to omit; a cell whose assignment contains one is dropped.
         metrics: `step.metric` patterns for the report, `*` allowed.
     """
 
@@ -680,12 +680,12 @@ class Workflow:
         path: the file it was read from.
         source: text of the file as written.
         seed: root of all seeds; of a sweep, the first.
-        seeds: roots of all seeds where they are swept; empty otherwise.
+        seeds: roots of all seeds if they are swept; empty otherwise.
         inputs: by name.
         steps: by name, in the order of the file.
-        compare: what to compare; None when only the baseline runs.
-        overrides: `--set ...` and `--input ...` that changed the document, in order; of files
-            only the names are kept.
+        compare: what to compare; None if only the baseline runs.
+        overrides: `--set ...` and `--input ...` that changed the document, in order; of files only
+            the names are kept.
         datasets: by name; empty when the workflow runs once, on its inputs.
         only_data: names of the datasets to run on; empty for all.
     """
@@ -710,12 +710,12 @@ class Workflow:
 
     @cached_property
     def data_inputs(self) -> frozenset[str]:
-        """Inputs that datasets name; of all datasets, so that a choice moves no address."""
+        """Inputs that datasets name; of all datasets, so that a selection changes no address."""
         return frozenset(name for item in self.datasets.values() for name in item.inputs)
 
     @cached_property
     def data_calls(self) -> frozenset[tuple[str, str]]:
-        """(step, variant) of the method calls whose parameters datasets change."""
+        """Return (step, variant) of the method calls whose parameters datasets change."""
         return frozenset(call for item in self.datasets.values() for call in item.calls)
 
     @cached_property
@@ -725,7 +725,7 @@ class Workflow:
 
     @cached_property
     def has_seeds(self) -> bool:
-        """Whether the seed is a factor, so that addresses of what is random name it."""
+        """Whether the seed is a factor, so that addresses of random steps contain it."""
         return bool(self.seeds) or self.has_data_seeds
 
     def seeds_of(self, dataset: Dataset | None) -> tuple[int, ...]:
@@ -734,7 +734,7 @@ class Workflow:
 
     @cached_property
     def input_specs(self) -> Mapping[str, WorkflowInputSpec]:
-        """Every input that cells may take, by its own name: `scan`, `scan@hall`."""
+        """Return every input that cells may take, by its own name: `scan`, `scan@hall`."""
         chosen = self.chosen_data
         shared = {
             name: spec
@@ -756,7 +756,7 @@ class Workflow:
 
     @property
     def baseline(self) -> dict[str, str]:
-        """Variant of every varied step that runs when nothing is compared."""
+        """Return the variant of every varied step that runs without a comparison."""
         chosen = self.compare.baseline if self.compare else {}
         return {
             step.name: chosen.get(step.name, step.variants[0].name)
@@ -772,7 +772,7 @@ def factors_of(workflow: Workflow) -> frozenset[str]:
 
 
 def is_acyclic(sources: Mapping[str, Sequence[str]]) -> bool:
-    """Whether no step needs itself, directly or through others."""
+    """Whether no step depends on itself, directly or through others."""
     try:
         TopologicalSorter(sources).prepare()
     except CycleError:

@@ -1,4 +1,4 @@
-"""Parameters of method calls: those of the file, of `--set` and of sweeps, and the defaults."""
+"""Parameters of method calls: from the file, `--set` and sweeps, and the defaults."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ from orthoflow.workflow.source import (
 
 Report: TypeAlias = Callable[[str], None]
 
-# Keys of a call that are written among its parameters.
+# Keys of a call that are often written among its parameters.
 _BESIDE: Final = CallSection.model_fields.keys() - {"params"}
 SWEEP: Final = "sweep"
 # Letters of a value that a message repeats.
 _SHOWN: Final = 60
-# Letters of a name, see `NAME_PATTERN`; fewer letters of a parameter would not show which it is.
+# Letters of a name, see `NAME_PATTERN`; fewer letters of a parameter would not identify it.
 _LETTERS: Final = 32
 _MIN_LETTERS: Final = 4
-# What pydantic calls a list or a mapping of another form, and a value of another type in one.
+# Pydantic's names of a list or a mapping of another form, and of a value of another type in one.
 _OF_LISTS: Final = frozenset(
     ("tuple_type", "list_type", "dict_type", "missing", "too_long", "too_short")
 )
@@ -84,7 +84,7 @@ def describe_method(catalog: Catalog, method_id: str) -> MethodInfo:
     """Load a method and read its ports.
 
     Raises:
-        WorkflowError: no plugin brings a method of that id.
+        WorkflowError: no plugin has a method of that id.
         PluginError: it cannot be loaded.
     """
     entry = catalog.method(method_id)
@@ -100,16 +100,16 @@ def describe_method(catalog: Catalog, method_id: str) -> MethodInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class DraftCall:
-    """A method call as the file states it, with its place.
+    """A method call as stated in the file, with its place.
 
     Attributes:
         location: of the mapping that holds `use`.
         name: of the variant, empty for a step without variants.
-        call: what the file states; its parameters without sweeps.
+        call: its content; its parameters without sweeps.
         info: the method, None when it cannot be loaded.
-        kind: ports of its kind, known even when the method is not.
-        swept: of a variant that a sweep made, the parameters and their values.
-        family: of such a variant, the name of the variant that it came from.
+        kind: ports of its kind, known even if the method is not.
+        swept: for a variant made by a sweep, the parameters and their values.
+        family: for such a variant, the name of the original variant.
         is_unswept: the file sweeps it, and the command line sets one value.
     """
 
@@ -134,10 +134,10 @@ class DraftCall:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that `--set` may use for it.
+        """Return names by which `--set` may refer to it.
 
         A step without variants has its method's name, so that `plane.hough2d.cell_m` works in
-        recipes with and without variants; what was swept keeps the name that it had before, too.
+        recipes with and without variants; a swept variant keeps its previous name, too.
         """
         method = self.method.partition(".")[2]
         before = (self.family or method,) if self.swept else ()
@@ -150,7 +150,7 @@ class DraftCall:
 
 @dataclass(frozen=True, kw_only=True)
 class DraftStep:
-    """A step as the file states it, with its place."""
+    """A step as stated in the file, with its place."""
 
     location: Location
     name: str
@@ -180,8 +180,8 @@ class Override:
     """One parameter of one method call, set from the command line or by a dataset.
 
     Attributes:
-        report: takes what is wrong with it, and knows its place.
-        keys: parameter name, and keys inside it when it is a mapping.
+        report: reports a problem at its place.
+        keys: parameter name, and keys inside it if it is a mapping.
         value: JSON.
     """
 
@@ -190,14 +190,14 @@ class Override:
     value: JsonValue
 
 
-# (step, variant) -> what is set; the variant is empty for a step without variants.
+# (step, variant) -> overrides; the variant is empty for a step without variants.
 Overrides: TypeAlias = dict[tuple[str, str], tuple[Override, ...]]
 
 
 def overrides_of_options(
     sets: Sequence[str], steps: Sequence[DraftStep], log: ProblemLog
 ) -> Overrides:
-    """Find the method calls that each `--set` means; what fits nowhere goes to the log."""
+    """Find the method calls of each `--set`; those that match nothing go to the log."""
     assigned: Overrides = {}
     for text in sets:
         report = partial(log.report_option, f"--set {text}")
@@ -217,13 +217,13 @@ def overrides_of_settings(
     *,
     is_column: bool = False,
 ) -> Overrides:
-    """Find the method calls that each `step.parameter: value` of a mapping means.
+    """Find the method calls of each `step.parameter: value` of a mapping.
 
     Args:
         settings: the mapping.
         location: of the mapping in the log's tree.
         steps: of the workflow.
-        log: takes the problems.
+        log: receives the problems.
         is_column: the keys are columns of a table; problems of these name the key alone, so that
             each is reported once.
     """
@@ -264,7 +264,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     try:
         log.raise_any()
     except InvalidWorkflowError as error:
-        # A shell would have parted it at the space.
+        # A shell would have split it at the space.
         way_out = "" if " " in raw.strip() else "; quote it"
         raise ArgumentError(
             f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
@@ -334,12 +334,12 @@ def resolve_call(
 
     Args:
         draft: the method call.
-        overrides: put over what the file states, one after the other.
-        log: takes the problems of what the file states.
-        blame: takes these in the log's place, for a call that is fine without the overrides.
+        overrides: applied to the file's parameters, one after the other.
+        log: receives the problems of the file's parameters.
+        blame: receives these instead of the log, for a call that is correct without the overrides.
 
     Returns:
-        The call; without resolved parameters where they are wrong, or the method is unknown.
+        The call; without resolved parameters if they are wrong, or the method is unknown.
     """
     as_set: dict[str, JsonValue] = deepcopy(draft.call.params)
     for override in overrides:
@@ -371,7 +371,7 @@ def _resolved(
         with guarded(f"checking the parameters of {info.id}"):
             params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
             resolved = params.model_dump(mode="json")
-            # As the step will: a default may be refused once it is given like any other value.
+            # As in the step: a default may be refused once it is given like any other value.
             info.method.Params.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         reports = {override.keys[0]: override.report for override in overrides}
@@ -398,7 +398,7 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
             override.report(f"{key} is not a mapping, so nothing in it can be set")
             return
         place = inner
-    # Several calls may take the same value, and later settings go into it.
+    # Several calls may take the same value, and later settings modify it.
     place[last] = deepcopy(override.value)
 
 
@@ -414,13 +414,13 @@ class _Reporter:
     blame: Report | None
 
     def report_all(self, errors: Sequence[ErrorDetails]) -> None:
-        """Report each; but what is wrong with the form of one list or mapping is one problem."""
+        """Report each; but a wrong form of one list or mapping is one problem."""
         for first, group in itertools.groupby(errors, key=lambda details: details["loc"][:1]):
             several = list(group)
             if form := self._other_form(str(first[0]) if first else "", several):
                 self._report(first, form)
                 continue
-            # Each alternative of a type reports what it would take.
+            # Each alternative of a type reports its own expectation.
             places: dict[Location, list[ErrorDetails]] = {}
             for details in several:
                 places.setdefault(self._location(details), []).append(details)
@@ -428,7 +428,7 @@ class _Reporter:
                 self._report(location, self._message(alternatives, location))
 
     def _location(self, details: ErrorDetails) -> Location:
-        """Where in the parameters an error is, without pydantic's names of alternative types."""
+        """Return the location of an error in the parameters, without pydantic's names of types."""
         here: JsonValue = dict(self.as_set)
         location: Location = ()
         for part in details["loc"]:
@@ -442,7 +442,7 @@ class _Reporter:
         return location
 
     def _other_form(self, name: str, errors: Sequence[ErrorDetails]) -> str:
-        """Return how a parameter is written whose value has another form, else nothing."""
+        """Return how a parameter is written if its value has another form, else nothing."""
         field_info = self.info.method.Params.model_fields.get(name)
         kinds = {details["type"] for details in errors if len(details["loc"]) > 1}
         kinds |= {details["type"] for details in errors} - {"missing"}
@@ -498,7 +498,7 @@ class _Reporter:
         return f"{words}, got {shown}{meant}"
 
     def _sweep_of(self, value: object) -> str:
-        """Return how each value of a list is tried, for a list in the place of one value."""
+        """Return how to sweep a list given instead of one value."""
         is_source = self.draft.kind is not None and self.draft.kind.is_source
         if is_source or not isinstance(value, list) or len(value) < 2:
             return ""
@@ -508,7 +508,7 @@ class _Reporter:
 
 # Sweeps -------------------------------------------------------------------------------------------
 
-# Parameter -> its values, each with what reports a problem of it.
+# Parameter -> its values, each with a function that reports its problems.
 _Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]
 
 
@@ -517,10 +517,10 @@ def expand_sweeps(
 ) -> tuple[tuple[DraftStep, ...], Overrides]:
     """Replace every call that sweeps a parameter by a variant for each value.
 
-    A `--set` of a swept parameter takes the place of the sweep, and may be one itself.
+    A `--set` of a swept parameter replaces the sweep, and may be one itself.
 
     Returns:
-        The steps, and the overrides of their calls, the swept values among them.
+        The steps, and the overrides of their calls, including the swept values.
     """
     expanded: list[DraftStep] = []
     kept: Overrides = {}
@@ -546,7 +546,7 @@ def expand_sweeps(
 def _sweeps_of(
     draft: DraftCall, overrides: Sequence[Override], log: ProblemLog
 ) -> tuple[_Sweeps, tuple[Override, ...]]:
-    """Return what a call sweeps, and the overrides that sweep nothing."""
+    """Return the sweeps of a call, and the overrides that sweep nothing."""
     found: _Sweeps = {}
     for name, value in draft.call.params.items():
         if _is_sweep(value):
@@ -583,7 +583,7 @@ def _is_sweep(value: JsonValue) -> bool:
 
 
 def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Report]]:
-    """Leave out what stands there twice, and report it at its place."""
+    """Drop duplicates, and report them at their places."""
     kept: dict[str, tuple[JsonValue, Report]] = {}
     for value, report in values:
         text = _canonical(value)
@@ -647,7 +647,7 @@ def _numbered(name: str) -> Iterator[str]:
 
 
 def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) -> list[str]:
-    """Name the combinations of a sweep, whatever their order: exact values, else an index.
+    """Name the combinations of a sweep, independent of their order: exact values, else an index.
 
     Args:
         before: name of the variant that is swept, or nothing.
@@ -690,7 +690,7 @@ def _ordered(value: JsonValue) -> tuple[int, float, str]:
 
 
 def _word(value: JsonValue) -> str:
-    """Return a value as a word of a name that states it exactly; empty where there is none."""
+    """Return a value as a word of a name that states it exactly; empty if there is none."""
     if value is None or isinstance(value, bool):
         return {True: "true", False: "false", None: "none"}[value]
     if isinstance(value, int | float):

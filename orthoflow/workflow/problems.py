@@ -16,13 +16,13 @@ Location: TypeAlias = tuple[str | int, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """One thing that is wrong.
+    """One problem.
 
     Attributes:
         file: the workflow file as the user named it, or the command-line option.
         line: from 1; 0 for a command-line option.
         column: from 1; 0 for a command-line option.
-        path: where in the document, keys joined by dots, e.g. `steps.wall.params.gsd_m`.
+        path: location in the document, keys joined by dots, e.g. `steps.wall.params.gsd_m`.
         message: one sentence.
         text: the offending line, empty for a command-line option.
     """
@@ -36,13 +36,13 @@ class Problem:
 
     @property
     def place(self) -> str:
-        """Where it is, as the sentence begins: `hall.yaml:3:9: steps.wall: `."""
+        """Return its place, as the sentence begins: `hall.yaml:3:9: steps.wall: `."""
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
         return f"{where}: {self.path}: " if self.path else f"{where}: "
 
     def __str__(self) -> str:
         head = f"{self.place}{self.message}"
-        # Around the column, so that a line of a thousand characters does not bury the message.
+        # Around the column, so that a line of a thousand characters does not hide the message.
         is_long = len(self.text) > _SNIPPET_WIDTH
         start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]
@@ -67,7 +67,7 @@ class InvalidWorkflowError(_ProblemsError, WorkflowError):
 
 
 class UnusablePluginError(_ProblemsError, PluginError):
-    """A workflow is fine, but plugins it needs are not; `problems` names where it needs them."""
+    """A workflow is correct, but plugins it needs are not; `problems` names where it needs them."""
 
 
 class InvalidArgumentsError(_ProblemsError, ArgumentError):
@@ -82,7 +82,7 @@ class ProblemLog:
         file: the workflow file as the user named it.
         lines: its text.
         tree: its values with their positions, None before it is parsed.
-        unnamed: the first key of locations, where paths do not state it.
+        unnamed: the first key of locations, if paths do not state it.
     """
 
     file: str
@@ -95,7 +95,7 @@ class ProblemLog:
     _in_options: list[Problem] = field(default_factory=list)
 
     def parse(self, text: str) -> Value | None:
-        """Parse YAML; what is wrong with it is added, None when nothing can be read."""
+        """Parse YAML; problems are added, None if nothing can be read."""
         self.tree = read_yaml(text, self)
         return self.tree
 
@@ -137,7 +137,7 @@ class ProblemLog:
             location: where it is in the tree.
             message: one sentence.
             at_key: the position is that of the key.
-            shown: the path that the problem states, where it is another.
+            shown: the path stated in the problem, if it differs.
         """
         path = self.path(location if shown is None else shown)
         self.add(self.position(location, at_key=at_key), path, message)
@@ -149,7 +149,7 @@ class ProblemLog:
             self._in_plugins.append(problem)
 
     def report_input(self, place: Problem | None, message: str) -> None:
-        """Add a problem of input files; the file itself decides the kind of the error."""
+        """Add a problem of input files; the file itself decides the type of the error."""
         if len(self._in_inputs) < MOST_PROBLEMS:
             nowhere = Problem(file=self.file, message="")
             self._in_inputs.append(replace(place or nowhere, message=message))
@@ -161,12 +161,12 @@ class ProblemLog:
             self._in_options.append(problem)
 
     def place(self, location: Location) -> Problem | None:
-        """Return a problem without its message; None where the value comes from no file."""
+        """Return a problem without its message; None if the value comes from no file."""
         position = self.position(location)
         return self._at(position, self.path(location), "") if position.line else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value, of the nearest one around it where there is none."""
+        """Return the position of a value, or of the nearest enclosing one."""
         steps = self._walk(location)
         if at_key and steps and isinstance(steps[-1][1], Entry):
             return steps[-1][1].position
@@ -175,7 +175,7 @@ class ProblemLog:
         return self.tree.position if self.tree else Position(line=1, column=1)
 
     def path(self, location: Location) -> str:
-        """Write a location: `steps.wall.in.cloud[1]`, without the index of what is no list."""
+        """Format a location: `steps.wall.in.cloud[1]`, without indices of non-lists."""
         path, value = "", self.tree
         for part in location:
             if isinstance(part, int):
@@ -188,7 +188,7 @@ class ProblemLog:
         return path
 
     def value(self, location: Location) -> Value | None:
-        """Return the value at a location; None where there is none."""
+        """Return the value at a location; None if there is none."""
         value = self.tree
         for part in location:
             if isinstance(part, int) and not isinstance(value, Listing):
@@ -242,7 +242,7 @@ class ProblemLog:
 
 
 def _inside(value: Value | None, part: str | int) -> tuple[Value | None, Entry | None]:
-    """Return what a key or an index leads to, and the entry of a key."""
+    """Return the value of a key or an index, and the entry of a key."""
     if isinstance(value, Table):
         entry = value.get(str(part))
         return (entry.value, entry) if entry else (None, None)

@@ -71,7 +71,7 @@ _ResolvedName: TypeAlias = Annotated[str, AfterValidator(check_name)]
 
 
 class _Resolved(BaseModel):
-    """The form of a resolved workflow: the record may hold anything."""
+    """The form of a resolved workflow: a record may contain anything."""
 
     orthoflow: Literal[1]
     name: _ResolvedName
@@ -87,8 +87,8 @@ class _Resolved(BaseModel):
 def resolved_json(workflow: Workflow) -> str:
     """Return the workflow with all defaults and overrides as canonical JSON.
 
-    Paths that came from the command line are reduced to their last part: records hold no paths of
-    the machine they were made on.
+    Paths from the command line are reduced to their last part: records contain no paths of the
+    machine on which they were made.
     """
     document: dict[str, object] = {
         "orthoflow": FORMAT,
@@ -141,10 +141,10 @@ def _step_json(step: WorkflowStep) -> dict[str, object]:
 
 
 def workflow_from_resolved(resolved: str, source: str) -> Workflow:
-    """Build a workflow that was checked and resolved before; no plugin is asked.
+    """Build a workflow that was checked and resolved before; plugins are not needed.
 
     Args:
-        resolved: what `resolved_json` returned.
+        resolved: result of `resolved_json`.
         source: text of the workflow file as written.
 
     Raises:
@@ -196,10 +196,10 @@ def _from_resolved(document: _Resolved, source: str) -> Workflow:
 
 
 def _check_resolved(workflow: Workflow) -> None:
-    """Check what the checks of a file have checked, since a record may have been changed.
+    """Repeat the checks of a file, since a record may have been changed.
 
     Raises:
-        ValueError: a value is out of range, or names what is not there.
+        ValueError: a value is out of range, or names something that does not exist.
     """
     factors = factors_of(workflow)
     for dataset in workflow.datasets.values():

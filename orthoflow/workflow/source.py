@@ -1,4 +1,4 @@
-"""Finding and reading a workflow's text, and validating what it holds by the models."""
+"""Finding and reading a workflow's text, and validating its content with the models."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
     """Read a text file of bounded size.
 
     Raises:
-        WorkflowError: it cannot be read, is too large, or is no UTF-8.
+        WorkflowError: it cannot be read, is too large, or is not UTF-8.
     """
     try:
-        # No more than is looked at: what was named by mistake may be a scan.
+        # No more than needed: a file named by mistake may be a scan.
         with open_file(path) as stream:
             content = stream.read(most_bytes + 1)
     except OSError as error:
@@ -104,18 +104,18 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
 def validate(
     model: type[Model], data: JsonValue, log: ProblemLog, location: Location = ()
 ) -> Model | None:
-    """Validate what a document holds; all that does not fit is reported at its place.
+    """Validate the content of a document; all mistakes are reported at their places.
 
-    What does not fit is then left out, so that the checks that follow see all the rest.
+    Invalid parts are then removed, so that the following checks see the rest.
 
     Args:
-        model: what is expected.
+        model: the expected form.
         data: the value at the location.
-        log: has the tree of the document, and takes the problems.
+        log: has the tree of the document, and receives the problems.
         location: of the value in the tree.
 
     Returns:
-        The model of all that fits; None where the whole does not.
+        The model of all valid parts; None if the whole is invalid.
     """
     is_first = True
     while True:
@@ -135,7 +135,7 @@ def validate(
 
 
 def _once(details: Sequence[ErrorDetails]) -> list[ErrorDetails]:
-    """Leave out what follows from another problem: a list that is short of the items in it."""
+    """Drop problems that follow from another: a list that is too short because of its items."""
     locs = [one["loc"] for one in details]
     keys = [loc[:-1] for loc in locs if loc and loc[-1] == "[key]"]
     return [
@@ -149,7 +149,7 @@ def _once(details: Sequence[ErrorDetails]) -> list[ErrorDetails]:
 
 
 def _unfit(data: Any, loc: Location) -> Location:
-    """Return the location of what has to be left out: the innermost value that is there."""
+    """Return the location of what has to be removed: the innermost existing value."""
     for index, part in enumerate(loc):
         is_there = (isinstance(data, dict) and part in data) or (
             isinstance(data, list) and isinstance(part, int) and part < len(data)

@@ -1,4 +1,4 @@
-"""A workflow seen from outside: the JSON Schema of its file, and its steps as a flowchart."""
+"""A workflow for other programs: the JSON Schema of its file, and its steps as a flowchart."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from orthoflow.workflow.parameters import (
 # Any: JSON.
 Schema: TypeAlias = dict[str, Any]
 _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
-# What of a parameter's schema stays where editors look for it when a sweep may take its place.
+# Parts of a parameter's schema that stay where editors look for them if a sweep may replace it.
 _SHOWN: Final = ("description", "default")
 
 
@@ -71,7 +71,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
         }
         section["allOf"] = [{"$ref": "#/$defs/parameters"}]
     call["required"] = ["use"]
-    # With variants, what belongs to a call stands in each of them.
+    # With variants, the keys of a call are in each of them.
     step["oneOf"] = [
         {"required": ["use"], "properties": {"variants": False}},
         {
@@ -106,7 +106,7 @@ def _loadable(catalog: Catalog) -> Iterator[MethodInfo]:
 
 
 def _renamed(schema: Any, info: MethodInfo) -> Any:
-    """Lead the references of a method's own definitions to where they stand now."""
+    """Update the references of a method's own definitions to their new place."""
     if isinstance(schema, dict):
         return {
             key: f"#/$defs/{info.id}.{value.rpartition('/')[2]}"
@@ -126,7 +126,7 @@ def _or_sweep(schema: Schema) -> Schema:
 
 
 def _first_of(schema: Schema) -> Schema:
-    """Without `null`: a key that is there has a value."""
+    """Return it without `null`: a key that is present has a value."""
     choices = schema.pop("anyOf", [])
     chosen = [choice for choice in choices if choice.get("type") != "null"]
     return {**schema, **(chosen[0] if len(chosen) == 1 else {"anyOf": chosen})}
@@ -146,7 +146,7 @@ def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> N
 
 
 def _tidy(schema: Any) -> None:
-    """Drop what is of no use to an editor: titles made of names, `null` as the absence of a key."""
+    """Drop what is of no use to an editor: titles made of names, `null` for absent keys."""
     if isinstance(schema, list):
         for item in schema:
             _tidy(item)
@@ -163,10 +163,10 @@ def _tidy(schema: Any) -> None:
 
 
 def mermaid(workflow: Workflow, catalog: Catalog) -> str:
-    """Draw inputs, steps with their variants, and what flows between them, for Mermaid.
+    """Draw inputs, steps with their variants, and their connections, for Mermaid.
 
-    Dotted edges may stay empty: the port has several candidates, or the input switches the step
-    off. Ports that all methods of a step ignore are not drawn.
+    Dotted edges may stay empty: the port has several candidates, or the input disables the step.
+    Ports that all methods of a step ignore are not drawn.
     """
     # Names may be words that Mermaid reserves, such as `end`; only the labels show them.
     nodes = {f"{INPUTS}.{name}": f"input{k}" for k, name in enumerate(workflow.inputs)}
@@ -197,7 +197,7 @@ def _call_label(variant: StepVariant) -> str:
 
 
 def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str]]:
-    """Source, arrow and label of each wire of a step."""
+    """Yield source, arrow and label of each wire of a step."""
     taken = {
         port for variant in step.variants for port in describe_method(catalog, variant.method).takes
     }

@@ -24,7 +24,9 @@ _METHODS: Final = {
     "plane.hough3d:Hough3d": "Hough transform of voxels, planes in any direction",
     "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or "
     "the plan",
-    "plane.region:Region": "regions grown over neighbouring points with like normals and one plane",
+    "plane.region:Region": (
+        "regions grown over neighbouring points with similar normals and one plane"
+    ),
     "plane.open3d_ransac:Open3dRansac": "open3d's segment_plane, plane after plane, for comparison",
     "plane.open3d_patches:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane that the user gives",
@@ -33,19 +35,19 @@ _METHODS: Final = {
     "distinct",
     "match.sides:FaceByPhotos": "planes whose side was guessed, turned to the side that the photos "
     "show",
-    "match.guided:MatchGuided": "photos laid into the walls by a first pose and measured there",
-    "orient.pnp:OrientPnp": "each photo by itself from its ties, with its accuracy or the reason "
-    "against",
+    "match.guided:MatchGuided": "photos matched with the walls again from a first pose",
+    "orient.pnp:OrientPnp": "each photo separately from its ties, with "
+    "its accuracy or the reason for its refusal",
     "orient.dlt:OrientDlt": "each photo by a direct linear transform, with or without distortion",
     "orient.bundle:OrientColmapBundle": "all photos at once, tied to the walls and to each other, "
     "lenses refined",
-    "orient.given:OrientGiven": "poses from elsewhere, as they are or corrected by ties measured "
-    "by hand",
+    "orient.given:OrientGiven": "poses of other programs, unchanged or "
+    "corrected by ties measured by hand",
     "colour.photos:ColourPhotos": "each point takes the colour of the photo that shows it best",
     "ortho.pointcloud_direct:PointcloudDirect": "the topmost point colours its cell",
-    "ortho.dsm_backward:DsmBackward": "each cell of a wall looks up its colour in the photos that "
-    "see it",
-    "ortho.dsm_forward:DsmForward": "each pixel of a photo is thrown onto the wall it shows",
+    "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its "
+    "colour from the photos that see it",
+    "ortho.dsm_forward:DsmForward": "each pixel of a photo is projected onto the wall it shows",
     "mosaic.seams:MosaicSeams": "one orthoimage per wall from its layers",
     "segment.openings:SegmentOpenings": "windows, doors and niches as outlines, by depth, lines of "
     "sight and picture",
@@ -86,7 +88,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="raster",
-            summary="lay the cloud into a raster on each plane",
+            summary="bin the cloud into a raster on each plane",
             inputs=_ports("cloud planes"),
             outputs=_ports("walls"),
         ),
@@ -110,7 +112,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="ortho",
-            summary="lay photos or the coloured cloud onto the walls",
+            summary="project photos or the coloured cloud onto the walls",
             inputs=_ports("walls cloud photos cameras"),
             outputs=_ports("layers"),
         ),
@@ -122,13 +124,13 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="segment",
-            summary="outline what is on the walls",
+            summary="outline objects on the walls",
             inputs=_ports("walls cloud orthoimages"),
             outputs=_ports("openings"),
         ),
         KindSpec(
             name="inspect",
-            summary="measure how good the orthoimages are",
+            summary="measure the quality of the orthoimages",
             inputs=_ports(
                 "orthoimages walls checkpoints truth cloud planes labels cameras openings"
             ),
@@ -154,7 +156,7 @@ def orthoflow_products() -> list[ProductSpec]:
         _product("photos", "photographs:Photos", "photographs as they were taken"),
         _product("calibration", "photographs:Calibration", "calibrated cameras"),
         _product("checkpoints", "inspections:CheckPoints", "surveyed check points"),
-        _product("truth", "inspections:Truth", "what a simulated scene really is"),
+        _product("truth", "inspections:Truth", "the truth of a simulated scene"),
         _product(
             "planes",
             "planes:Planes",
@@ -169,12 +171,15 @@ def orthoflow_products() -> list[ProductSpec]:
             publisher="publishing",
         ),
         _product(
-            "ties", "photographs:Ties", "points of photos known on walls", publisher="publishing"
+            "ties",
+            "photographs:Ties",
+            "points of photos with known positions on walls",
+            publisher="publishing",
         ),
         _product(
             "cameras", "photographs:Cameras", "orientations of photos", publisher="publishing"
         ),
-        _product("layers", "walls:Layers", "each source laid onto each wall"),
+        _product("layers", "walls:Layers", "each source projected onto each wall"),
         _product(
             "orthoimages", "walls:Orthoimages", "the finished orthoimages", publisher="publishing"
         ),

@@ -554,7 +554,7 @@ def parse_json(text: str, place: str) -> JsonValue:
     """
 
     def refuse(constant: str) -> JsonValue:
-        raise ValueError(f"{constant} is no JSON")
+        raise ValueError(f"{constant} is not valid JSON")
 
     try:
         value: JsonValue = json.loads(text, parse_constant=refuse)

@@ -411,7 +411,7 @@ def _foreign(file: h5py.File) -> ForeignFormatError | None:
         if not all(_is_short_text(file, name) for name in (b"format", b"format_version")):
             name = Path(file.filename).name
             return ForeignFormatError(
-                f"{name} is no record of orthoflow: it does not name that format; give a run.h5"
+                f"{name} is not a record of orthoflow: it does not name that format; give a run.h5"
             )
         is_product = text_attribute(file, "format") == PRODUCT_FORMAT
         check_format(file, PRODUCT_FORMAT if is_product else RUN_FORMAT)
@@ -488,7 +488,7 @@ class _Inspection:
         try:
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
-            raise self._refusal(place, f"is no place in a record: {error}") from error
+            raise self._refusal(place, f"is not a place in a record: {error}") from error
 
     def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         # Two ways to one object make loops, and trees that grow without end from a few bytes.

@@ -279,7 +279,7 @@ def product_path(digest: str) -> str:
     """
     scheme, _, digits = digest.partition(":")
     if f"{scheme}:" != DIGEST_PREFIX or not is_sha256(digits):
-        raise RecordFormatError(f"{digest!r} is no SHA-256 digest")
+        raise RecordFormatError(f"{digest!r} is not a SHA-256 digest")
     return f"/{PRODUCTS}/{digits}"
 
 

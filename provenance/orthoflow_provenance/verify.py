@@ -442,7 +442,7 @@ def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Itera
                 yield Finding(
                     code="reference",
                     place=place,
-                    problem=f"{product.digest!r} is no SHA-256 digest",
+                    problem=f"{product.digest!r} is not a SHA-256 digest",
                 )
             if product.source and outputs.get(product.source, product.digest) != product.digest:
                 yield Finding(

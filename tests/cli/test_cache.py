@@ -111,7 +111,8 @@ def test_a_folder_of_something_else_is_no_store(
         done = CliRunner().invoke(program, [*command, "--store", "."])
     assert done.exit_code == 2
     assert done.stderr == (
-        f"error: {tmp_path} is no store of orthoflow: it holds site and 1 more; name a store, or a "
+        f"error: {tmp_path} is not a store of orthoflow: it holds site and 1 more; name a "
+        "store, or a "
         "folder that is empty or not there yet, with --store\n"
     )
     assert without_bytecode(tmp_path) <= before

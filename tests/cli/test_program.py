@@ -148,8 +148,8 @@ def test_a_value_that_the_shell_took_apart_is_told_so(second: str) -> None:
     words = ["run", "direct.yaml", "--set", "wall.near=[[1,", second, "3]]"]
     result = CliRunner().invoke(program, words)
     assert result.exit_code == 2
-    assert "wall.near=[[1, was taken apart at its spaces" in result.output
-    assert "quotes" in result.output
+    assert "wall.near=[[1, was split at its spaces" in result.output
+    assert "quote the whole value" in result.output
 
 
 def test_version_is_that_of_the_package() -> None:
@@ -191,8 +191,9 @@ def test_a_bug_of_ours_asks_for_debug_instead_of_a_traceback() -> None:
     result = invoke_failing(ZeroDivisionError("division by zero"))
     assert result.exit_code == 1
     assert result.stderr == (
-        "error: orthoflow itself failed (ZeroDivisionError: division by zero); repeat the command "
-        "with --debug and report what it prints\n"
+        "error: orthoflow itself failed (ZeroDivisionError: division by zero); repeat the "
+        "command with "
+        "--debug and report its output\n"
     )
 
 
@@ -245,12 +246,16 @@ def test_only_the_standard_library_click_and_pluggy_load_for_help(tmp_path: Path
 @pytest.mark.parametrize(
     ("error", "code", "sentence"),
     [
-        (MemoryError(), 1, "error: not enough memory to go on"),
-        (OSError(errno.ENOMEM, "Cannot allocate memory"), 1, "error: not enough memory to go on"),
+        (MemoryError(), 1, "error: not enough memory to continue"),
+        (
+            OSError(errno.ENOMEM, "Cannot allocate memory"),
+            1,
+            "error: not enough memory to continue",
+        ),
         (
             ImportError("libhdf5.so: failed to map segment from shared object"),
             1,
-            "error: not enough memory to go on",
+            "error: not enough memory to continue",
         ),
         (
             ImportError("libGL.so.1: cannot open shared object file"),

@@ -101,7 +101,7 @@ def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[s
         "plane: failed in 1 min 15 s: no plane, 1 warning like one above (2 of 5)",
         "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
-        "last: ok in 1.2 s, besides 45.0 s of loading and compiling (5 of 5)",
+        "last: ok in 1.2 s, plus 45.0 s of loading and compiling (5 of 5)",
         "going on with run r1: 1 step",
     ]
 
@@ -137,7 +137,7 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
         assert columns[4] == ["", "peeling", "", ""]
-        whole = "1 of 4 steps ended, time left not known yet"
+        whole = "1 of 4 steps ended, remaining time not yet known"
         assert str(progress.drawn().renderables[1]) == whole
         progress.take(CellStarted(address="plane"))
         assert str(list(progress.table().columns[1].cells)[1]) == "  0 %"
@@ -214,7 +214,7 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         "plane: failed in 1 min 15 s: no plane, 1 warning like one above",
         "wall: skipped",
         "other: ok in 1.2 s",
-        "last: ok in 1.2 s, besides 45.0 s of loading and compiling",
+        "last: ok in 1.2 s, plus 45.0 s of loading and compiling",
     ]
     assert capsys.readouterr().err == ""
 
@@ -310,7 +310,7 @@ def test_a_cell_is_predicted_by_its_last_run_then_by_its_progress(
     assert cell.done(now_s) == pytest.approx(done)
 
 
-UNKNOWN = "time left not known yet"
+UNKNOWN = "remaining time not yet known"
 LEFT = [running(took_s=50.0), CellState(took_s=40.0), CellState(took_s=40.0)]
 
 

@@ -230,8 +230,8 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
         _, rest = running.communicate(timeout=30)
     assert running.returncode == 130
     assert rest.splitlines()[-2:] == [
-        "report of what there is so far: r/report.html",
-        "interrupted; what is finished is kept, and the same command with -o r goes on from there",
+        "report of the finished steps: r/report.html",
+        "interrupted; finished steps are kept, and the same command with -o r goes on from there",
     ]
     assert "Traceback" not in rest
     assert {path.name for path in (tmp_path / "r").iterdir()} == {
@@ -263,7 +263,7 @@ def test_a_run_that_failed_for_want_of_room_goes_on_with_the_same_folder(tmp_pat
     arguments = ("run", "studio.yaml", "-o", "r")
     failed = orthoflow(tmp_path, *arguments, environment={"WORKSHOP_DISK_IS_FULL": "1"})
     assert failed.returncode == 1
-    assert "with more room on the disk, the same command with -o r goes on" in failed.stderr
+    assert "with more disk space, the same command with -o r goes on" in failed.stderr
     assert open_run(tmp_path / "r").cells["paint"].error_type == "DiskSpaceError"
     page = (tmp_path / "r" / "report.html").read_text()
     assert re.search(r'<li>Failed: [^<]+<span class="soft">\(paint\)</span>', page)

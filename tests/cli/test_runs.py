@@ -80,7 +80,7 @@ def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> Non
     # Of the other workflow there is one run: nothing that it differs from.
     assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2"]
     assert rows[4] == ["runs/going", "2026-01-02", "11:00", "hall", "unfinished"]
-    assert lines[6].startswith("runs/going unfinished: goes on with the same command and -o ")
+    assert lines[6].startswith("runs/going unfinished: continues with the same command and -o ")
     assert lines[-1] == "5 runs"
 
 
@@ -226,9 +226,7 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     shown = asked("show", "torn")
     assert shown.exit_code == 3
     assert shown.output.startswith("error: torn/run.h5 cannot be read, the file is damaged: ")
-    assert shown.output.endswith(
-        "; take another copy of it, `orthoflow verify` says whether that one is whole\n"
-    )
+    assert shown.output.endswith("; use another copy, and check it with `orthoflow verify`\n")
     assert shown.output.count("\n") == 1
     assert rows["hostile"]["workflow"] == "\x1b[2Jred"
     assert "\x1b" not in said("runs")
@@ -269,7 +267,7 @@ def test_links_are_not_followed(runs: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("nowhere",), "nowhere is no folder: give folders that runs lie in"),
+        (("nowhere",), "nowhere is not a folder: give folders that contain runs"),
         (("--where", "rmse_u_mm"), "is not a condition: expected a name, one of < <= > >= = !="),
         (("--where", "rmse_u_mm < 2 mm"), "is not a condition"),
         (("--where", "rmse_u < 2"), "no run has a metric or parameter 'rmse_u'; did you mean"),

@@ -92,19 +92,19 @@ def test_an_input_that_is_no_file_is_refused_without_waiting_for_it(world: World
     path = world.folder / "numbers.txt"
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(InputError, match=r"numbers\.txt is no file: expected one that can be read"):
+    with pytest.raises(InputError, match=r"numbers\.txt is not a regular file, which can be"):
         world.plan(STEPS)
 
 
 def test_paths_that_are_no_text_are_refused_before_anything_runs(world: World) -> None:
     odd = Path(os.fsdecode(os.fsencode(world.folder) + b"/\xff\xfe"))
     plan = world.plan("steps: {a: {use: make.range}}")
-    with pytest.raises(ArgumentError, match=r"^the run folder .*\\udcff.* is no UTF-8: rename it"):
+    with pytest.raises(ArgumentError, match=r"^the run folder .*\\udcff.* is not UTF-8: rename it"):
         execute(plan, odd / "run", world.store)
-    with pytest.raises(ArgumentError, match=r"^the store .*\\udcff.* is no UTF-8: rename it"):
+    with pytest.raises(ArgumentError, match=r"^the store .*\\udcff.* is not UTF-8: rename it"):
         execute(plan, world.folder / "run", Store(odd))
     assert not odd.exists()
     odd.mkdir()
     (odd / "numbers.txt").write_text("1")
-    with pytest.raises(InputError, match=r"^the input file .*\\udcff.* is no UTF-8: rename it"):
+    with pytest.raises(InputError, match=r"^the input file .*\\udcff.* is not UTF-8: rename it"):
         world.store.file_digests().digest(odd / "numbers.txt")

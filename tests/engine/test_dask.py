@@ -217,7 +217,7 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
             os.kill(os.getpid(), signal.SIGINT)
 
     world, folder = office.world, office.world.folder / f"broken-off-{own}"
-    with pytest.raises(CancelledStepError, match="the same command goes on"):
+    with pytest.raises(CancelledStepError, match="the same command continues"):
         execute(office.plan(own=own), folder, world.store, interrupt)
     outcome = execute(world.plan(STEPS, force=("second",)), folder, world.store)
     assert digests(outcome) == office.quiet

@@ -363,7 +363,9 @@ def test_a_disk_that_is_full_from_the_start_is_one_sentence(tiny_world: World) -
 def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> None:
     plan_first = "steps: {a: {use: make.range}}"
     (world.folder / "file").write_text("no folder")
-    with pytest.raises(ArgumentError, match=r"file/run can be no folder, for .*/file is a file; "):
+    with pytest.raises(
+        ArgumentError, match=r"file/run cannot be a folder, because .*/file is a file; "
+    ):
         world.run(plan_first, into="file/run")
 
 

@@ -215,5 +215,5 @@ def test_a_product_that_is_read_with_its_arrays_missing_is_damage(world: World) 
 
     first = run(world, STEPS)
     os.truncate(product_file(world, first, "scan"), 3000)
-    with pytest.raises(DamageError, match="was damaged; run again and it is computed anew"):
+    with pytest.raises(DamageError, match="was damaged; run again to compute it again"):
         world.store.get_product(digests(first)["scan.scan"], Scan, is_checked=True)

@@ -118,7 +118,7 @@ def test_an_interrupted_run_says_so(world: World, number: signal.Signals) -> Non
     process.send_signal(number)
     said = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert "CancelledStepError: the run was interrupted; the same command goes on" in said
+    assert "CancelledStepError: the run was interrupted; the same command continues" in said
     assert "Traceback" not in said
     assert events(world, "run")[-1]["event"] == "interrupted"
 
@@ -159,7 +159,7 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
         with pytest.raises(ArgumentError, match="is in use by another run; wait for its end"):
             world.run(STEPS)
         assert is_running(world.folder / "run")
-        with pytest.raises(ArgumentError, match=r"holds no run\.h5 yet: its run is under"):
+        with pytest.raises(ArgumentError, match=r"holds no run\.h5 yet: its run has not ended"):
             find_record(world.folder / "run")
         with pytest.raises(StoreError, match="is in use by a run"):
             collect_garbage(world.store)

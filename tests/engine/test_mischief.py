@@ -126,7 +126,7 @@ def test_a_step_says_that_an_interrupt_was_its_own(world: World) -> None:
 FAILED = {
     "raises_base": "failed unexpectedly: BaseException: of no kind",
     "raises_speechless": "failed unexpectedly: Speechless: a Speechless without words",
-    "raises_nothing": "failed without a word",
+    "raises_nothing": "failed without a message",
     "raises_lines": r"failed unexpectedly: ValueError: one two \x1b[31m \udcff \x00",
 }
 

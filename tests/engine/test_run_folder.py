@@ -121,7 +121,8 @@ def test_below_a_file_there_is_no_folder(tmp_path: Path) -> None:
         with pytest.raises(ArgumentError) as caught:
             Journal(place, "hall")
         assert str(caught.value) == (
-            f"{place} can be no folder, for {tmp_path / 'notes.txt'} is a file; choose another "
+            f"{place} cannot be a folder, because {tmp_path / 'notes.txt'} is a file; choose "
+            "another "
             "folder with -o (in Python: output=)"
         )
 

@@ -62,7 +62,7 @@ def test_a_result_begins_with_what_is_known_of_its_task() -> None:
         (MethodError("no plane"), "no plane"),
         (InputError("a: wrong\nb: wrong"), "a: wrong; b: wrong"),
         (MethodError("one\ntwo"), "one two"),
-        (MethodError(""), "method work.add of toys 1.0 failed without a word"),
+        (MethodError(""), "method work.add of toys 1.0 failed without a message"),
         (MethodError("x" * 4000), "x" * 4000),
         (MethodError("y" * 4001), f"{'y' * 4000}... (4001 characters)"),
     ],

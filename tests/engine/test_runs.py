@@ -231,7 +231,7 @@ def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) 
     warned = [address for address, result in outcome.results.items() if result.warnings]
     assert warned == ["second", "third"]
     assert outcome.results["second"].warnings == (
-        "the code of the method changed during the run: the result is not kept for other runs",
+        "the code of the method changed during the run: the result is not stored",
     )
     results = outcome.results
     assert world.store.result(results["first"].key) == results["first"]

@@ -37,7 +37,9 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_was(
 ) -> None:
     (repository / "results").mkdir()
     before = contents(repository)
-    with pytest.raises(ArgumentError, match=r"\.git is no store of orthoflow: it holds HEAD; name"):
+    with pytest.raises(
+        ArgumentError, match=r"\.git is not a store of orthoflow: it holds HEAD; name"
+    ):
         command(Store(repository))
     assert contents(repository) == before
     (repository / "refs").mkdir()

@@ -256,7 +256,7 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         ),
         (
             "cameras:\n  a.jpg: {width: 4000, height: 3000, fx: 3000,5, fy: 3000}\n",
-            '.5: unknown key, what a decimal comma leaves behind: write decimal points; expected',
+            '.5: unknown key, probably a decimal comma: write decimal points; expected',
         ),
         ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key; expected cameras"),
         ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", 'found duplicate key "a"; remove one'),
@@ -330,7 +330,7 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_file(tmp_path: Path) -> N
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "calibration.yaml"
     path.write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(InputError, match=r"calibration\.yaml is no UTF-8 text"):
+    with pytest.raises(InputError, match=r"calibration\.yaml is not UTF-8 text"):
         read_calibration(path)
     path.write_bytes(b"#" * 1_000_001)
     with pytest.raises(

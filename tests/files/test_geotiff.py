@@ -135,7 +135,7 @@ def test_maps_are_in_metres() -> None:
         require_map_crs(crs)
     # Degrees, and feet.
     for crs in ("EPSG:4326", "EPSG:2263"):
-        with pytest.raises(InputError, match=f"^{crs} is no coordinate system in metres"):
+        with pytest.raises(InputError, match=f"^{crs} is not a coordinate system in metres"):
             require_map_crs(crs)
     assert "25832" in epsg_wkt(25832)
     assert epsg_wkt(999_999) == ""

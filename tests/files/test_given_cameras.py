@@ -366,11 +366,11 @@ OUTSIDE = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><x>&a;</x>'
     [
         (BOMB, "defines a document type"),
         (OUTSIDE, "defines a document type"),
-        (BOMB.encode("utf-16"), "is no UTF-8 text"),
-        ("<document><chunk>", r"c.xml:1: it is no XML: no element found"),
+        (BOMB.encode("utf-16"), "is not UTF-8 text"),
+        ("<document><chunk>", r"c.xml:1: it is not XML: no element found"),
         ("<document/>", "holds no cameras of Metashape"),
         (metashape(np.eye(4)[:3]), "the transform of a must be 16 numbers, got 12"),
-        (metashape(2.0 * np.eye(4)), "the rotation of a is no rotation matrix"),
+        (metashape(2.0 * np.eye(4)), "the rotation of a is not a rotation matrix"),
         (metashape(np.eye(4), lens={**LENS, "f": -1.0}), "the lens of sensor NIKON is none"),
         (metashape(np.eye(4), chunk="<transform><scale>0</scale></transform>"), "must be positive"),
         (metashape(np.diag([1.0, 1, 1, np.nan])), "the transform of a must be numbers, got '1.0"),
@@ -476,18 +476,18 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
     ("files", "message"),
     [
         ({"a.jpg": ""}, "a.jpg holds no cameras that orthoflow reads: expected one cameras.json"),
-        ({"c.json": "[1"}, "c.json: it is no cameras.json of a run"),
-        ({"c.json": "[" * 100_000}, "c.json: it is no cameras.json of a run"),
-        ({"c.json": cameras_json(lambda e: e.pop("K"))}, "it is no cameras.json of a run"),
+        ({"c.json": "[1"}, "c.json: it is not a cameras.json of a run"),
+        ({"c.json": "[" * 100_000}, "c.json: it is not a cameras.json of a run"),
+        ({"c.json": cameras_json(lambda e: e.pop("K"))}, "it is not a cameras.json of a run"),
         ({"c.json": cameras_json(lambda e: e.update(distortion=[0]))}, r"and k1, k2, p1, p2, k3"),
         ({"c.json": cameras_json(lambda e: e.update(R_camera_from_world=[[1] * 3] * 3))},
-         "the rotation of a.jpg is no rotation matrix"),
+         "the rotation of a.jpg is not a rotation matrix"),
         ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0 0 2 a.jpg\n\n"}, "cannot read the C"),
         ({"cameras.txt": CAMERA, "images.txt": "1 0 0 0 0 0 0 0 1 a.jpg\n\n"}, "a.jpg"),
         ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0\n"}, "cannot read the COLMAP model"),
         ({"cameras.txt": "1 PINHOLE 640 480 500 320 240\n", "images.txt": ""}, "cannot read the C"),
         ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
-        ({"cameras.txt": CAMERA, "images.txt": b"1 1 0 0 0 0 0 0 1 \xab.jpg\n\n"}, "is no UTF-8"),
+        ({"cameras.txt": CAMERA, "images.txt": b"1 1 0 0 0 0 0 0 1 \xab.jpg\n\n"}, "is not UTF-8"),
         ({"cameras.bin": b"\0" * 8, "images.bin": b"\1" + b"\0" * 7 + b"x" * 64},
          "images.bin: it ends too early"),
         ({"b.out": "1 0\n", "list.txt": "a.jpg\nb.jpg\n"}, r"1 cameras .* list.txt \(2 lines\)"),
@@ -509,25 +509,25 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "the lens of a.jpg is none: focal length 0, 2"),
         ({"c.json": cameras_json(lambda e: e.update(K=[[1, 0, 0], [0, 2, 0]]))}, r"must be K \(3"),
         ({"c.json": cameras_json(lambda e: e.update(distortion=[0, 0, 0, 0, math.nan]))},
-         "it is no cameras.json of a run"),
+         "it is not a cameras.json of a run"),
         ({"c.json": cameras_json(lambda e: e.update(distortion=[0, 0, 0, 0, "1e999"]))},
          "the lens of a.jpg is none"),
         # A mirror is no turn.
         ({"c.json": cameras_json(
             lambda e: e.update(R_camera_from_world=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]))},
-         "the rotation of a.jpg is no rotation matrix"),
+         "the rotation of a.jpg is not a rotation matrix"),
         # LAPACK never ended with it.
         ({"c.json": cameras_json(
             lambda e: e.update(R_camera_from_world=[[1, 0, 0], [7.5, 1, 0], [0, 0, 1]])
         ).replace("7.5", "1e309")},
-         "the rotation of a.jpg is no rotation matrix"),
+         "the rotation of a.jpg is not a rotation matrix"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0\n"},
          "c.csv:2: the focal length of a.jpg must be positive, got 0"),
         ({"c.csv": "name,heading,x,y,z\n"}, "the column pitch is missing"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,zero,0,0,0,0,0,0\n"}, "c.csv:2: the parameters"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,four,0,0\n"}, "c.csv:2: the parameters"),
-        ({"c.csv": HEAD + "x" * 200_000 + ",1\n"}, "c.csv: it is no table: field larger than"),
-        ({"c.json": cameras_json(lambda e: e.update(width=math.inf))}, "no cameras.json of a run"),
+        ({"c.csv": HEAD + "x" * 200_000 + ",1\n"}, "c.csv: it is not a table: field larger than"),
+        ({"c.json": cameras_json(lambda e: e.update(width=math.inf))}, "not a cameras.json"),
         ({"c.json": cameras_json(lambda e: e.update(sigma_wall_mm=[1]))},
          "sigma_wall_mm of a.jpg must be numbers"),
         ({"c.json": cameras_json(lambda e: e.update(width=10**30))},
@@ -598,7 +598,7 @@ def test_rounded_rotations_are_made_right_and_others_refused(tmp_path: Path, tur
     text = cameras_json(lambda entry: entry.update(R_camera_from_world=rotation.tolist()))
     paths = write(tmp_path, {"c.json": text})
     if turned > 1e-4:
-        with pytest.raises(InputError, match="no rotation matrix"):
+        with pytest.raises(InputError, match="not a rotation matrix"):
             read_given_cameras(paths)
         return
     (given,) = read_given_cameras(paths)

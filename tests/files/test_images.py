@@ -88,7 +88,7 @@ def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None
 @pytest.mark.parametrize("encoded", [b"", b"<html>" + bytes(40), b"\x89PNG\r\n\x1a\n"])
 def test_what_is_no_image_is_told_with_its_size(encoded: bytes) -> None:
     with pytest.raises(
-        InputError, match=rf"image (is no JPEG|cannot be decod).* \({len(encoded)} "
+        InputError, match=rf"image (is not a JPEG|cannot be decod).* \({len(encoded)} "
     ):
         images.decode_image(encoded)
 
@@ -221,7 +221,7 @@ def test_an_encoded_image_is_shrunk_to_a_longest_side_and_never_enlarged() -> No
         same = images.shrunk_webp(encoded, "a.png", longest_side_px=longest_side_px)
         assert images.decode_image(same).shape == image.shape
     assert photo_format(same) == "WebP"
-    with pytest.raises(InputError, match=r"a\.png is no JPEG"):
+    with pytest.raises(InputError, match=r"a\.png is not a JPEG"):
         images.shrunk_webp(b"", "a.png", longest_side_px=20)
 
 

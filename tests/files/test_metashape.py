@@ -184,10 +184,10 @@ def test_cameras_of_all_chunks_are_read_wherever_the_chunks_stand(tmp_path: Path
             document(chunk="<transform><scale>-2</scale></transform>"),
             "the scale of the chunk must be positive, got -2",
         ),
-        (document(sensors=SENSOR.replace(SIZE, "")), "NIKON does not say how many pixels it has"),
+        (document(sensors=SENSOR.replace(SIZE, "")), "NIKON does not state its size in pixels"),
         (
             document(sensors=SENSOR.replace('height="480"', 'height="0"')),
-            "NIKON does not say how many pixels it has",
+            "NIKON does not state its size in pixels",
         ),
         ('<!ENTITY a "b">' + document(), "defines a document type"),
         (document(cameras=""), "holds no cameras of Metashape"),

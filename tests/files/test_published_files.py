@@ -160,7 +160,7 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
     publishing.publish_walls(walls(), tmp_path, DIGEST)
     files = {f"wall_2_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")}
     assert names_in(tmp_path) == files
-    content = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+    content = "depth in metres along the normal, positive towards the viewer; NaN = no data"
     assert json_of(tmp_path / "wall_2_depth.json") == {
         **PLACED,
         "wall": 2,
@@ -171,9 +171,9 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
         "content": content,
         "name": "north",
         "mask": {
-            "0": "void: no point of the scan fell here",
-            "1": "measured: points of the scan fell here",
-            "2": "recovered: taken from neighbouring cells",
+            "0": "void: no point of the scan is in this cell",
+            "1": "measured: points of the scan are in this cell",
+            "2": "recovered: interpolated from neighbouring cells",
         },
         "mask_counts": {"0": 1, "1": 4, "2": 1},
         "product_digest": DIGEST,
@@ -202,12 +202,12 @@ def test_each_raster_of_a_wall_says_what_it_holds(tmp_path: Path) -> None:
     stems |= {"wall_3_depth", "wall_3_depth_p5_0", "wall_3_depth_p50_0"}
     suffixes = (".tif", ".json", ".png", ".pgw")
     assert names_in(tmp_path) == {f"{stem}{suffix}" for stem in stems for suffix in suffixes}
-    depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+    depth = "depth in metres along the normal, positive towards the viewer; NaN = no data"
     contents = {
         "wall_2_depth": (DEPTH, depth),
         "wall_2_depth_p5_0": (DEPTH, f"percentile 5.0 of the cell's points: {depth}"),
         "wall_2_depth_p50_0": (DEPTH + 1.0, f"percentile 50.0 of the cell's points: {depth}"),
-        "wall_2_intensity": (intensity, "intensity 0..1 (laser); NaN = nothing"),
+        "wall_2_intensity": (intensity, "intensity 0..1 (laser); NaN = no data"),
         "wall_3_depth": (DEPTH, depth),
     }
     for stem, (values, content) in contents.items():
@@ -255,7 +255,7 @@ def test_orthoimages_are_told_completely(
             "1": "painted: a source shows this cell",
             "2": "filled: inpainted from neighbouring cells",
             "3": "occluded: hidden in every source",
-            "4": "no surface: the scan does not know the surface here",
+            "4": "no surface: the scan has no surface here",
             "5": "contradicted: painted by one photo alone, and the scan has another colour here",
         },
         "mask_counts": {"0": 1, "1": 2, "2": 1, "3": 1, "4": 1},

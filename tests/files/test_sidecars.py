@@ -83,7 +83,7 @@ def test_long_values_are_cut_in_messages() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\xff", r"a\.json is no UTF-8 text"),
+        (b"\xff", r"a\.json is not UTF-8 text"),
         (b"{", r"a\.json: no JSON, "),
         (b"[]", r"a\.json: expected a JSON object with origin_world"),
     ],

@@ -132,11 +132,11 @@ def test_names_of_columns_may_be_followed_by_a_number(tmp_path: Path) -> None:
         (f"{ALL}P,1,2,3,a,5,6\n", ["p.csv:2: wall must be a number, got a"]),
         (
             "P,1,2,3\n" + "x" * 10_001,
-            ["p.csv:2: the line is longer than 10000 letters: this is no list"],
+            ["p.csv:2: the line is longer than 10000 letters: this is not such a table"],
         ),
         (
             b"P,1,2,\xff\n",
-            [f"p.csv is no UTF-8 text: {POINTS_EXPECTED}; save it as UTF-8"],
+            [f"p.csv is not UTF-8 text: {POINTS_EXPECTED}; save it as UTF-8"],
         ),
     ],
 )

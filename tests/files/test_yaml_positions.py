@@ -110,7 +110,7 @@ def test_plain_values_are_those_of_yaml_1_2(text: str, value: object) -> None:
         ("a: {~: x}", (1, 5, "a", "a key must be text, got ~")),
         ("a:\n  ? [x]\n  : 1", (2, 5, "a", "a key must be text, got a list or mapping")),
         ("a: [x, !foo y]", (1, 8, "a[1]", "tags are not allowed in a workflow, got !foo")),
-        ("a: !!int x", (1, 4, "a", "'x' is no int")),
+        ("a: !!int x", (1, 4, "a", "'x' is not a valid int")),
         ("a: &b {c: *b}", (1, 4, "", "the value contains itself through its anchor")),
         (
             "%YAML 1.1\n---\na: 1",
@@ -227,7 +227,7 @@ def test_keys_and_values_are_counted(text: str, n_values: int) -> None:
         ("a: {: x}", (1, 6, "a"), "a key must be text, got nothing"),
         ("a: !foo {b: 1}", (1, 4, "a"), "tags are not allowed in a workflow, got !foo"),
         ("b: !foo [1]", (1, 4, "b"), "tags are not allowed in a workflow, got !foo"),
-        (f"a: 0x{'1' * 999}", (1, 4, "a"), f"'0x{'1' * 98}...' is no int"),
+        (f"a: 0x{'1' * 999}", (1, 4, "a"), f"'0x{'1' * 98}...' is not a valid int"),
     ],
     ids=[
         "decimal comma",

@@ -180,7 +180,7 @@ KNOWN: Final = {
         target="WORKFLOW",
         file="w.yaml",
         content=_STEPS.encode() + b"seed: 0x" + b"f" * 5000,
-        words="is no int",
+        words="is not a valid int",
     ),
     "a seed that no record can keep": Known(
         target="WORKFLOW",

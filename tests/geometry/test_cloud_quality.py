@@ -181,8 +181,8 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
         "point is 2.0 mm away: planes and depths"
     )
     assert apart == (
-        "the scans disagree: where two show one surface they lie 9.4 mm apart across it (median), "
-        "while each scatters by 3.1 mm: register them again, or take one at a time"
+        "the scans disagree: where two show one surface they are 9.4 mm apart (median), "
+        "while the scatter of each is 3.1 mm: register them again, or use one at a time"
     )
     thin = context(tmp_path)
     report_quality(replace(quality, scan_step_m=0.0032, scans_apart_m=0.003), thin)

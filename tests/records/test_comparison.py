@@ -183,7 +183,7 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
     assert repr(told).endswith("differ; 2 steps in one of them only>")
     shown = studio("compare", "first", "swept").stdout
     assert "steps: 0 of 2 differ, 2 only in B" in shown
-    assert "compared, though called otherwise: paint (A) and paint@paint=grey-128 (B)" in shown
+    assert "compared despite different names: paint (A) and paint@paint=grey-128 (B)" in shown
     of_both = re.findall("^(.*): .*, of the 2 steps that both have$", shown, re.MULTILINE)
     assert of_both == ["parameters (* set, others are defaults)", "metrics"]
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}

@@ -132,7 +132,7 @@ def test_a_cell_that_no_path_can_name_is_refused_whatever_is_asked(
     for command in (("verify",), *COMMANDS):
         done = finished(command[0], run, *command[1:])
         assert done.exit_code == 3, (command, done.output)
-        assert "is no place in a record" in done.output
+        assert "is not a place in a record" in done.output
     assert sorted(path.name for path in folder.iterdir()) == ["run"]
 
 

@@ -204,7 +204,7 @@ def test_a_run_that_is_held_open_looks_at_its_record_once(
 
 def test_a_record_that_is_gone_cannot_be_held_open(run: Run) -> None:
     run.path.unlink()
-    with pytest.raises(ArgumentError, match="is no file"), run.held_open():
+    with pytest.raises(ArgumentError, match="is not a file"), run.held_open():
         pass
 
 

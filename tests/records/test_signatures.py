@@ -179,10 +179,10 @@ def test_what_is_no_signature_is_a_finding_only_when_one_is_asked_for(
         path.write_text(content)
     done = finished("verify", run)
     assert done.exit_code == 0, done.output
-    assert "note: run.h5.sig is no signature, or damaged" in done.output
+    assert "note: run.h5.sig is not a signature, or is damaged" in done.output
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
-    assert "\nrun.h5.sig is no signature, or damaged" in done.stdout
+    assert "\nrun.h5.sig is not a signature, or is damaged" in done.stdout
     assert "\x1b" not in done.output
 
 
@@ -193,9 +193,12 @@ def test_what_is_no_signature_is_a_finding_only_when_one_is_asked_for(
         (("sign", "--key", "jane.pub"), "check: sign with the private one, jane"),
         (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
         (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
-        (("verify", "--signer", "jane"), "jane is no public key in OpenSSH or PEM format"),
+        (("verify", "--signer", "jane"), "jane is not a public key in OpenSSH or PEM format"),
         (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),
-        (("verify", "--signer", "studio.yaml"), "studio.yaml is no public key in OpenSSH or PEM"),
+        (
+            ("verify", "--signer", "studio.yaml"),
+            "studio.yaml is not a public key in OpenSSH or PEM",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )
@@ -217,7 +220,7 @@ def test_the_password_of_a_key_is_asked_for(
     monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: "wrong")
     done = finished("sign", run, "--key", key)
     assert done.exit_code == 2
-    assert "or the password is another one" in done.output
+    assert "or the password is wrong" in done.output
     monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: PASSWORD)
     assert finished("sign", run, "--key", key).exit_code == 0
     assert finished("verify", run, "--signer", "jane.pub").exit_code == 0

@@ -135,7 +135,7 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     require_unchanged(run, products / "same")
     require_unchanged(run)
     for name, sentence in (
-        ("folder", "is not named in the record of the run, so nothing vouches for it"),
+        ("folder", "is not named in the record of the run, so it cannot be checked"),
         ("other", "other was changed after the run: the record says that it has the digest"),
         ("link", "link cannot be read: no file"),
         ("gone", "gone cannot be read: missing"),
@@ -211,8 +211,8 @@ def test_a_record_without_a_signature_has_nothing_said_of_it(
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ({"creator": "CloudCompare"}, "x.h5 is no record of orthoflow: it does not name"),
-        ({"format": "colmap-db"}, "x.h5 is no record of orthoflow: it does not name"),
+        ({"creator": "CloudCompare"}, "x.h5 is not a record of orthoflow: it does not name"),
+        ({"format": "colmap-db"}, "x.h5 is not a record of orthoflow: it does not name"),
         (
             {"format": np.bytes_("colmap-db"), "format_version": np.bytes_("1"), "creator": "C"},
             "x.h5 must be of format orthoflow-run, got 'colmap-db'",

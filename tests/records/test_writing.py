@@ -173,7 +173,7 @@ def test_what_was_broken_off_is_shown_and_stays_unfinished(executed: Executed) -
         "survey": "ok",
         "paint": "skipped",
     }
-    assert seen[0].cells["paint"].error_message == "not computed yet: the run was broken off"
+    assert seen[0].cells["paint"].error_message == "not computed yet: the run was interrupted"
     assert (executed.folder / "products" / "survey" / "planes.json").is_file()
     assert not list(executed.folder.glob("*run.h5*"))
     assert executed.write().record.status == "ok"

@@ -49,7 +49,7 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
     (tmp_path / "elsewhere").symlink_to(tmp_path / "a", target_is_directory=True)
     assert run_folders([tmp_path]) == [tmp_path / name for name in found]
     with pytest.raises(
-        ArgumentError, match=r"b/run\.h5 is no folder: give folders that runs lie in"
+        ArgumentError, match=r"b/run\.h5 is not a folder: give folders that contain runs"
     ):
         run_folders([tmp_path, tmp_path / "b" / "run.h5"])
 
@@ -293,7 +293,7 @@ def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path
     assert told == RunSummary(
         folder=folder,
         state="unfinished",
-        reason=f"goes on with the same command and -o {folder}",
+        reason=f"continues with the same command and -o {folder}",
         workflow="hall",
         run_id="x",
         started="2026-01-02T11:00:00Z",

@@ -253,7 +253,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
         (
             "check",
             "completeness",
-            "painted, not filled, of the surface that is seen at all",
+            "painted, not filled, of the visible surface",
             Sense.MORE,
         ),
         ("check", "wall_s", "time / s", Sense.LESS),

@@ -171,7 +171,7 @@ def test_a_system_in_degrees_and_one_that_is_none_are_refused(shell: Shell) -> N
     points, rgb = site(2)
     write_las(shell.folder / "site.laz", points[::50], rgb=rgb[::50])
     for crs, said in (
-        ("EPSG:4326", "no coordinate system in metres"),
+        ("EPSG:4326", "not a coordinate system in metres"),
         ("EPSG:9999", "there is no"),
     ):
         ended = shell(

@@ -244,7 +244,7 @@ def test_a_new_kind_that_cannot_be_is_refused(
         ([], "give --kind, the kind of the method"),
         (["--new-kind", "part", "--gives", "a,b"], "of a and b no plugin has a product type"),
         (["--new-kind", "part", "--gives", "truth"], "no installed method makes truth of cloud"),
-        (["--kind", "plane", "--new-kind", "part"], "exclude each other: leave one of them out"),
+        (["--kind", "plane", "--new-kind", "part"], "exclude each other: omit one of them"),
     ],
 )
 def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], said: str, tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) 
         (("hall.las", "--recipe", "photos-on-scan"), "photos-on-scan needs photos, and there are"),
         (
             ("hall.las", "-o", "notes.txt"),
-            "notes.txt is there already: choose another name with -o",
+            "notes.txt exists already: choose another name with -o",
         ),
         (("torn.las",), "torn.las"),
     ],
@@ -186,7 +186,7 @@ def test_no_name_of_a_file_says_more_than_that_it_is_one(
 def test_a_path_that_is_no_text_is_left_out(data: Path) -> None:
     bad = os.fsdecode(os.fsencode(data) + b"/\xff.las")
     write_scan(data / "b.las").rename(bad)
-    assert "not used: \\udcff.las: its path is no UTF-8: rename it" in said("new", data)
+    assert "not used: \\udcff.las: its path is not UTF-8: rename it" in said("new", data)
     assert "udcff" not in Path("workflow.yaml").read_text().partition("What follows")[2]
 
 
@@ -462,7 +462,7 @@ def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
         (
             "calibration.yaml",
             'cameras:\n  "*.jpg": {width: 9, height: 9, fx: 9,1, fy: 9, cx: 4, cy: 4}\n',
-            "unknown key, what a decimal comma leaves behind: write decimal points",
+            "unknown key, probably a decimal comma: write decimal points",
         ),
     ],
 )

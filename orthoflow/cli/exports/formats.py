@@ -68,7 +68,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "figures": Format(
         writer="results:export_figures",
-        summary="every figure, the plan of the photos and the curves of sweeps, for publication: "
+        summary="all figures, the plan of the photos and the curves of sweeps, for publication: "
         "--format pdf, svg or png",
         options=frozenset({"cell", "figure_format"}),
     ),
@@ -85,7 +85,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "layers": Format(
         writer="results:export_layers",
-        summary="what each photo shows of each wall by itself, as GeoTIFFs, from the store unless "
+        summary="the part of each photo on each wall, as GeoTIFFs, from the store unless "
         "the run was made with --embed",
         options=frozenset({"cell"}),
     ),
@@ -107,7 +107,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "e57": Format(
         writer="clouds:export_e57",
-        summary="the same as E57, a scan each with its pose",
+        summary="the same as E57, one scan each with its pose",
         options=_CLOUD_OPTIONS,
     ),
     "gltf": Format(
@@ -126,13 +126,15 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "plan": Format(
         writer="sections:export_plans",
-        summary="the room cut level at --height above the floor, as DXF, SVG and PDF to scale",
+        summary=(
+            "the room cut horizontally at --height above the floor, as DXF, SVG and PDF to scale"
+        ),
         options=_SECTION_OPTIONS | {"heights_m"},
         takes_rasters=True,
     ),
     "section": Format(
         writer="sections:export_sections",
-        summary="the room cut upright through two places of the plan, likewise",
+        summary="the room cut vertically through two points of the plan, likewise",
         options=_SECTION_OPTIONS | {"through"},
         takes_rasters=True,
     ),
@@ -144,7 +146,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "relief": Format(
         writer="drawings:export_relief",
-        summary="each wall in raking light, with contour lines and depths in colour",
+        summary="each wall as shaded relief, with contour lines and depths in colour",
         options=frozenset({"cell", "wall", "light"}),
         takes_rasters=True,
     ),
@@ -162,7 +164,10 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "prov": Format(
         writer="results:export_prov",
-        summary="W3C PROV-JSON: which products came of which, by which method of which software",
+        summary=(
+            "W3C PROV-JSON: which products were derived from which, by which method of "
+            "which software"
+        ),
     ),
     "stac": Format(
         writer="results:export_stac",
@@ -220,12 +225,12 @@ def check_choices(chosen: Choices, target: str | None) -> None:
     """
     if target is None and not chosen.embed and not chosen.split:
         raise ArgumentError(
-            f"say what to write: --to {listed(tuple(FORMATS))}, or --embed or --split"
+            f"choose what to write: --to {listed(tuple(FORMATS))}, or --embed or --split"
         )
     said = f"--to {target}" if target else "--split" if chosen.split else "--embed"
     if chosen.split and (target or chosen.embed):
         raise ArgumentError(
-            f"--split writes records of its own, so it does not go with "
+            f"--split writes records of its own, so it cannot be combined with "
             f"{f'--to {target}' if target else '--embed'}: split first, then export each, as "
             f"orthoflow export RUN/datasets/NAME {f'--to {target}' if target else '--embed'}"
         )

@@ -24,7 +24,7 @@ _MOST_NAMED: Final = 5
 # What a product type is called where a cell has none, and where a run has none.
 _SAID: Final = {
     "cameras": ("orientations", "has oriented no photos"),
-    "layers": ("layers", "has laid nothing onto walls"),
+    "layers": ("layers", "has projected nothing onto walls"),
     "cloud": ("clouds", "has read no cloud"),
     "orthoimages": ("orthoimages", "has made no orthoimages"),
     "labels": ("labels of points", "has found no planes"),

@@ -107,7 +107,7 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
         for flag, said in (("--license", chosen.license_text), ("--author", author))
         if not said
     ]
-    told = f"; it does not say what {' and '.join(lacking)} would" if lacking else ""
+    told = f"; it does not state what {' and '.join(lacking)} would" if lacking else ""
     return f"{counted(len(files), 'file')}, described in {files[0].name}{told}"
 
 

@@ -42,8 +42,8 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
     planes = last_product(run, branch_of(run, address), Planes, chosen.store)
     if planes is None:
         raise ArgumentError(
-            f"the orthoimages of {address} come of no planes of this run, so nothing says which "
-            "way is up"
+            f"the orthoimages of {address} belong to no planes of this "
+            "run, so the up direction is unknown"
         )
     depths = _depths(run, address, orthos, chosen.wall) if chosen.relief else None
     make_empty(folder)
@@ -120,8 +120,8 @@ def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
     found = ortho_files(paths)
     if not found:
         raise ArgumentError(
-            f"no orthoimages of {address} lie below {run.products_folder}: give the run folder as "
-            "the run left it"
+            f"no orthoimages of {address} lie below {run.products_folder}: pass the "
+            "unmodified run folder"
         )
     if chosen.wall is not None:
         numbered = {ortho.wall: ortho for ortho in found}

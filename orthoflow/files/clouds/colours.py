@@ -1,4 +1,4 @@
-"""Colours of points by what is known of them: plane, intensity, distance from the plane."""
+"""Colours of points by plane, intensity or distance from the plane."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from orthoflow.products import PointCloud
 
-# Hues by the golden ratio: planes of near numbers never look alike.
+# Hues by the golden ratio: planes with close numbers have different colours.
 _HUE_STEP: Final = 0.618033988749895
 _SATURATION: Final = 0.6
 UNKNOWN: Final = (128, 128, 128)
-# What is darkest in intensity keeps so much of its plane's colour.
+# The darkest intensity keeps this share of its plane's colour.
 _DARKEST: Final = 0.4
 _PIECES: Final = 64
 _PIECE: Final = 4096
-# Behind the plane, on it, before it.
+# Behind the plane, on it, in front of it.
 BEHIND: Final = (33, 102, 172)
 ON_PLANE: Final = (247, 247, 247)
 BEFORE: Final = (178, 24, 43)
 
 
 def plane_colour(index: int) -> tuple[int, int, int]:
-    """Colour (red, green, blue) of a plane by its position in `Planes`; -1 is grey.
+    """Return the colour (red, green, blue) of a plane by its position in `Planes`; -1 is grey.
 
     >>> plane_colour(-1), plane_colour(0)
     ((128, 128, 128), (255, 102, 102))
@@ -39,7 +39,7 @@ def plane_colour(index: int) -> tuple[int, int, int]:
 def plane_colours(
     plane: NDArray[np.int16], palette: NDArray[np.float64], grey: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Colours (n, 3) of points on planes, darker where their grey (n,), 0..1, is.
+    """Return colours (n, 3) of points on planes, darkened by their grey (n,), 0..1.
 
     Args:
         plane: (n,) number of the plane, -1 for none.
@@ -51,7 +51,7 @@ def plane_colours(
 
 
 def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArray[np.uint8]:
-    """Colours (n, 3) of signed distances: blue behind, white on, red before; grey for NaN.
+    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; grey for NaN.
 
     >>> deviation_colours(np.array([-0.01, 0.0, 0.02, np.nan], dtype=np.float32), 0.01).tolist()
     [[33, 102, 172], [247, 247, 247], [178, 24, 43], [128, 128, 128]]
@@ -64,7 +64,7 @@ def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArra
 
 
 def round_scale_m(largest_m: float) -> float:
-    """Return the next of 1, 2, 5, 10 ... mm, a scale that people read.
+    """Return the next of 1, 2, 5, 10 ... mm, for a readable scale.
 
     >>> round_scale_m(0.0031), round_scale_m(0.0), round_scale_m(0.09)
     (0.005, 0.001, 0.1)
@@ -77,7 +77,7 @@ def round_scale_m(largest_m: float) -> float:
 
 
 def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
-    """Brightness (n,) of points: root of the intensity, else mean of the colours, else 1."""
+    """Return the brightness (n,) of points: root of intensity, else mean of the colours, else 1."""
     if cloud.intensity is not None:
         intensity = np.nan_to_num(np.asarray(cloud.intensity[part], dtype=np.float64))
         return np.sqrt(np.maximum(intensity, 0.0))
@@ -88,7 +88,7 @@ def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
 
 
 def grey_range(cloud: PointCloud) -> tuple[float, float]:
-    """Between which greys most points lie, told from pieces all over the cloud."""
+    """Return the range of grey of most points, estimated from pieces all over the cloud."""
     if (cloud.intensity is None and cloud.rgb is None) or not len(cloud):
         return 0.0, 1.0
     sample = np.concatenate([greys(cloud, piece) for piece in sampled_pieces(len(cloud))])
@@ -97,6 +97,6 @@ def grey_range(cloud: PointCloud) -> tuple[float, float]:
 
 
 def sampled_pieces(n_points: int) -> list[slice]:
-    """Short pieces all over a cloud, none of them over another; all of a small one."""
+    """Return short disjoint pieces all over a cloud; all of a small one."""
     firsts = range(0, n_points, max(_PIECE, n_points // _PIECES))
     return [slice(k, min(k + _PIECE, n_points)) for k in firsts]

@@ -1,9 +1,9 @@
 """A cloud as COPC 1.0: a LAZ file whose chunks are the nodes of an octree, coarse ones first.
 
 Each node holds one point of each cell of its grid, its children hold points between those, and a
-node of few points keeps all of them. Points wait in files beside the one that is written, so that
-memory does not follow their number: they are sorted in groups along a Morton curve, none of which
-cuts a cell of the root's grid.
+node of few points keeps all of them. Points are buffered in files beside the output, so that memory
+does not grow with their number: they are sorted in groups along a Morton curve, none of which cuts
+a cell of the root's grid.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from orthoflow.files.clouds.dressing import BLOCK, DressedCloud
 from orthoflow.files.clouds.las import las_header, las_record
 from orthoflow.files.points.libraries import load_library
 
-# Bits of a place along an axis; the grid of a node has 2^7 cells a side.
+# Bits of a position along an axis; the grid of a node has 2^7 cells per side.
 _PLACE_BITS: Final = 21
 _GRID_BITS: Final = 7
 _DEEPEST: Final = _PLACE_BITS - _GRID_BITS
@@ -40,21 +40,21 @@ _SPREADS: Final = (
 )
 _INFO: Final = struct.Struct("<5d2Q2d88x")
 _ENTRY: Final = struct.Struct("<4iQ2i")
-# The chunks follow eight bytes that say where their table is.
+# The chunks follow eight bytes with the position of their table.
 _TABLE_BYTES: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Waiting:
-    """Points that wait to be written, in mapped files.
+    """Buffered points, in mapped files.
 
     Attributes:
-        records: (n,) points as LAS stores them.
-        codes: (n,) uint64 places along the Morton curve of the root.
+        records: (n,) points as in LAS.
+        codes: (n,) uint64 positions along the Morton curve of the root.
         order: (n,) int64 numbers of the points, group after group.
         counts: points of each cell of the root's grid, along the curve.
         low: (3,) int64 lowest corner of the root, in steps of the file.
-        side: of the root, likewise.
+        side: side of the root, likewise.
     """
 
     records: NDArray[np.void]
@@ -66,7 +66,7 @@ class _Waiting:
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        """Which group each cell belongs to; a group begins with a cell, none cuts one."""
+        """Return the group of each cell; a group begins with a cell, none cuts one."""
         return (np.cumsum(self.counts) - self.counts) // _IN_MEMORY_POINTS
 
 
@@ -75,7 +75,7 @@ class _Nodes:
     """Runs of points of one node each, coarse nodes first; a node has a run per group.
 
     Attributes:
-        key: (r,) uint64 level of the node, and below it 42 bits of its place along the curve.
+        key: (r,) uint64 level of the node, followed by 42 bits of its position along the curve.
         first: (r,) int64 where the run begins in `_Waiting.order`.
         count: (r,) int64.
     """
@@ -86,11 +86,11 @@ class _Nodes:
 
 
 def write_copc(path: Path, dressed: DressedCloud) -> int:
-    """Write the chosen points, and give their number.
+    """Write the chosen points, and return their number.
 
     Raises:
         PluginError: laspy or lazrs does not load.
-        OSError: the disk refuses.
+        OSError: the disk cannot be written.
     """
     laspy = load_library("laspy", path)
     header = las_header(laspy, dressed)
@@ -106,7 +106,7 @@ def write_copc(path: Path, dressed: DressedCloud) -> int:
 # Any: laspy and lazrs have no types.
 def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     lazrs = load_library("lazrs", Path(file.name))
-    # A cube in steps of the file is one in metres, too: they are the same along all axes.
+    # A cube in steps of the file is one in metres, too, because all axes have the same step.
     half = 0.5 * waiting.side * float(header.scales[0])
     middle = header.offsets + header.scales * waiting.low + half
     sizes = (*middle.tolist(), half, 2.0 * half / 2**_GRID_BITS)
@@ -117,7 +117,7 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     )
     header.vlrs.append(laspy.vlrs.known.LasZipVlr(packed.record_data()))
     header.are_points_compressed = True
-    # Extents begin with nothing instead of with 0.
+    # Extents begin empty instead of with 0.
     header.partial_reset()
     header.write_to(file)
     compressor = lazrs.LasZipCompressor(file, packed)
@@ -142,7 +142,7 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
 
 
 def _waiting(laspy: Any, header: Any, dressed: DressedCloud, folder: Path) -> _Waiting | None:
-    """Put the chosen points into files, with their places on the curve, ordered by groups."""
+    """Write the chosen points to files, with their positions on the curve, sorted into groups."""
     lowest, highest = [], []
     kind = None
     with (folder / "records").open("wb") as stream:
@@ -156,7 +156,7 @@ def _waiting(laspy: Any, header: Any, dressed: DressedCloud, folder: Path) -> _W
         return None
     records = np.memmap(folder / "records", dtype=kind, mode="r")
     n_points = len(records)
-    # A step around it, and an odd number of them: then no point lies on a border of nodes, which
+    # A margin of one step, and an odd number of steps: then no point is on a border of nodes, which
     # readers compute from rounded metres.
     low = np.min(lowest, axis=0) - 1
     span = int((np.max(highest, axis=0) - low).max())
@@ -186,7 +186,7 @@ def _waiting(laspy: Any, header: Any, dressed: DressedCloud, folder: Path) -> _W
 
 
 def _codes(waiting: _Waiting, part: slice) -> NDArray[np.uint64]:
-    """Places of points along the curve: bits of x, y and z in turn, from the lowest."""
+    """Positions of points along the curve: bits of x, y and z interleaved, from the lowest."""
     records = waiting.records[part]
     codes = np.zeros(len(records), dtype=np.uint64)
     for axis, name in enumerate("XYZ"):
@@ -203,16 +203,16 @@ def _root_cells(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 
 def _ancestors(codes: NDArray[np.uint64], level: int) -> NDArray[np.uint64]:
-    """Cubes of a level, of which there are 8^level, that places lie in."""
+    """Return the cubes of a level, of which there are 8^level, that contain positions."""
     return codes >> np.uint64(3 * (_PLACE_BITS - level))
 
 
 def _nodes(waiting: _Waiting) -> _Nodes:
-    """Order each group by its nodes."""
+    """Sort each group by its nodes."""
     counts, order = waiting.counts, waiting.order
     totals = [counts.reshape(8**level, -1).sum(axis=1) for level in range(_GRID_BITS + 1)]
     sizes = np.bincount(waiting.groups, weights=counts).astype(np.int64)
-    # A cell of more points than a group takes the numbers of others.
+    # A cell with more points than a group occupies the numbers of others.
     sizes = sizes[sizes > 0]
     keys, firsts, runs = [], [], []
     for end, size in zip(np.cumsum(sizes), sizes, strict=True):
@@ -240,7 +240,7 @@ def _nodes(waiting: _Waiting) -> _Nodes:
 
 
 def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Levels of the nodes that keep points, which are sorted along the curve."""
+    """Return levels of the nodes that keep points, which are sorted along the curve."""
     levels = np.full(len(codes), _DEEPEST, dtype=np.int64)
     left = np.arange(len(codes))
     for level in range(_DEEPEST):
@@ -263,20 +263,20 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
 
 
 def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
-    """Return the points of one node after the other."""
+    """Yield the points of one node after the other."""
     begins = np.flatnonzero(np.append(True, np.diff(nodes.key) != 0))
     for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
         runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)
         index = np.concatenate([waiting.order[first : first + count] for first, count in runs])
-        # In the order of the cloud, which compresses best and does not tell the groups.
+        # In the order of the cloud, which compresses best and does not reveal the groups.
         yield np.sort(index)
 
 
 def _tree(nodes: _Nodes, chunks: Sequence[tuple[int, int]], offset: int) -> bytes:
-    """The hierarchy: level, x, y, z, offset, bytes and points of each chunk, in their order."""
+    """Return the hierarchy: level, x, y, z, offset, bytes and points of each chunk, in order."""
     entries = []
     for key, (n_points, n_bytes) in zip(np.unique(nodes.key).tolist(), chunks, strict=True):
-        # No level has more bits of a place than stand below its number.
+        # No level has more bits of a position than there are below its number.
         level = key >> _KEY_BITS
         x, y, z = (
             sum((key >> (3 * bit + axis) & 1) << bit for bit in range(level)) for axis in range(3)

@@ -1,4 +1,4 @@
-"""`cloud.json`: what the points beside it are, and what their colours and fields mean."""
+"""`cloud.json`: what the points beside it are, and the meaning of their colours and fields."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MEANINGS: Final = {
 
 
 def describe_cloud(path: Path, dressed: DressedCloud, name: str, n_points: int) -> None:
-    """Write what a cloud's file holds, beside it.
+    """Write the description of a cloud's file beside it.
 
     Raises:
         StoreError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Points ready to be written, piece by piece: chosen, coloured, with plane and normal."""
+"""Points prepared for writing, piece by piece: selected, coloured, with plane and normal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
-# Points at once: ten of their copies take some hundred megabytes.
+# Points per piece: ten copies of them take some hundred megabytes.
 BLOCK: Final = 1 << 20
 _SCALE_PERCENT: Final = 99.0
 _NOTHING: Final = np.zeros(0, dtype=np.float32)
@@ -33,17 +33,18 @@ _NOTHING: Final = np.zeros(0, dtype=np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class Points:
-    """Some points with all that is written of them; None is not known of this cloud.
+    """Some points with all their values; None if unknown for this cloud.
 
     Attributes:
         world: (n, 3) float64 metres.
         rgb: (n, 3) uint8.
-        normal: (n, 3) float32 unit vectors towards the viewer, 0 0 0 where there is no surface.
+        normal: (n, 3) float32 unit vectors towards the viewer, 0 0 0 without a surface.
         intensity: (n,) float32, 0..1.
         scan: (n,) uint16.
         plane: (n,) int16, -1 for none.
-        deviation_m: (n,) float32 from the plane, positive towards the viewer; NaN without one.
-        photo: (n,) int16 which photo gave the colour, -1 for none.
+        deviation_m: (n,) float32 distance from the plane, positive towards the viewer; NaN without
+            one.
+        photo: (n,) int16 photo that gave the colour, -1 for none.
     """
 
     world: NDArray[np.float64]
@@ -60,7 +61,7 @@ class Points:
 
     # Any: each has a type of its own.
     def fields(self) -> dict[str, NDArray[Any]]:
-        """What is known besides place, colour and normal, as files call it."""
+        """Names of the values besides position, colour and normal, as in files."""
         every = {
             "intensity": self.intensity,
             "scan": self.scan,
@@ -73,23 +74,23 @@ class Points:
 
 @dataclass(frozen=True, kw_only=True)
 class DressedCloud:
-    """A cloud and what it is dressed in.
+    """A cloud and the values added to its points.
 
     Attributes:
         cloud: the points.
-        colouring: what their colours show.
-        neighbourhoods: of the cloud.
-        planes: None where the run found none; then there are no deviations.
-        labels: of the cloud's points, likewise.
+        colouring: what their colours represent.
+        neighbourhoods: neighbourhoods of the cloud.
+        planes: None if the run found none; then there are no deviations.
+        labels: labels of the cloud's points, likewise.
         photo_colours: for the colouring `photos`.
-        photo_names: of these, by their numbers.
-        wall: only points over this raster, as far before and behind it as it reaches; deviations
-            are then those from its plane.
+        photo_names: names of these photos, by number.
+        wall: only points over this raster, within its depths in front and behind; deviations are
+            then those from its plane.
         wall_plane: number of the plane of that wall.
         box_world: (2, 3) only points between these corners.
-        is_cleaned: without points that are alone.
-        crs_wkt: coordinate system of the world, as WKT; empty where nobody said.
-        name: what the cloud is called in files.
+        is_cleaned: without isolated points.
+        crs_wkt: coordinate system of the world, as WKT; empty if unknown.
+        name: name of the cloud in files.
     """
 
     cloud: PointCloud
@@ -108,9 +109,9 @@ class DressedCloud:
 
     @cached_property
     def scale_m(self) -> float:
-        """Deviation that has the full colour: what 99 of 100 points keep, rounded up to 1-2-5.
+        """Return the deviation with full colour: the 99th percentile, rounded up to 1-2-5.
 
-        Told from short pieces all over the cloud, of the points in them that are written.
+        Estimated from short pieces all over the cloud, from their selected points.
         """
         found = [
             deviations[self._chosen(piece, None)]
@@ -123,12 +124,12 @@ class DressedCloud:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no point is chosen."""
+        """Whether no point is selected."""
         return not any(self._chosen(part, None).any() for part in self._parts())
 
     @cached_property
     def scans(self) -> tuple[int, ...]:
-        """Numbers of the scans that have points, cropping aside."""
+        """Return numbers of the scans that have points, before cropping."""
         found: set[int] = set()
         if self.cloud.scan is None:
             return (0,)
@@ -137,7 +138,7 @@ class DressedCloud:
         return tuple(sorted(found))
 
     def station(self, scan: int) -> NDArray[np.float64] | None:
-        """Where a scan was taken from (3,), None where the files did not say it of each scan."""
+        """Return the station of a scan (3,), None if the files do not state one for each scan."""
         cloud = self.cloud
         if cloud.stations is None or cloud.stations_source != "file":
             return None
@@ -147,7 +148,7 @@ class DressedCloud:
         return np.asarray(cloud.stations[scan], dtype=np.float64)
 
     def bounds_world(self, scan: int | None = None) -> NDArray[np.float64] | None:
-        """Smallest and largest coordinates (2, 3) of the chosen points; None without any."""
+        """Return smallest and largest coordinates (2, 3) of the selected points, or None."""
         found = [
             (world.min(axis=0), world.max(axis=0))
             for part in self._parts()
@@ -161,7 +162,7 @@ class DressedCloud:
         )
 
     def blocks(self, scan: int | None = None) -> Iterator[Points]:
-        """Return the chosen points in their order, of all scans or of one."""
+        """Yield the selected points in order, of all scans or of one."""
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():
@@ -218,7 +219,7 @@ class DressedCloud:
         )
 
     def _deviations(self, part: slice) -> NDArray[np.float32] | None:
-        """Signed distances (n,) from the wall's plane, else from the plane that has the point."""
+        """Return signed distances (n,) from the wall's plane, else from each point's own plane."""
         if self.wall is not None:
             plane = self.wall.frame.plane
             distances = self.cloud.points_world(part) @ plane.normal - plane.offset_m
@@ -241,7 +242,7 @@ class DressedCloud:
         if self.colouring == "rgb" and cloud.rgb is not None:
             rgb = np.array(cloud.rgb[part])
             if cloud.has_rgb is not None:
-                # Grey, where a scan took no colours.
+                # Grey for a scan without colours.
                 is_grey = ~np.asarray(cloud.has_rgb[part])
                 rgb[is_grey] = np.rint(255.0 * np.clip(greys(cloud, part)[is_grey], 0, 1))[:, None]
             return rgb
@@ -262,7 +263,7 @@ class DressedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """1 or -1 (n,): normals point to the scanner, else where the plane's does, else up."""
+        """Return 1 or -1 (n,): normals point to the scanner, else as that of the plane, else up."""
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:
@@ -283,6 +284,6 @@ class DressedCloud:
 
     @cached_property
     def _palette(self) -> NDArray[np.float64]:
-        # int16 has no more.
+        # Limit of int16.
         highest = -1 if self.labels is None else int(self.labels.plane_index.max(initial=-1))
         return np.array([plane_colour(k) for k in range(-1, highest + 1)], dtype=np.float64)

@@ -27,7 +27,7 @@ _NORMALS: Final = ("nor:normalX", "nor:normalY", "nor:normalZ")
 
 @dataclass(frozen=True, kw_only=True)
 class _Writer:
-    """An E57 file that is being written."""
+    """An E57 file under construction."""
 
     # Any: libE57 has no types.
     libe57: Any
@@ -45,11 +45,11 @@ class _Writer:
 
 
 def write_e57(path: Path, dressed: DressedCloud) -> int:
-    """Write the chosen points, scan by scan and piece by piece; gives their number.
+    """Write the selected points, scan by scan and piece by piece; return their number.
 
-    A scan whose station is known has it as its pose and its points from there, along the axes of
-    the world: the cloud does not keep how the instrument was turned. Others have the cloud's
-    origin for a pose, so that survey coordinates keep their digits.
+    A scan with a known station has it as its pose, and points relative to it, along the axes of the
+    world, because the cloud does not keep the rotation of the instrument. Others have the cloud's
+    origin as pose, so that survey coordinates keep their digits.
 
     Raises:
         PluginError: pye57 does not load.
@@ -64,7 +64,7 @@ def write_e57(path: Path, dressed: DressedCloud) -> int:
 
 
 def _write_head(writer: _Writer, dressed: DressedCloud) -> Any:
-    """Write what stands before the scans, the same on another day; gives the list of scans."""
+    """Write what precedes the scans, independent of the date; return the list of scans."""
     libe57, image = writer.libe57, writer.image
     for prefix, uri in {"": libe57.E57_V1_0_URI, **EXTENSIONS}.items():
         image.extensionsAdd(prefix, uri)
@@ -95,12 +95,12 @@ def _write_scan(writer: _Writer, scans: Any, dressed: DressedCloud, scan: int) -
     low, high = limits - centre
     node = writer.libe57.StructureNode(writer.image)
     name = f"scan {scan}" if station is not None else f"scan {scan}, station not known"
-    # The same cloud gives the same name.
+    # The same cloud gets the same name.
     unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{dressed.name}:{scan}")
     node.set("guid", writer.text(f"{{{unique}}}"))
     node.set("name", writer.text(name))
     node.set("description", writer.text(f"orthoflow {__version__}"))
-    # Of the points as they are in the file.
+    # Of the points as stored in the file.
     corners = zip("xyz", low, high, strict=True)
     bounds = {f"{axis}{end}": float(v) for axis, a, b in corners for end, v in _ends(a, b)}
     node.set("cartesianBounds", writer.group(**bounds))
@@ -165,12 +165,12 @@ def _field(libe57: Any, image: Any, name: str, kind: np.dtype[Any]) -> Any:
 
 
 def _columns(points: Points, centre: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Fields of points in types that pye57 takes."""
-    # The scan is told by the Data3D.
+    """Return fields of points in types that pye57 accepts."""
+    # The Data3D states the scan.
     fields = {name: values for name, values in points.fields().items() if name != "scan"}
     own = {"plane", "deviation", "photo"}
     return {
-        # Readers ask for it, though all are valid.
+        # Readers require it, though all are valid.
         _STATE: np.zeros(len(points), dtype=np.int8),
         **dict(zip(_AXES, (points.world - centre).T, strict=True)),
         **dict(zip(_COLOURS, points.rgb.T, strict=True)),

@@ -19,14 +19,14 @@ _VERSION: Final = "1.4"
 _SCALE_M: Final = 1e-4
 _NO_DATE: Final = dt.date(1970, 1, 1)
 _LARGEST: Final = 2.0**30
-# As CloudCompare and PDAL name them.
+# Names as in CloudCompare and PDAL.
 NORMAL_FIELDS: Final = ("NormalX", "NormalY", "NormalZ")
 
 
 def write_laz(path: Path, dressed: DressedCloud) -> int:
-    """Write the chosen points, piece by piece; gives their number.
+    """Write the selected points, piece by piece; return their number.
 
-    World coordinates are kept to a tenth of a millimetre, from the offset of the header.
+    World coordinates are stored to a tenth of a millimetre, relative to the offset of the header.
 
     Raises:
         PluginError: laspy does not load.
@@ -81,11 +81,11 @@ def las_header(laspy: Any, dressed: DressedCloud) -> Any:
     )
     header.scales = np.full(3, _scale_m(cloud))
     header.offsets = np.floor(cloud.origin)
-    # LAS 1.4 asks for it with this point format, known coordinate system or not.
+    # LAS 1.4 requires it with this point format, with or without a known coordinate system.
     header.global_encoding.wkt = True
     if dressed.crs_wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(dressed.crs_wkt))
-    # The same cloud gives the same bytes on another day; laspy would write today's.
+    # Independent of the date, so that the same cloud gives the same bytes.
     header.creation_date = _NO_DATE
     header.generating_software = "orthoflow"
     return header

@@ -1,7 +1,7 @@
-"""What lies about each point of a cloud: the direction of its surface, and whether it is alone.
+"""The neighbourhood of each point of a cloud: surface normal, and whether it is isolated.
 
 The cloud is read piece by piece into voxels that keep count and moments of their points, so that
-memory follows the voxels, of which there are about a million at most.
+memory depends on the number of voxels, about a million at most.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from orthoflow.files.clouds.photo_colours import spacing_of
 from orthoflow.products import PointCloud
 
-# A voxel in spacings of points: with its 26 neighbours, a surface is twelve spacings wide.
+# Side of a voxel in point spacings: with its 26 neighbours, a surface is twelve spacings wide.
 _VOXEL_SPACINGS: Final = 4.0
 _VOXELS_MOST: Final = 1_000_000
-# For outliers, 3 x 3 x 3 voxels are one: sparse ends of a scan have few points about them too.
+# For outliers, 3 x 3 x 3 voxels are joined: sparse ends of a scan have few neighbours, too.
 _COARSER: Final = 3
 _ALONE_FEWER_THAN: Final = 10
 _POINTS_LEAST: Final = 6
@@ -33,14 +33,14 @@ _MOMENTS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbourhoods:
-    """What is known of the voxels of a cloud.
+    """The neighbourhoods of the voxels of a cloud.
 
     Attributes:
         low: (3,) float64 metres from the cloud's origin.
-        side_m: of a voxel.
+        side_m: side of a voxel.
         keys: (v,) int64, sorted.
-        normals: (v, 3) float32 unit vectors of unknown sign, 0 0 0 where there is no surface.
-        alone: (v,) True where fewer than 10 points lie within about 18 spacings.
+        normals: (v, 3) float32 unit vectors of unknown sign, 0 0 0 without a surface.
+        alone: (v,) True if fewer than 10 points are within about 18 spacings.
     """
 
     low: NDArray[np.float64]
@@ -50,12 +50,12 @@ class Neighbourhoods:
     alone: NDArray[np.bool_]
 
     def places(self, offsets: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Which voxel (n,) each point (n, 3) lies in; metres from the cloud's origin."""
+        """Return the voxel (n,) of each point (n, 3); metres from the cloud's origin."""
         return np.searchsorted(self.keys, _keys(offsets, self.low, self.side_m))
 
 
 def neighbourhoods_of(cloud: PointCloud) -> Neighbourhoods:
-    """Look at a cloud once."""
+    """Compute the neighbourhoods of a cloud in one pass."""
     spacing_m = spacing_of(cloud)
     per_voxel = max(_VOXEL_SPACINGS**2, len(cloud) / _VOXELS_MOST)
     side_m = spacing_m * float(np.sqrt(per_voxel))
@@ -71,7 +71,7 @@ def neighbourhoods_of(cloud: PointCloud) -> Neighbourhoods:
 
 
 def offsets_of(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
-    """Points (n, 3) of a piece, metres from the cloud's origin."""
+    """Return points (n, 3) of a piece, metres from the cloud's origin."""
     return np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]]).astype(np.float64)
 
 
@@ -85,7 +85,7 @@ def _keys(
 def _moments(
     cloud: PointCloud, low: NDArray[np.float64], side_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Sorted voxels, and of each the count, the sums and the sums of products of its points."""
+    """Return sorted voxels with count, sums and sums of products of their points."""
     keys = np.zeros(0, dtype=np.int64)
     moments = np.zeros((0, 10))
     for first in range(0, len(cloud), _AT_ONCE):
@@ -103,7 +103,7 @@ def _moments(
 
 
 def _neighbour_sums(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums over 3 x 3 x 3 voxels."""
+    """Return sums over 3 x 3 x 3 voxels."""
     sums = np.zeros_like(values)
     for dx, dy, dz in product((-1, 0, 1), repeat=3):
         wanted = keys + ((dx << 42) + (dy << 21) + dz)

@@ -1,4 +1,4 @@
-"""Which photo shows a point best, and its colour there."""
+"""The photo that shows a point best, and the point's colour there."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Box
 
 UNSEEN_GREY: Final = 128
-# A point so little behind the nearest one is seen as well, and points with fewer about them are
-# outliers, unless a user says otherwise.
+# Default tolerance behind the nearest point, and minimum number of neighbours of points that hide
+# others.
 TOLERANCE_M: Final = 0.05
 OCCLUDER_POINTS_MIN: Final = 6
-# Towards the border of a photo its lens is known less well: quality falls to 0 over this share.
+# Towards the border of a photo its lens is less certain: quality decreases to 0 over this share.
 _BORDER_SHARE: Final = 0.05
-# OpenCV takes pictures of fewer than 32,767 rows.
+# OpenCV accepts pictures of fewer than 32,767 rows.
 _REMAPPED_AT_ONCE: Final = 30_000
 _PROJECTED_AT_ONCE: Final = 1 << 19
 _SAMPLED_MOST: Final = 200_000
-# So much of the points at either end of an axis may be outliers.
+# This share of the points at either end of an axis may be outliers.
 _OUTSIDE_PERCENT: Final = 0.5
-# The cloud's longest side is cut into so many cubes to see how large its surfaces are.
+# The cloud's longest side is divided into this many cubes to estimate the size of its surfaces.
 _CUBES: Final = 64
 
 
@@ -41,8 +41,8 @@ class PointColours:
 
     Attributes:
         rgb: (n, 3) uint8, `UNSEEN_GREY` where no photo sees the point.
-        best: (n,) float32 quality of the photo that won, 0 where none sees the point.
-        photo: (n,) int16 which photo won, -1 for none; None if nobody wants to know.
+        best: (n,) float32 quality of the chosen photo, 0 if none sees the point.
+        photo: (n,) int16 chosen photo, -1 for none; None if not requested.
     """
 
     rgb: NDArray[np.uint8]
@@ -62,18 +62,18 @@ def colour_points(
 ) -> None:
     """Assign each point the colour of the photo that shows it best.
 
-    A point is seen where no nearer point of the whole cloud lies before it, outliers left out.
-    Of several photos that see it, the one with the most pixels per metre wins, away from its
-    border; its colour is interpolated between four pixels.
+    A point is seen if no nearer point of the whole cloud hides it, outliers excluded. Of several
+    photos that see it, the one with the most pixels per metre is used, away from its border; its
+    colour is interpolated between four pixels.
 
     Args:
         cloud: the points.
         oriented: photos with their cameras.
-        colours: what is filled.
-        tolerance_m: a point so little behind the nearest one is seen as well.
-        occluder_points_min: points with fewer about them, themselves included, hide nothing.
-        threads: how many threads look at once; it does not show in the result.
-        progress: told the share done and the photo's name before each photo.
+        colours: output.
+        tolerance_m: points at most this far behind the nearest one are seen, too.
+        occluder_points_min: points with fewer neighbours, themselves included, hide nothing.
+        threads: number of threads; it does not change the result.
+        progress: called with the finished share and the photo's name before each photo.
     """
     from orthoflow.geometry.occluders import depth_buffer, occluders_in
 
@@ -96,13 +96,13 @@ def colour_points(
 
 
 def spacing_of(cloud: PointCloud) -> float:
-    """How far apart points of a surface lie, metres, from the cubes that they pass through."""
+    """Estimate the spacing of points of a surface, metres, from the cubes that they occupy."""
     return _extent(cloud).spacing_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadyPhoto:
-    """A photo's camera, shifted to the cloud's origin, and what stands before it."""
+    """A photo's camera, relative to the cloud's origin, and its depth buffer."""
 
     camera: ViewingCamera
     buffer: DepthBuffer
@@ -116,7 +116,7 @@ def _colour(
     ready: _ReadyPhoto,
     colours: PointColours,
 ) -> None:
-    """Colour what a photo sees better than those before it; what they had is changed."""
+    """Colour the points that a photo sees better than those before it, replacing their colours."""
     import cv2
 
     image = decode_image(photo.encoded, photo.name)
@@ -142,10 +142,10 @@ def _colour(
 
 @dataclass(frozen=True, kw_only=True)
 class _ShownPoints:
-    """Some points of a cloud as a photo has them.
+    """Some points of a cloud projected into a photo.
 
     Attributes:
-        index: (n,) int64 points that lie inside the photo.
+        index: (n,) int64 points inside the photo.
         pixels: (n, 2) float64 column, row.
         depth_m: (n,) float64 along the optical axis.
     """
@@ -156,11 +156,11 @@ class _ShownPoints:
 
 
 def _points_in_photo(cloud: PointCloud, camera: ViewingCamera) -> Iterator[_ShownPoints]:
-    """Project a cloud, part by part; gives the points inside the photo.
+    """Project a cloud, part by part; return the points inside the photo.
 
     Args:
         cloud: the points.
-        camera: shifted to the cloud's origin.
+        camera: relative to the cloud's origin.
     """
     for start in range(0, len(cloud), _PROJECTED_AT_ONCE):
         part = slice(start, start + _PROJECTED_AT_ONCE)
@@ -173,13 +173,13 @@ def _points_in_photo(cloud: PointCloud, camera: ViewingCamera) -> Iterator[_Show
 
 
 def _is_seen(shown: _ShownPoints, buffer: DepthBuffer, tolerance_m: float) -> NDArray[np.bool_]:
-    """Which points (n,) no nearer surface hides by more than the tolerance."""
+    """Report which points (n,) no nearer surface hides by more than the tolerance."""
     places = (shown.pixels / buffer.reduction).astype(np.int64)
     return shown.depth_m <= buffer.nearest[places[:, 1], places[:, 0]] + tolerance_m
 
 
 def _quality(shown: _ShownPoints, camera: ViewingCamera) -> NDArray[np.float32]:
-    """Pixels per metre squared, less near the photo's border."""
+    """Return pixels per metre squared, decreasing near the photo's border."""
     size = np.array([camera.width, camera.height], dtype=np.float64)
     rim = np.minimum(shown.pixels, size - shown.pixels).min(axis=1) / size.min()
     quality: NDArray[np.float32] = (
@@ -190,13 +190,13 @@ def _quality(shown: _ShownPoints, camera: ViewingCamera) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Extent:
-    """Where most of a cloud lies, metres from its origin, and how far apart its points are.
+    """The extent of most of a cloud, metres from its origin, and its point spacing.
 
     Attributes:
         low: (3,) float64.
         high: (3,) float64.
-        side_m: of the cubes that it was looked at in.
-        spacing_m: between neighbouring points of a surface, about.
+        side_m: side of the cubes used for the estimate.
+        spacing_m: approximate spacing of the points of a surface.
     """
 
     low: NDArray[np.float64]
@@ -217,7 +217,7 @@ def _extent(cloud: PointCloud) -> _Extent:
 
 
 def _box_of(cloud: PointCloud, cameras: Sequence[ViewingCamera]) -> Box:
-    """The box about cameras and the cloud but for outliers, with the spacing of its points."""
+    """Return the box around cameras and cloud without outliers, with the point spacing."""
     from orthoflow.geometry.occluders import Box
 
     extent = _extent(cloud)

@@ -1,6 +1,6 @@
-"""A cloud as binary PLY, double coordinates.
+"""A cloud as binary PLY with double coordinates.
 
-Written by hand: libraries that write PLY want all points at once, or know no fields of one's own.
+A writer of our own: libraries for PLY need all points at once, or do not support custom fields.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from orthoflow.files.clouds.dressing import DressedCloud, Points
 
 _TYPES: Final = {"f8": "double", "f4": "float", "u1": "uchar", "u2": "ushort", "i2": "short"}
-# As many digits as any number of points has; written again when it is known.
+# As many digits as any number of points has; overwritten when the number is known.
 _DIGITS: Final = 12
 
 
 def write_ply(path: Path, dressed: DressedCloud) -> int:
-    """Write the chosen points, piece by piece; gives their number.
+    """Write the selected points, piece by piece; return their number.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the disk cannot be written.
     """
     n_written = 0
     count_at = 0

@@ -1,1 +1,1 @@
-"""Drawings of walls and rooms: sheets in scale, CAD files and vectors."""
+"""Drawings of walls and rooms: sheets to scale, CAD files and vectors."""

@@ -1,4 +1,4 @@
-"""Pictures that CAD files refer to: PNG as wide as the raster, written row by row."""
+"""Pictures referenced by CAD files: PNG of the size of the raster, written row by row."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LEVEL: Final = 4
 
 
 def write_cad_picture(raster: Path, path: Path) -> tuple[int, int]:
-    """Write an orthoimage as PNG, every cell a pixel, transparent where it shows nothing.
+    """Write an orthoimage as PNG, one pixel per cell, transparent where empty.
 
     Returns:
         Rows and columns.
@@ -46,7 +46,7 @@ def write_cad_picture(raster: Path, path: Path) -> tuple[int, int]:
                     last = min(rows, first + step)
                     box = (0.0, float(first), float(columns), float(last))
                     values, shown = source.read(box, (last - first, columns))
-                    # White below what is transparent, for programs that know no transparency.
+                    # White behind transparency, for programs that do not support it.
                     pixels = np.full((last - first, columns, 4), 255, dtype=np.uint8)
                     pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
                     pixels[..., 3] = np.where(shown, 255, 0)

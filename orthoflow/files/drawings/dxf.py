@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """A layer as the US National CAD Standard names it.
+    """A layer with a name of the US National CAD Standard.
 
     Attributes:
-        holds: what lies on it.
-        colour: as CAD programs number them.
-        weight: of its lines, hundredths of a millimetre, as ISO 128 grades them.
+        holds: its content.
+        colour: number of the colour in CAD programs.
+        weight: width of its lines, hundredths of a millimetre, as in ISO 128.
     """
 
     holds: str
@@ -56,7 +56,7 @@ LAYERS: Final = {
 _TEXT_M: Final = 0.125
 _METRES: Final = 6
 _VERSION: Final = "R2010"
-# Programs that show no attributes have the same as text beside the mark.
+# For programs that do not show attributes the same is written as text beside the mark.
 _UNSEEN: Final = {"flags": 1}
 _GRID_STEPS_M: Final = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0, 100.0)
 _MOST_LINES: Final = 12
@@ -66,10 +66,10 @@ _LEVEL_BLOCK: Final = "LEVEL"
 
 
 def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
-    """Write a wall in the coordinates of its GeoTIFF, its orthoimage in exact scale.
+    """Write a wall in the coordinates of its GeoTIFF, with its orthoimage to scale.
 
-    Layers are those of `LAYERS` for elevations. Openings are rectangles or arches where those fit;
-    a text states how far the outline that was found leaves them. Marks are blocks with attributes.
+    Layers are those of `LAYERS` for elevations. Openings are rectangles or arches if those fit; a
+    text states their deviation from the outline that was found. Marks are blocks with attributes.
 
     Raises:
         StoreError: it cannot be written.
@@ -114,8 +114,8 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
 def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> None:
     """Write a room in the coordinates of its scan, with a coordinate system `wall_<k>` per wall.
 
-    Layers are those of `LAYERS` for walls: edges, the outline at the height of the floor, faces
-    between floor and ceiling, openings, surveyed points, and each orthoimage in its place.
+    Layers are those of `LAYERS` for walls: edges, the outline at floor height, faces between floor
+    and ceiling, openings, surveyed points, and each orthoimage at its position.
 
     Raises:
         StoreError: it cannot be written.
@@ -146,15 +146,15 @@ def _new_document() -> tuple[Drawing, Modelspace]:
         layer.description = given.holds
     add_dimension_style(document, _TEXT_M)
     _add_blocks(document)
-    # LibreCAD takes the limits of paper space for its paper, and them for metres: A3.
+    # LibreCAD takes the limits of paper space as its paper, in metres: A3.
     document.paperspace().dxf.limmax = (0.42, 0.297)
     return document, document.modelspace()
 
 
 def add_dimension_style(document: Drawing, text_m: float) -> None:
-    """Define how dimensions look: metres with three decimals, text above the line.
+    """Define the style of dimensions: metres with three decimals, text above the line.
 
-    The header has the same: some programs draw dimensions anew, by it alone.
+    The header has the same, because some programs redraw dimensions from it alone.
     """
     style = document.dimstyles.add(DIMENSION_STYLE)
     values = {
@@ -220,7 +220,7 @@ def _add_level(space: Modelspace, x: float, height_m: float) -> None:
 def _add_opening(
     space: Modelspace, outline_m: NDArray[np.float64], sigma_m: float | None, words: str
 ) -> None:
-    """Add an opening in regular form, with its size, and how far what was found leaves it."""
+    """Add an opening in regular form, with its size and its deviation from the found outline."""
     regular = regular_opening(outline_m, sigma_m)
     _add_polygon(space, regular.outline_m, "A-ELEV-OPNG")
     low, high = regular.outline_m.min(axis=0), regular.outline_m.max(axis=0)
@@ -248,7 +248,7 @@ def _add_dimension(
 
 
 def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> None:
-    """Add a wall's coordinate system, and its picture where it belongs."""
+    """Add a wall's coordinate system, and its picture at its position."""
     frame = wall.frame
     axes = {"origin": frame.origin_world, "xaxis": frame.u_world, "yaxis": -frame.v_world}
     document.ucs.add(

@@ -1,4 +1,4 @@
-"""Elevations: the walls of a room or the facades of a building unfolded, at their true heights."""
+"""Elevations: the walls of a room or the facades of a building unfolded at their true heights."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _GAP_MM: Final = 8.0
 _LEFT_MM: Final = 20.0
 _BELOW_MM: Final = 34.0
 _TEXT_MM: Final = 2.5
-# Walls that are that nearly parallel follow each other along one facade.
+# Walls this close to parallel follow each other along one facade.
 _PARALLEL_DEG: Final = 10.0
 
 
@@ -43,8 +43,8 @@ class ElevationWall:
 
     Attributes:
         name: what it is called.
-        frame: of its picture.
-        raster: GeoTIFF that is shown.
+        frame: frame of its picture.
+        raster: GeoTIFF of the picture.
     """
 
     name: str
@@ -60,13 +60,13 @@ class ElevationWall:
 def unfolded(
     walls: Sequence[ElevationWall], up: NDArray[np.float64]
 ) -> tuple[tuple[ElevationWall, ...], bool]:
-    """Put walls in the order in which a viewer sees them who turns, or walks, to the right.
+    """Sort walls in the order in which a viewer who turns or walks to the right sees them.
 
     Inside a room the viewer turns clockwise, seen from above; around a building the facades follow
-    each other counter-clockwise. Begins behind the widest gap of directions.
+    each other counter-clockwise. The order begins after the widest gap of directions.
 
     Returns:
-        The walls, and whether they are those of a room seen from inside.
+        The walls, and whether they form a room seen from inside.
     """
     e1, e2, _ = basis_from_up(up)
     middles = np.array([wall.frame.corners_world().mean(axis=0) for wall in walls])
@@ -99,10 +99,10 @@ def _turned_deg(one: float, other: float) -> float:
 def elevation_scale(
     walls: Sequence[ElevationWall], up: NDArray[np.float64], scale: int | None, paper: str | None
 ) -> tuple[int, Paper, list[list[ElevationWall]]]:
-    """Choose scale and paper, and which walls stand on which sheet.
+    """Choose scale and paper, and the walls of each sheet.
 
-    Without a scale, all walls stand on one sheet of A3 (or the given paper) at the largest usual
-    scale; with one, on the smallest paper that takes them, else on several sheets of A0.
+    Without a scale, all walls are on one sheet of A3 (or the given paper) at the largest usual
+    scale; with one, on the smallest paper that fits them, else on several sheets of A0.
     """
     rows = list(walls)
     low, high = _heights(walls, up)
@@ -139,7 +139,7 @@ def _fits(walls: Sequence[ElevationWall], high_m: float, paper: Paper, scale: in
 
 
 def _heights(walls: Sequence[ElevationWall], up: NDArray[np.float64]) -> tuple[float, float]:
-    """Height of the lowest and the highest corner."""
+    """Return the heights of the lowest and the highest corner."""
     heights = np.array([wall.frame.corners_world() @ up for wall in walls])
     return float(heights.min()), float(heights.max())
 
@@ -154,11 +154,11 @@ def write_elevation(
     """Write one sheet as PDF.
 
     Args:
-        path: file to write.
+        path: output file.
         walls: from left to right.
         up: (3,) unit vector of the scan.
         place: n of 1 : n, and the paper.
-        texts: one line on where it comes from, and the language of labels.
+        texts: one line about the origin of the data, and the language of labels.
     """
     scale, paper = place
     origin, language = texts
@@ -182,7 +182,7 @@ def write_elevation(
             )
             box = [(total, base), (total + wide, base), (total + wide, base + tall)]
             line(canvas, [*box, (total, base + tall)], width_mm=0.25, is_closed=True)
-            # A name beside a narrow wall goes one line down.
+            # The name of a narrow wall is one line lower.
             below = 10.0 if total < named else 6.0
             write_text(canvas, wall.name, (total, bottom - below), high_mm=_TEXT_MM)
             named = total + text_width_mm(wall.name, _TEXT_MM) + 1.0 if below < 8.0 else -math.inf
@@ -202,7 +202,7 @@ def _draw_heights(
     heights_m: tuple[float, float],
     scale: int,
 ) -> None:
-    """Draw level lines every round height, with numbers that stand clear of each other."""
+    """Draw level lines at round heights, with numbers that do not overlap."""
     low, high = heights_m
     step = next(s for s in (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0) if 1e3 * s / scale >= 8.0)
     for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):

@@ -46,11 +46,11 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
 
 
 def write_seams_geojson(path: Path, image: Orthoimage) -> None:
-    """Write which photo paints what of a wall, in the coordinates of its GeoTIFF.
+    """Write the areas of a wall that each photo paints, in the coordinates of its GeoTIFF.
 
-    Edited and given back as the input `seams` of `mosaic.seams`, it overrides the automatic seams.
+    Edited and passed as the input `seams` of `mosaic.seams`, it overrides the automatic seams.
     """
-    # Of very large walls, corners are good to some cells.
+    # For very large walls, corners are accurate to some cells.
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     features: list[Feature] = []
@@ -93,12 +93,12 @@ def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> Non
 
 
 def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> Feature:
-    """Return an opening of a wall as a polygon, with all that is known of it.
+    """Return an opening of a wall as a polygon with all its properties.
 
     Args:
         opening: it.
-        place: among the openings of its wall, from the left.
-        in_world: in coordinates of the scan, x, y, z; else as the wall's GeoTIFF has them.
+        place: its index among the openings of its wall, from the left.
+        in_world: in coordinates of the scan, x, y, z; otherwise in those of the wall's GeoTIFF.
     """
     sources = [OutlineSource(source).name.lower() for source in opening.side_source.tolist()]
     about: dict[str, JsonValue] = {
@@ -141,7 +141,7 @@ def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[Feature]:
 
 
 def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> Feature:
-    """A ring that ends where it begins, as the format wants it."""
+    """Return a closed ring, as the format requires."""
     return _feature("Polygon", np.vstack([corners, corners[:1]])[None], about)
 
 

@@ -1,4 +1,4 @@
-"""A room from above, small, with one wall marked: which wall does a sheet show?"""
+"""A small plan of a room with one wall marked, to show which wall a sheet is of."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame
 from orthoflow.geometry.outlines import RoomOutline, room_outline
 from orthoflow.products import Planes
 
-# Each is held against each other, and three against one another: a record may claim any number.
+# Every pair and some triples are compared, and a record may state any number.
 MOST_PLANES: Final = 200
 MOST_PARTS: Final = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class KeyPlan:
-    """Lines of a plan, in metres to the right and upwards, around a place near all of them.
+    """Lines of a plan, in metres to the right and upwards, relative to a nearby origin.
 
     Attributes:
-        walls: (w, 2, 2) upright rectangles from above.
-        numbers: of these walls, as files and reports have them.
-        outlines: of the room, (n, 2) each; closed ones end where they begin.
-        marked: (n, 2) the wall that is meant: two ends, or the four corners of a level plane.
+        walls: (w, 2, 2) rectangles of upright walls from above.
+        numbers: numbers of these walls, as in files and reports.
+        outlines: outlines of the room, (n, 2) each; closed ones end where they begin.
+        marked: (n, 2) the marked wall: two ends, or the four corners of a level plane.
         arrow: (2, 2) from the viewer to the wall; None for level planes.
-        up_label: what the upwards direction of the plan is: `N` in a map, else an axis.
+        up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
     """
 
     walls: NDArray[np.float64]
@@ -43,7 +43,7 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Planes with the rectangles of their parts, or of all their points where there are none.
+    """Return planes with the rectangles of their parts, or of all their points without parts.
 
     Raises:
         InputError: there are more than `MOST_PLANES`, or `MOST_PARTS` of them.
@@ -60,7 +60,7 @@ def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
 
 
 def outline_of(planes: Planes) -> RoomOutline:
-    """The outline of the room that planes bound.
+    """Return the outline of the room bounded by planes.
 
     Raises:
         InputError: there are more than `MOST_PLANES`.
@@ -81,7 +81,7 @@ def _check_counts(planes: Planes) -> None:
 
 
 def key_plan(planes: Planes, frame: WallFrame) -> KeyPlan:
-    """Draw planes from above, and mark where a raster lies."""
+    """Draw planes from above, and mark the position of a raster."""
     outline = outline_of(planes)
     basis = basis_from_up(planes.up)
     corners = frame.corners_world()

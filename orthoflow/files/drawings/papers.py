@@ -1,4 +1,4 @@
-"""Paper, scale, and which part of a wall each sheet shows."""
+"""Paper, scale, and the part of a wall on each sheet."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ BELOW_MM: Final = 11.0
 
 @dataclass(frozen=True, kw_only=True)
 class Paper:
-    """A sheet of paper, and where on it the title block stands.
+    """A sheet of paper and the position of its title block.
 
     Attributes:
-        width_mm: of the sheet as it is read.
+        width_mm: width of the sheet in reading direction.
         height_mm: likewise.
         name: of the paper, empty for any other size.
-        layout: the title block stands in a column on the right, or in a strip along the lower edge.
+        layout: the title block is in a column on the right, or in a strip along the lower edge.
         block_mm: width of that column, or height of that strip.
     """
 
@@ -62,7 +62,7 @@ class Paper:
 
     @property
     def area_mm(self) -> tuple[float, float]:
-        """Width and height that pictures can take, with what stands around them."""
+        """Width and height available for pictures with their margins."""
         wide, high = self.width_mm - 2 * MARGIN_MM, self.height_mm - 2 * MARGIN_MM
         if self.layout == "column":
             return wide - self.block_mm, high
@@ -75,7 +75,7 @@ class Paper:
 
     @property
     def turned(self) -> Paper:
-        """The same paper, upright instead of lying, or lying instead of upright."""
+        """Return the same paper in the other orientation."""
         return replace(self, width_mm=self.height_mm, height_mm=self.width_mm)
 
 
@@ -100,8 +100,8 @@ class View:
 
     Attributes:
         kind: which picture of the wall: `ortho`, `depth`, `intensity`.
-        part: what of the wall it shows.
-        corner_mm: its bottom-left corner on the paper, from the paper's.
+        part: the part of the wall.
+        corner_mm: its bottom-left corner on the paper.
     """
 
     kind: str
@@ -110,7 +110,7 @@ class View:
 
 
 def paper_of(text: str) -> Paper:
-    """Read the name of a paper, `A0` to `A4`, `A3.1` ..., or its size as `700x500`, in mm.
+    """Parse the name of a paper, `A0` to `A4`, `A3.1` ..., or its size as `700x500`, in mm.
 
     Raises:
         ArgumentError: it is neither.
@@ -129,7 +129,7 @@ def paper_of(text: str) -> Paper:
 
 
 def usual_papers() -> list[Paper]:
-    """Usual papers from the smallest, lying before upright."""
+    """Return usual papers, smallest first, landscape before portrait."""
     names = sorted(SIZES_MM | LONG_MM, key=lambda name: math.prod((SIZES_MM | LONG_MM)[name]))
     return [way for name in names for way in (paper_of(name), paper_of(name).turned)]
 
@@ -141,15 +141,15 @@ def together(
 
     Args:
         kinds: the pictures.
-        size_m: width and height of the wall as it is drawn.
-        paper: of the sheet.
+        size_m: width and height of the drawn wall.
+        paper: paper of the sheet.
         scale: n of 1 : n.
     """
     whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
     wide, high = _with_labels(size_m, scale)
     count, (across, up) = len(kinds), paper.area_mm
     for columns, rows in ((count, 1), (1, count)):
-        # A micrometre of slack: 12.0 m at 1:50 are 240.00000000000003 mm.
+        # A tolerance of a micrometre: 12.0 m at 1:50 are 240.00000000000003 mm.
         if columns * wide > across + 1e-3 or rows * high > up + 1e-3:
             continue
         left, bottom = paper.corner_mm
@@ -177,18 +177,17 @@ def cut_up(
     scale: int,
     grid_m: float,
 ) -> tuple[tuple[View, ...], ...]:
-    """Lay each picture of a wall onto as many sheets as it needs, evenly.
+    """Distribute each picture of a wall evenly over as many sheets as it needs.
 
     Args:
         kinds: the pictures.
-        size_m: width and height of the wall as it is drawn.
-        paper: of the sheets.
+        size_m: width and height of the drawn wall.
+        paper: paper of the sheets.
         scale: n of 1 : n.
-        grid_m: the wall is cut at whole steps of the grid where sheets have the room; 0 for
-            anywhere.
+        grid_m: the wall is cut at whole steps of the grid if the sheets have room; 0 for anywhere.
 
     Raises:
-        ArgumentError: it takes more than `MOST_SHEETS`.
+        ArgumentError: it needs more than `MOST_SHEETS`.
     """
     around = (LEFT_MM + RIGHT_MM, ABOVE_MM + BELOW_MM)
     limits = [
@@ -216,7 +215,7 @@ def cut_up(
 
 
 def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list[float]:
-    """Where an edge is cut: parts are equal, but for whole steps of the grid where these fit."""
+    """Return where an edge is cut: into equal parts, or at whole steps of the grid if these fit."""
     step_m = size_m / count
     if grid_m > 0.0 and math.ceil(step_m / grid_m - 1e-9) * grid_m <= limit_m + 1e-9:
         step_m = math.ceil(step_m / grid_m - 1e-9) * grid_m
@@ -224,7 +223,7 @@ def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list
 
 
 def _alone(kind: str, part: Part, paper: Paper, scale: int) -> View:
-    """One picture in the middle of its sheet."""
+    """Return one picture in the middle of its sheet."""
     wide, high = _with_labels(part.size_m, scale)
     left, bottom = paper.corner_mm
     across, up = paper.area_mm
@@ -244,7 +243,7 @@ def _with_labels(size_m: tuple[float, float], scale: int) -> tuple[float, float]
 
 
 def nice_step(least: float) -> float:
-    """The smallest of 1, 2, 5 times a power of ten that is at least as large.
+    """Return the smallest of 1, 2, 5 times a power of ten that is at least as large.
 
     >>> nice_step(0.3), nice_step(2.0), nice_step(60.0)
     (0.5, 2.0, 100.0)

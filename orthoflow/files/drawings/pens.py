@@ -42,13 +42,13 @@ BLACK: Final = (0.0, 0.0, 0.0)
 WHITE: Final = (1.0, 1.0, 1.0)
 RED: Final = (0.8, 0.0, 0.0)
 GREY: Final = (0.5, 0.5, 0.5)
-# Contours before the plane and behind it, and openings.
+# Contours in front of the plane and behind it, and openings.
 BEFORE: Final = (0.80, 0.25, 0.05)
 BEHIND: Final = (0.05, 0.30, 0.75)
 OPENING: Final = (0.0, 0.40, 0.45)
 # ISO 128-2, line 10: a long dash, a gap, a dot, a gap.
 MATCH_DASHES_MM: Final = (8.0, 1.5, 0.5, 1.5)
-# Height of capital letters of the font over its size.
+# Height of capital letters of the font relative to its size.
 _CAPITALS: Final = 0.729
 
 Colour = tuple[float, float, float]
@@ -60,7 +60,7 @@ def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
-    # Pictures as bytes: as text they would be a quarter larger, and slow to write.
+    # Pictures as binary data: as text they would be a quarter larger, and slow to write.
     rl_config.useA85 = 0
     register_fonts()
     size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
@@ -102,7 +102,7 @@ def box(
 
 
 def arrow(canvas: Canvas, ends_mm: NDArray[np.float64], colour: Colour = BLACK) -> None:
-    """Draw an arrow from the first to the second of two places (2, 2)."""
+    """Draw an arrow from the first to the second of two positions (2, 2)."""
     along = (ends_mm[1] - ends_mm[0]) / max(float(np.linalg.norm(ends_mm[1] - ends_mm[0])), 1e-9)
     aside = np.array([-along[1], along[0]])
     barbs = [ends_mm[1] - 2.5 * along + side * 0.9 * aside for side in (1.0, -1.0)]
@@ -111,14 +111,14 @@ def arrow(canvas: Canvas, ends_mm: NDArray[np.float64], colour: Colour = BLACK) 
 
 
 def cross(canvas: Canvas, x: float, y: float) -> None:
-    """Draw a cross of 3 mm, white below black, so that it is seen on any picture."""
+    """Draw a cross of 3 mm, black on white, so that it is visible on any picture."""
     for colour, width_mm in ((WHITE, WIDE_MM), (BLACK, FINE_MM)):
         line(canvas, [(x - 1.5, y), (x + 1.5, y)], width_mm=width_mm, colour=colour)
         line(canvas, [(x, y - 1.5), (x, y + 1.5)], width_mm=width_mm, colour=colour)
 
 
 def height_mark(canvas: Canvas, at_mm: tuple[float, float], text: str) -> None:
-    """Draw a height mark, its tip at a place, with the height beside it."""
+    """Draw a height mark with its tip at a position, and the height beside it."""
     x, y = at_mm
     line(canvas, [(x - 2.0, y), (x + 2.0, y)])
     tip = [(x, y), (x - 1.2, y + 2.1), (x + 1.2, y + 2.1)]
@@ -137,9 +137,9 @@ def write_text(  # noqa: PLR0913 - what a text has
     is_centred: bool = False,
     colour: Colour = BLACK,
 ) -> None:
-    """Write a line of text, its height that of its capital letters; foreign letters harmless.
+    """Write a line of text, its height that of its capital letters; untrusted text is escaped.
 
-    It is turned counter-clockwise about where it begins, or about its middle where it is centred.
+    It is rotated counter-clockwise about its beginning, or about its middle if centred.
     """
     canvas.saveState()
     canvas.translate(at_mm[0] * POINTS_PER_MM, at_mm[1] * POINTS_PER_MM)
@@ -162,7 +162,7 @@ def write_on_white(
     turned_deg: float = 0.0,
     colour: Colour = BLACK,
 ) -> None:
-    """Write a line of text around a place, on white: what lies below is cut out for it."""
+    """Write a line of text around a position, on a white background."""
     along = np.array([math.cos(math.radians(turned_deg)), math.sin(math.radians(turned_deg))])
     aside = np.array([-along[1], along[0]])
     half = 0.5 * text_width_mm(text, TEXT_MM) + 0.4 * TEXT_MM
@@ -175,19 +175,19 @@ def write_on_white(
         (path.lineTo if place else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
     canvas.setFillColorRGB(*WHITE)
     canvas.drawPath(path, stroke=0, fill=1)
-    # Its capital letters stand as far above the middle as below it.
+    # Its capital letters extend as far above the middle as below it.
     x, y = np.array(middle_mm) - 0.5 * TEXT_MM * aside
     at = (float(x), float(y))
     write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True, colour=colour)
 
 
 def font_points(high_mm: float) -> float:
-    """Size of the font whose capital letters are so high."""
+    """Return the font size with capital letters of this height."""
     return high_mm * POINTS_PER_MM / _CAPITALS
 
 
 def text_width_mm(text: str, high_mm: float = TEXT_MM, *, is_bold: bool = False) -> float:
-    """How wide a line of text is on the paper."""
+    """Return the width of a line of text on the paper."""
     from reportlab.pdfbase.pdfmetrics import stringWidth
 
     register_fonts()
@@ -201,7 +201,7 @@ def text_width_mm(text: str, high_mm: float = TEXT_MM, *, is_bold: bool = False)
 def paragraph(
     text: str, *, high_mm: float = TEXT_MM, is_bold: bool = False, colour: Colour = BLACK
 ) -> Any:
-    """Make a flowable of text that wraps, with the fonts that its letters need."""
+    """Make a flowable of wrapped text, with the fonts that its letters need."""
     from reportlab.lib.colors import Color
     from reportlab.lib.styles import ParagraphStyle
     from reportlab.platypus import Paragraph
@@ -256,7 +256,7 @@ def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
 def fallback_font(letter: str) -> str:
     """Make a font of one letter out of those that are installed, and return its name.
 
-    reportlab embeds fonts with TrueType outlines only, so others are converted.
+    reportlab only embeds fonts with TrueType outlines, so others are converted.
 
     Raises:
         InputError: no installed font has the letter.
@@ -300,7 +300,7 @@ def fallback_font(letter: str) -> str:
 
 @lru_cache(maxsize=1)
 def _installed_letters() -> dict[str, frozenset[int]]:
-    """Code points of each font of the system, by path; of collections those of their first font."""
+    """Return code points of each system font, by path; for collections those of the first font."""
     from fontTools.ttLib import TTFont, TTLibError
     from matplotlib.font_manager import findSystemFonts
 

@@ -1,4 +1,4 @@
-"""Rasters of walls as pictures for paper: no finer than print shows, in bounded memory."""
+"""Rasters of walls as pictures for paper, at the resolution of print and in bounded memory."""
 
 from __future__ import annotations
 
@@ -18,48 +18,49 @@ from orthoflow.geometry.levels import Colours, eight_bits
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
-# Cells that are read at a time.
+# Cells read at a time.
 _BAND_CELLS: Final = 1 << 24
-# Up to this many pixels a picture is kept as it is; beyond, a sheet would be too large to send.
+# A picture of up to this many pixels is lossless; beyond, a sheet would be too large to send.
 _LOSSLESS_PX: Final = 8_000_000
 _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
-# A contour has so many times the width of its number, else it has none.
+# A contour must be this many times as long as its number is wide, or it has none.
 _LEAST_WIDTHS: Final = 5.0
 _APART_MM: Final = 12.0
 _TRIED: Final = (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
-# The chord over the length of the line below a number, at least: it would lie beside it else.
+# Minimum ratio of the chord to the length of the line below a number, which would be beside it
+# otherwise.
 _STRAIGHT: Final = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """Values that become black and white, and the interval of contours between them."""
+    """Values for black and white, and the interval of contours between them."""
 
     low: float
     high: float
 
     @property
     def interval(self) -> float:
-        """Distance of contours, a round number, about ten over the range; at least 1 mm."""
+        """Interval of contours, a round number, about ten over the range; at least 1 mm."""
         return nice_step(max((self.high - self.low) / 12.0, 1e-3))
 
 
 def write_picture(
     raster: Path, part: Part, path: Path, *, scale: int, is_flipped: bool = False
 ) -> tuple[int, int]:
-    """Write a part of a wall's raster as a picture, white where it shows nothing.
+    """Write a part of a wall's raster as a picture, white where empty.
 
-    Cells are kept as they are where print shows them, else averaged to 400 pixels per inch.
+    Cells are unchanged if print resolves them, otherwise averaged to 400 pixels per inch.
 
     Args:
         raster: GeoTIFF of one band, which is stretched to grey, or of three.
         part: of the raster.
-        path: file to write without its suffix, which says the format: PNG, or JPEG when large.
+        path: output file without its suffix, which depends on the format: PNG, or JPEG if large.
         scale: n of 1 : n.
-        is_flipped: the rows of the raster go up the paper; `part` is what is seen there.
+        is_flipped: the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
         Rows and columns of the picture.
@@ -79,7 +80,7 @@ def write_picture(
 
 
 def _flipped(part: Part, source: RasterParts) -> Part:
-    """The same part, counted from the other of the raster's upper and lower edges."""
+    """The same part, relative to the opposite edge of the raster."""
     high_m = source.shape[0] * source.gsd_m
     return replace(part, top_m=high_m - part.bottom_m, bottom_m=high_m - part.top_m)
 
@@ -91,7 +92,7 @@ def picture_file(path: Path) -> Path:
 
 
 def stretch_of(raster: Path) -> Stretch:
-    """Values of one band that stand for black and white: its 2nd and 98th percentile."""
+    """Return the values of one band for black and white: its 2nd and 98th percentile."""
     with RasterParts(raster) as source:
         rows, columns = source.shape
         shape = (min(rows, _OVERVIEW_PX), min(columns, _OVERVIEW_PX))
@@ -106,13 +107,12 @@ def stretch_of(raster: Path) -> Stretch:
 def contours(
     raster: Path, part: Part, *, scale: int, interval_m: float, is_flipped: bool = False
 ) -> list[tuple[float, NDArray[np.float64]]]:
-    """Contours of a depth raster, each a level in metres and a line.
+    """Return contours of a depth raster, each a level in metres and a line.
 
     Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
-    the drawing where the raster's rows go up the paper.
-    Levels are half an interval from the plane, and an interval apart: on the plane itself, noise
-    would be all that they draw. Depths are averaged over half a millimetre of paper; lines shorter
-    than six are left out.
+    the drawing if the raster's rows go up the paper. Levels begin half an interval from the plane,
+    because on the plane itself they would only show noise. Depths are averaged over half a
+    millimetre of paper; lines shorter than six are omitted.
     """
     from contourpy import contour_generator
 
@@ -153,10 +153,10 @@ def contours(
 
 @dataclass(frozen=True, kw_only=True)
 class LabelPlace:
-    """Where a number stands.
+    """The position of a number.
 
     Attributes:
-        middle_mm: of the number, on the paper.
+        middle_mm: centre of the number, on the paper.
         turned_deg: counter-clockwise, so that it is never upside down.
     """
 
@@ -167,12 +167,12 @@ class LabelPlace:
 def label_place(
     points_mm: NDArray[np.float64], wide_mm: float, placed_mm: Sequence[NDArray[np.float64]]
 ) -> LabelPlace | None:
-    """Find a place for a number on a line, None where there is none.
+    """Find a position for a number on a line, or None.
 
     Args:
         points_mm: the line, (n, 2) on the paper.
-        wide_mm: how wide the number is.
-        placed_mm: the middles of other numbers, (2,) each.
+        wide_mm: width of the number.
+        placed_mm: centres of other numbers, (2,) each.
     """
     steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -237,7 +237,7 @@ def _write_encoded(path: Path, picture: NDArray[np.uint8]) -> None:
     if picture.shape[0] * picture.shape[1] <= _LOSSLESS_PX:
         path.with_suffix(".png").write_bytes(encode_png(picture))
         return
-    # Turned in place: a copy of an A0 sheet would be 750 MB.
+    # Flipped in place: a copy of an A0 sheet would take 750 MB.
     for row in picture:
         row[:] = row[:, ::-1].copy()
     options = [

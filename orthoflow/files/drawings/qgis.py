@@ -1,7 +1,7 @@
-"""A QGIS project that opens the walls of a room side by side, each at its true height.
+"""A QGIS project with the walls of a room side by side, each at its true height.
 
-Every wall has a coordinate system of its own, which no other can be transformed into. So each
-raster is opened through a GDAL virtual raster beside the project that shifts X alone: Y stays the
+Every wall has a coordinate system of its own, which cannot be transformed into another. So each
+raster is opened through a GDAL virtual raster beside the project that shifts X only: Y stays the
 height.
 """
 
@@ -31,7 +31,7 @@ class ProjectLayer:
 
     Attributes:
         wall: name of the wall.
-        kind: what the raster shows: `ortho`, `intensity`, `depth`, `error`.
+        kind: content of the raster: `ortho`, `intensity`, `depth`, `error`.
         raster: its GeoTIFF.
         is_shown: it is visible when the project opens.
     """
@@ -43,7 +43,7 @@ class ProjectLayer:
 
 
 def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> None:
-    """Write `walls.qgs` and a virtual raster per layer, walls from left to right in their order.
+    """Write `walls.qgs` and a virtual raster per layer, with the walls from left to right.
 
     Raises:
         InputError: a raster cannot be read.
@@ -59,7 +59,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
     for number, layer in enumerate(layers):
         vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
         boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
-        # Ids need to be unique in the project; the same run gives the same project.
+        # Ids must be unique in the project; the same run gives the same project.
         identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
         group = groups.get(layer.wall)
         if group is None:
@@ -100,7 +100,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
 
 
 def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
-    """What is added to X of each wall."""
+    """Return the offset of X of each wall."""
     found: dict[str, float] = {}
     right = 0.0
     for layer in layers:

@@ -1,4 +1,4 @@
-"""Openings as a draughtsman draws them: rectangles and arches, with their deviation stated."""
+"""Openings in regular form, as rectangles and arches with their deviation stated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SAMPLE_M: Final = 0.01
-# What a side may leave a straight line by: stones are that even, and outlines that exact.
+# Permitted deviation of a side from a straight line: stones and outlines are about this accurate.
 _TOLERANCE_M: Final = 0.02
 _SPRINGINGS: Final = 40
 _ARC_POINTS: Final = 33
@@ -20,10 +20,10 @@ class RegularOpening:
     """An opening of a wall in regular form.
 
     Attributes:
-        kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` where neither
+        kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither
             fits.
         outline_m: (n, 2) X and Y, counter-clockwise, not closed; an arch has its arc as a polygon.
-        deviation_m: largest distance of the outline that was found from this one.
+        deviation_m: largest distance of the found outline from this one.
     """
 
     kind: Literal["rectangle", "arch", "outline"]
@@ -32,13 +32,13 @@ class RegularOpening:
 
 
 def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> RegularOpening:
-    """Fit a rectangle, else an arch, to an outline.
+    """Fit a rectangle, or else an arch, to an outline.
 
     Args:
         outline_m: (n, 2) X and Y of an upright wall, counter-clockwise.
-        sigma_m: standard deviation of its sides, None where it is unknown.
+        sigma_m: standard deviation of its sides, None if unknown.
 
-    A form is taken where 95 % of the outline lie within three sigma, at least 20 mm, of it.
+    A form is accepted if 95 % of the outline is within three sigma, at least 20 mm, of it.
     """
     limit_m = max(_TOLERANCE_M, 3.0 * (sigma_m or 0.0))
     samples, directions = _sampled(outline_m)
@@ -63,7 +63,7 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
 
 
 def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points along an outline, and the direction of the side each lies on."""
+    """Return points along an outline, and the direction of the side of each."""
     points, directions = [], []
     for begin, end in zip(outline_m, np.roll(outline_m, -1, axis=0), strict=True):
         length = float(np.linalg.norm(end - begin))
@@ -78,9 +78,9 @@ def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def _sides(
     samples: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top, each the median of the samples of that side.
+    """Return left, bottom, right and top, each the median of the samples of that side.
 
-    Of a counter-clockwise outline the left side goes down, the lower one right, and so on.
+    In a counter-clockwise outline the left side goes down, the lower one right, and so on.
     """
     found = []
     for axis, direction in ((0, (0.0, -1.0)), (1, (1.0, 0.0)), (0, (0.0, 1.0)), (1, (-1.0, 0.0))):
@@ -94,7 +94,7 @@ def _sides(
 def _arches(
     samples: NDArray[np.float64], left: float, bottom: float, right: float
 ) -> list[NDArray[np.float64]]:
-    """Rectangles under circular segments whose apex is the outline's, for heights of springing."""
+    """Rectangles under circular segments with the apex of the outline, for springing heights."""
     apex = float(samples[:, 1].max())
     half = 0.5 * (right - left)
     rises = np.linspace(0.0, min(half, apex - bottom), _SPRINGINGS + 1)[1:]
@@ -110,7 +110,7 @@ def _arches(
 
 
 def _distances(points: NDArray[np.float64], outline: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance (n,) of points from a closed outline."""
+    """Return distances (n,) of points from a closed outline."""
     nearest = np.full(len(points), np.inf)
     for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         side = end - begin

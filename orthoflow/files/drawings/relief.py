@@ -1,4 +1,4 @@
-"""Relief of a wall from its depth raster: raking light, contour lines, depths in colour."""
+"""Relief of a wall from its depth raster: shading, contour lines, depths in colour."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from orthoflow.geometry import WallFrame
 NOTHING: Final = 0
 _BAND_ROWS: Final = 1024
 _FIGURE_PX: Final = 1600
-# Contours as those of a drawing at this scale: half a millimetre of its paper smooths them.
+# Contours as in a drawing at this scale: smoothed over half a millimetre of its paper.
 _CONTOUR_SCALE: Final = 20
-# Before the plane, behind it.
+# In front of the plane, behind it.
 _CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """Where a distant light stands before a wall.
+    """The direction of a distant light in front of a wall.
 
     Attributes:
-        azimuth_deg: direction it comes from on the wall, clockwise from above; 315 is top left.
-        altitude_deg: angle between its rays and the wall's plane; small ones rake.
+        azimuth_deg: its direction on the wall, clockwise from the top; 315 is top left.
+        altitude_deg: angle between its rays and the wall's plane; small ones emphasise relief.
     """
 
     azimuth_deg: float = 315.0
@@ -38,19 +38,19 @@ class Light:
 
 
 def shaded(depths_m: NDArray[np.floating], gsd_m: float, light: Light) -> NDArray[np.uint8]:
-    """Shade a depth raster, 1 to 255 by Lambert's cosine law; 0 where a depth is missing.
+    """Shade a depth raster, 1 to 255 by Lambert's cosine law; 0 without a depth.
 
     Args:
-        depths_m: (rows, cols) metres towards the viewer, NaN for nothing.
+        depths_m: (rows, cols) metres towards the viewer, NaN without data.
         gsd_m: side of a cell.
-        light: where it comes from.
+        light: direction of the light.
 
     A surface parallel to the wall's plane has the sine of the light's altitude.
     """
     depths = np.asarray(depths_m, dtype=np.float32)
     down, right = (_slope(depths, axis) / np.float32(gsd_m) for axis in (0, 1))
     azimuth, altitude = np.radians([light.azimuth_deg, light.altitude_deg])
-    # To the light: right and up on the wall, and towards the viewer.
+    # Towards the light: right and up on the wall, and towards the viewer.
     towards = (np.sin(azimuth), np.cos(azimuth))
     slope = -right * np.float32(towards[0]) + down * np.float32(towards[1])
     cosine = np.cos(altitude) * slope + np.sin(altitude)
@@ -61,7 +61,7 @@ def shaded(depths_m: NDArray[np.floating], gsd_m: float, light: Light) -> NDArra
 
 
 def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Change per cell: the mean of those to both neighbours, of one beside a hole, else zero."""
+    """Return the change per cell: the mean to both neighbours, to one beside a hole, or zero."""
     steps = np.diff(depths, axis=axis)
     before = np.concatenate([np.full_like(depths.take([0], axis), np.nan), steps], axis=axis)
     behind = np.concatenate([steps, np.full_like(depths.take([0], axis), np.nan)], axis=axis)
@@ -71,7 +71,7 @@ def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 def write_relief(depth: Path, path: Path, light: Light) -> None:
-    """Write the shaded relief of a depth raster as a GeoTIFF in the same place, band by band.
+    """Write the shaded relief of a depth raster as a GeoTIFF with the same position, band by band.
 
     Raises:
         InputError: the depth raster cannot be read.
@@ -85,7 +85,7 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
         with rasterio.open(path, "w", **profile) as target:
             for first in range(0, rows, _BAND_ROWS):
                 last = min(rows, first + _BAND_ROWS)
-                # Slopes look one row further on either side.
+                # Slopes need one more row on either side.
                 top, bottom = max(0, first - 1), min(rows, last + 1)
                 box = (0.0, float(top), float(columns), float(bottom))
                 depths, _ = source.read(box, (bottom - top, columns))
@@ -119,7 +119,7 @@ def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
 def _contours(
     depth: Path, frame: WallFrame, interval_m: float
 ) -> list[tuple[float, NDArray[np.float64]]]:
-    """Contours in X and Y (n, 2) of the raster's GeoTIFF."""
+    """Return contours in X and Y (n, 2) of the raster's GeoTIFF."""
     size_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
     whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
     found = contours(depth, whole, scale=_CONTOUR_SCALE, interval_m=interval_m)
@@ -127,7 +127,7 @@ def _contours(
 
 
 def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) -> None:
-    """Write a PNG: depths in colour over the raking light, contours, a legend in millimetres."""
+    """Write a PNG: coloured depths with shading, contours, and a legend in millimetres."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import TwoSlopeNorm
@@ -141,7 +141,7 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
         gsd_m = source.gsd_m * factor
     values = np.where(shown, np.asarray(depths, np.float32), np.nan)
     stretch = stretch_of(depth)
-    # The plane is white; what stands before it red, what lies behind it blue, each up to its own.
+    # The plane is white; parts in front of it red, parts behind it blue, each with its own range.
     norm = TwoSlopeNorm(0.0, min(1e3 * stretch.low, -1.0), max(1e3 * stretch.high, 1.0))
     grey = shaded(values, gsd_m, light)
     colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)).filled())[..., :3]

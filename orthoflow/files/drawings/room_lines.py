@@ -1,4 +1,4 @@
-"""The lines of a room, worked out once for all formats that draw them."""
+"""The lines of a room, computed once for all formats that draw them."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from orthoflow.products import CheckPoints, Opening, Planes
 
 @dataclass(frozen=True, kw_only=True)
 class RoomLines:
-    """What is drawn of a room.
+    """The drawn elements of a room.
 
     Attributes:
         planes: the planes.
         surfaces: each with the rectangles of its parts.
-        edges: where two planes meet.
-        corners: where three meet.
-        outline: of the room.
-        checkpoints: surveyed points, None without.
-        openings: of walls.
+        edges: intersections of two planes.
+        corners: intersections of three planes.
+        outline: outline of the room.
+        checkpoints: surveyed points, or None.
+        openings: openings of walls.
     """
 
     planes: Planes
@@ -47,15 +47,15 @@ class RoomLines:
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnWall:
-    """A wall that is drawn in its own coordinates: X and Y of its GeoTIFF.
+    """A wall in its own coordinates: X and Y of its GeoTIFF.
 
     Attributes:
         number: of the wall.
         name: what it is called.
-        plane_index: its plane, None where it is unknown.
+        plane_index: its plane, None if unknown.
         frame: of its raster.
         image: file name of its picture, beside the drawing; empty without one.
-        openings: of it, from the left.
+        openings: its openings, from the left.
     """
 
     number: int
@@ -66,11 +66,11 @@ class DrawnWall:
     openings: tuple[Opening, ...] = ()
 
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X and Y (n, 2) of points (n, 3)."""
+        """Return X and Y (n, 2) of points (n, 3)."""
         return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
 
     def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of some points (n, 3) lie on the raster's rectangle, or near it."""
+        """Report which points (n, 3) are on the raster's rectangle, or near it."""
         return self.frame.distances_m(points_world) <= REACH_M
 
 
@@ -79,7 +79,7 @@ def room_lines(
     checkpoints: CheckPoints | None,
     openings: tuple[Opening, ...] = (),
 ) -> RoomLines:
-    """Work out the lines of a room."""
+    """Compute the lines of a room."""
     surfaces = surfaces_of(planes)
     edges = edges_between(surfaces)
     return RoomLines(
@@ -94,12 +94,12 @@ def room_lines(
 
 
 def edges_of(lines: RoomLines, plane_index: int | None) -> Sequence[Edge]:
-    """Edges that lie on a plane."""
+    """Return the edges that lie on a plane."""
     return [edge for edge in lines.edges if plane_index in (edge.first, edge.second)]
 
 
 def numbered_openings(openings: Sequence[Opening]) -> Iterator[tuple[int, Opening]]:
-    """Openings with their places among those of their wall, as they come."""
+    """Yield openings with their indices among those of their wall, in order."""
     counts: dict[int, int] = {}
     for opening in openings:
         counts[opening.wall] = counts.get(opening.wall, -1) + 1

@@ -1,4 +1,4 @@
-"""Plans and sections as DXF, and from it as SVG and PDF in exact scale (ezdxf draws all three)."""
+"""Plans and sections as DXF, and from it as SVG and PDF to scale (ezdxf draws all three)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts.layout import Modelspace
 
-# Layers as the US National CAD Standard names those of sections: what they hold, AutoCAD colour
-# and line weight in hundredths of a millimetre (ISO 128: 0.5 cut, 0.25 and 0.13 the rest).
+# Layers with names of the US National CAD Standard for sections: content, AutoCAD colour and line
+# weight in hundredths of a millimetre (ISO 128: 0.5 cut, 0.25 and 0.13 the rest).
 LAYERS: Final = {
     "A-SECT-MCUT": ("what is cut", 7, 50),
     "A-SECT-MBND": ("what lies beyond", 8, 13),
@@ -52,17 +52,17 @@ _METRES: Final = 6
 
 @dataclass(frozen=True, kw_only=True)
 class SectionDrawing:
-    """A plan or section that is drawn.
+    """A plan or section to draw.
 
     Attributes:
         kind: `plan` or `section`.
-        section: what it shows.
+        section: its content.
         scale: n of 1 : n.
-        paper: of PDF and SVG.
-        origin: one line on where it comes from.
-        has_dimensions: the lengths of lines that are cut are written beside them.
-        up_label: of a plan, what its upwards direction is: `N`, `y`.
-        language: of its labels.
+        paper: paper of PDF and SVG.
+        origin: one line about the origin of the data.
+        has_dimensions: the lengths of cut lines are written beside them.
+        up_label: for a plan, the label of its upwards direction: `N`, `y`.
+        language: language of labels.
     """
 
     kind: Literal["plan", "section"]
@@ -75,7 +75,7 @@ class SectionDrawing:
     language: Language = "en"
 
     def mm(self, value: float) -> float:
-        """Metres in the drawing of millimetres on the paper."""
+        """Return metres in the drawing of millimetres on the paper."""
         return 1e-3 * self.scale * value
 
 
@@ -84,7 +84,7 @@ def fitted(
 ) -> tuple[int, Paper]:
     """Choose the largest usual scale on A3 or the given paper, and the smallest paper for it."""
     left, bottom, right, top = section.bounds_m
-    # Dimensions and hatches stand outside what is cut.
+    # Dimensions and hatches are outside the cut lines.
     around_mm = 2 * MARGIN_MM + (24.0 if has_dimensions else 2 * _SOLID_MM)
     wide_m, high_m = right - left, top - bottom
 
@@ -109,7 +109,7 @@ def write_section(folder: Path, name: str, drawing: SectionDrawing) -> None:
     """Write `<name>.dxf`, `<name>.svg` and `<name>.pdf`."""
     document = _document(drawing)
     save_document(document, folder / f"{name}.dxf")
-    # ezdxf shifts hatches by a random trifle; the same run gives the same picture.
+    # ezdxf shifts hatches by a small random amount; the same run must give the same picture.
     state = random.getstate()
     for suffix, write in ((".svg", _write_svg), (".pdf", _write_pdf)):
         random.seed(0)
@@ -147,9 +147,9 @@ def _document(drawing: SectionDrawing) -> Drawing:
 
 
 def _add_solid(space: Modelspace, line: CutLine, drawing: SectionDrawing) -> None:
-    """Hatch what is behind a line: to the other side of the wall, or a strip where that is unknown.
+    """Hatch behind a line: to the other side of the wall, or a strip if that is unknown.
 
-    A wall whose both sides were found is hatched from the one that comes first.
+    A wall with both sides found is hatched from the first of them.
     """
     is_known = math.isfinite(line.thickness_m)
     if is_known and line.behind @ [0.83, 0.56] < 0.0:
@@ -158,7 +158,7 @@ def _add_solid(space: Modelspace, line: CutLine, drawing: SectionDrawing) -> Non
     begin, end = line.ends_m
     outline = [begin, end, end + deep_m * line.behind, begin + deep_m * line.behind]
     hatch = space.add_hatch(dxfattribs={"layer": "A-SECT-PATT"})
-    # Lines of the pattern 3.175 units apart: 1.3 mm on the paper.
+    # Lines of the pattern are 3.175 units apart: 1.3 mm on the paper.
     hatch.set_pattern_fill("ANSI31", scale=drawing.mm(1.3) / 3.175)
     hatch.paths.add_polyline_path([tuple(place) for place in outline], is_closed=True)
 
@@ -170,7 +170,7 @@ def _add_dimension(space: Modelspace, line: CutLine, drawing: SectionDrawing) ->
         begin, end = end, begin
     direction = (end - begin) / line.length_m
     left = np.array([-direction[1], direction[0]])
-    # Dimensions stand outside, behind what is cut.
+    # Dimensions are outside, behind the cut lines.
     side = 1.0 if left @ line.behind >= 0.0 else -1.0
     space.add_aligned_dim(
         p1=tuple(begin),
@@ -228,7 +228,7 @@ _SQUARE: Final = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 
 def _middle_m(drawing: SectionDrawing) -> NDArray[np.float64]:
-    """What lies in the middle of the paper."""
+    """Return the centre of the drawing."""
     left, bottom, right, top = drawing.section.bounds_m
     right = max(right, left + drawing.mm(_TEXTS_MM))
     return np.array([0.5 * (left + right), 0.5 * (bottom + top) - 0.5 * drawing.mm(_BELOW_MM)])

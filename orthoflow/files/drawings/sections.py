@@ -1,9 +1,9 @@
-"""Plans and sections: where a plane cuts a room, as lines, with what lies beyond it.
+"""Plans and sections: the intersection of a plane with a room, as lines, and what is beyond it.
 
-Lines that are cut are exact: each is the intersection of the cutting plane with a plane that was
-found, between the places where its points end or another plane meets it. Points of the slab that no
-such line explains are kept as points. X and Y of the drawing are metres: of a plan (e1, e2) of the
-right-handed frame (e1, e2, up), of a section the distance from its first place and the height.
+Cut lines are exact: each is the intersection of the cutting plane with a detected plane, between
+the positions where its points end or another plane meets it. Points of the slab that no such line
+explains are kept as points. X and Y of the drawing are metres: for a plan (e1, e2) of the
+right-handed frame (e1, e2, up), for a section the distance from its first point and the height.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from orthoflow.products import Opening, Planes, PointCloud, PointLabels
 _LEAST_ANGLE_DEG: Final = 20.0
 # Longer stretches without points are drawn as openings; shorter ones are gaps between points.
 _LEAST_OPENING_M: Final = 0.15
-# A line ends in the corner with another where its points end that near: behind furniture, say.
+# A line is extended to the corner with another if its points end this close, e.g. behind furniture.
 _REACH_M: Final = 0.3
 _SHORTEST_M: Final = 0.05
-# Two sides of one wall: they face away from each other, and lie that far apart.
+# The two sides of a wall face away from each other and are at most this far apart.
 _THICKNESS_M: Final = (0.04, 1.5)
 _MOST_POINTS: Final = 30_000
-# Points that no line explains are drawn where that many lie within a cell: others are noise.
+# Unexplained points are drawn if this many are in a cell: others are noise.
 _CROWD_M: Final = 0.05
 _CROWD_POINTS: Final = 3
 _BLOCK: Final = 4_000_000
-# Level planes with at least this share of the area of the largest are floors that count.
+# Level planes with at least this share of the area of the largest count as floors.
 _FLOOR_SHARE: Final = 0.2
 
 
@@ -51,7 +51,7 @@ class Cut:
         x_world: (3,) unit vector to the right of the drawing.
         y_world: (3,) unit vector upwards on it.
         forward_world: (3,) unit vector, the direction of view.
-        title: what it is, for the drawing.
+        title: its title in the drawing.
     """
 
     origin_world: NDArray[np.float64]
@@ -61,20 +61,20 @@ class Cut:
     title: str
 
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X, Y and distance beyond the cut (n, 3), metres, of world points (n, 3)."""
+        """Return X, Y and distance beyond the cut (n, 3), metres, of world points (n, 3)."""
         axes = np.array([self.x_world, self.y_world, self.forward_world])
         return np.asarray((points_world - self.origin_world) @ axes.T)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CutLine:
-    """A line that is cut.
+    """A cut line.
 
     Attributes:
         plane: place of its plane in `planes.json`.
         ends_m: (2, 2) X and Y.
-        behind: (2,) unit vector away from the room, into what is solid.
-        thickness_m: to the other side of the wall, where that was found too; else NaN.
+        behind: (2,) unit vector away from the room, into the solid.
+        thickness_m: distance to the other side of the wall if that was found too; else NaN.
     """
 
     plane: int
@@ -90,16 +90,16 @@ class CutLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """What a plan or section shows.
+    """The content of a plan or section.
 
     Attributes:
         cut: the cutting plane.
-        lines: what is cut.
+        lines: the cut lines.
         gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, shadows.
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
         points_m: (p, 2) points of the slab that no line explains, thinned.
-        slab_m: thickness of the slab whose points were looked at; 0 without a cloud.
-        n_points: how many points lie in it.
+        slab_m: thickness of the slab whose points were used; 0 without a cloud.
+        n_points: number of points in it.
     """
 
     cut: Cut
@@ -112,7 +112,7 @@ class Section:
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """Left, bottom, right and top of what is drawn."""
+        """Return left, bottom, right and top of the drawing."""
         drawn = [line.ends_m for line in self.lines]
         drawn += [self.gaps_m.reshape(-1, 2), self.beyond_m.reshape(-1, 2), self.points_m]
         places = np.concatenate(drawn)
@@ -121,7 +121,7 @@ class Section:
 
 
 def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
-    """Cut level, a height above the lowest large floor; without a floor at that world height."""
+    """Cut horizontally above the lowest large floor; without a floor at that world height."""
     e1, e2, up = basis_from_up(planes.up)
     area = _areas_m2(planes)
     level = planes.normal @ up > math.cos(math.radians(_LEAST_ANGLE_DEG))
@@ -139,10 +139,10 @@ def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
 
 
 def section_cut(planes: Planes, through: Sequence[float], language: Language = "en") -> Cut:
-    """Cut upright through two places (x, y, x, y) of a plan; the first is on the left.
+    """Cut vertically through two points (x, y, x, y) of a plan; the first is on the left.
 
     Raises:
-        ArgumentError: both places are one.
+        ArgumentError: both points are the same.
     """
     e1, e2, up = basis_from_up(planes.up)
     first, second = (x * e1 + y * e2 for x, y in np.reshape(through, (2, 2)))
@@ -167,13 +167,13 @@ def section_of(
     cloud: PointCloud | None = None,
     labels: PointLabels | None = None,
 ) -> Section:
-    """Work out what a cut shows.
+    """Compute the content of a cut.
 
     Args:
         cut: the cutting plane.
         planes: planes of the room.
         openings: of its walls.
-        cloud: the points; without them lines reach as far as the rectangles of the planes.
+        cloud: the points; without them lines extend as far as the rectangles of the planes.
         labels: the plane of each point.
 
     Raises:
@@ -206,7 +206,7 @@ def _areas_m2(planes: Planes) -> NDArray[np.float64]:
 def _slab(
     cut: Cut, cloud: PointCloud | None, labels: PointLabels | None
 ) -> tuple[float, NDArray[np.float64], NDArray[np.int64]]:
-    """Thickness of the slab, X and Y of its points, and their planes (-1 for none)."""
+    """Return the slab's thickness, X and Y of its points, and their planes (-1 for none)."""
     if cloud is None or len(cloud) == 0:
         return 0.0, np.empty((0, 2)), np.empty(0, dtype=np.int64)
     slab_m = 0.02
@@ -214,7 +214,7 @@ def _slab(
     while True:
         found = list(_within(cut, cloud, labels, 0.5 * slab_m))
         n_points = sum(len(places) for places, _ in found)
-        # As thin as gives points every few centimetres along walls, and never a thick slice.
+        # Thin enough for a point every few centimetres along walls, and never a thick slice.
         if n_points >= 2000 or slab_m >= 0.16:
             break
         slab_m *= 2.0
@@ -245,7 +245,7 @@ def _drawn(
     plane: NDArray[np.int64],
     slab_m: float,
 ) -> tuple[list[CutLine], list[NDArray[np.float64]]]:
-    """Lines that are cut, and the gaps in them."""
+    """Return the cut lines, and the gaps in them."""
     traces = {}
     for index, surface in enumerate(surfaces_of(planes)):
         trace = _trace(cut, planes, index)
@@ -262,7 +262,7 @@ def _drawn(
         if len(places):
             own = places[plane == index] if (plane >= 0).any() else places
             offset = (own - point) @ behind
-            # The plane's own noise, and how far it leaves the cut line within the slab.
+            # The plane's own noise, and its distance from the cut line within the slab.
             near = np.abs(offset) <= 3.0 * float(planes.rms_m[index]) + 0.5 * slab_m
             along = np.sort((own[near] - point) @ direction)
             seen = _runs(along, _LEAST_OPENING_M)
@@ -294,14 +294,15 @@ _Span = tuple[float, float]
 
 
 def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
-    """A point of the line in which a plane is cut, its direction, and what is behind it."""
+    """Return a point of the line in which a plane is cut, its direction, and the solid side."""
     normal = planes.normal[index]
     in_cut = np.array([normal @ cut.x_world, normal @ cut.y_world])
     size = float(np.linalg.norm(in_cut))
     if size < math.sin(math.radians(_LEAST_ANGLE_DEG)):
         return None
     middle = cut.place_m(planes.corners[index].mean(axis=0)[None])[0]
-    # n . p = offset, with p in the cut: from the middle of the plane to the line beside it.
+    # n . p = offset, with p in the cut: from the middle of the plane to the nearest point of the
+    # line.
     away = float(normal @ cut.forward_world) * middle[2] / size**2
     point = middle[:2] + away * in_cut
     towards = in_cut / size
@@ -309,7 +310,7 @@ def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
 
 
 def _crossed(cut: Cut, rectangle_world: NDArray[np.float64], trace: _Trace) -> _Span | None:
-    """What of a line lies in a rectangle (4, 3)."""
+    """Return the part of a line in a rectangle (4, 3)."""
     places = cut.place_m(rectangle_world)
     crossings = []
     for begin, end in zip(places, np.roll(places, -1, axis=0), strict=True):
@@ -324,7 +325,7 @@ def _crossed(cut: Cut, rectangle_world: NDArray[np.float64], trace: _Trace) -> _
 
 
 def _joined(spans: Sequence[_Span], gap_m: float) -> list[_Span]:
-    """Spans in order, those that overlap or nearly meet as one."""
+    """Merge sorted spans that overlap or nearly meet."""
     found: list[_Span] = []
     for begin, end in sorted(spans):
         if found and begin - found[-1][1] <= gap_m:
@@ -335,7 +336,7 @@ def _joined(spans: Sequence[_Span], gap_m: float) -> list[_Span]:
 
 
 def _runs(along: NDArray[np.float64], gap_m: float) -> list[_Span]:
-    """Stretches of rising numbers without a larger gap."""
+    """Return stretches of ascending numbers without a larger gap."""
     if len(along) == 0:
         return []
     breaks = np.flatnonzero(np.diff(along) > gap_m)
@@ -344,7 +345,7 @@ def _runs(along: NDArray[np.float64], gap_m: float) -> list[_Span]:
 
 
 def _shared(span: _Span, others: Sequence[_Span]) -> list[_Span]:
-    """Parts of a span that others cover."""
+    """Return parts of a span that others cover."""
     parts = [(max(span[0], begin), min(span[1], end)) for begin, end in others]
     return [part for part in parts if part[1] > part[0]]
 
@@ -352,7 +353,7 @@ def _shared(span: _Span, others: Sequence[_Span]) -> list[_Span]:
 def _meeting(
     point: NDArray[np.float64], direction: NDArray[np.float64], other: _Trace
 ) -> float | None:
-    """Where a line meets another, along itself."""
+    """Return where a line meets another, along itself."""
     other_point, _, normal = other
     slope = float(direction @ normal)
     if abs(slope) < math.sin(math.radians(_LEAST_ANGLE_DEG)):
@@ -361,7 +362,7 @@ def _meeting(
 
 
 def _snapped(span: _Span, meets: Sequence[float]) -> _Span:
-    """Move the ends of a span into corners that are near."""
+    """Move the ends of a span to nearby corners."""
 
     def moved(end: float) -> float:
         near = [place for place in meets if abs(place - end) <= _REACH_M]
@@ -372,7 +373,7 @@ def _snapped(span: _Span, meets: Sequence[float]) -> _Span:
 
 
 def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
-    """Return lines the distance to the other side of their wall, where that is among them."""
+    """Set the distance of lines to the other side of their wall, if that is among them."""
     for line in lines:
         middle = line.ends_m.mean(axis=0)
         found = []
@@ -396,7 +397,7 @@ def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
 
 
 def _beyond(cut: Cut, planes: Planes, openings: Sequence[Opening]) -> NDArray[np.float64]:
-    """Edges of the room and outlines of openings behind the cut."""
+    """Return edges of the room and outlines of openings behind the cut."""
     ends = [edge.ends_world for edge in edges_between(surfaces_of(planes))]
     for opening in openings:
         corners = opening.outline_world
@@ -417,7 +418,7 @@ def _beyond(cut: Cut, planes: Planes, openings: Sequence[Opening]) -> NDArray[np
 def _unexplained(
     places: NDArray[np.float64], lines: Sequence[CutLine], slab_m: float
 ) -> NDArray[np.float64]:
-    """Points that lie beside all lines."""
+    """Return points away from all lines."""
     free = np.ones(len(places), dtype=bool)
     for line in lines:
         direction = (line.ends_m[1] - line.ends_m[0]) / max(line.length_m, 1e-9)
@@ -429,7 +430,7 @@ def _unexplained(
 
 
 def _thinned(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One point per cell of a grid that is as fine as their number allows, without single ones."""
+    """Return one point per cell of a grid adapted to their number, without isolated ones."""
     if len(places) == 0:
         return places
     _, cell, n_in_cell = np.unique(

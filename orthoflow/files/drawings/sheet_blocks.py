@@ -1,6 +1,6 @@
-"""What stands beside the pictures of a sheet: scale bar, notes, legend, key plan, title block.
+"""The blocks beside the pictures of a sheet: scale bar, notes, legend, key plan, title block.
 
-reportlab's flowables measure and break text; this module says what there is, and packs it into a
+reportlab's flowables measure and break text; this module creates the blocks, and packs them into a
 column on the right of the sheet or a strip along its lower edge.
 """
 
@@ -56,7 +56,7 @@ _COLUMNS_MM: Final = (90.0, 110.0, 130.0, 150.0, 180.0)
 # ISO 7200: a title block is 180 mm wide at most.
 _TITLE_MM: Final = 180.0
 _STRIP_COLUMN_MM: Final = 85.0
-# Of the paper at most so much is not for pictures.
+# Maximum share of the paper that is not for pictures.
 _MOST_SHARE: Final = 0.55
 _PLAN_MM: Final = (35.0, 90.0)
 _MOST_SEGMENTS: Final = 5
@@ -67,7 +67,7 @@ _SIGNATURE_MM: Final = 14.0
 _LOGO_MM: Final = 16.0
 # Wider title blocks have four columns instead of two.
 _FOUR_COLUMNS_MM: Final = 140.0
-# Scales of imperial rulers: inches on the paper of one foot.
+# Scales of imperial rulers: inches on the paper per foot.
 _INCHES: Final = {
     12: "1",
     16: "3/4",
@@ -82,7 +82,7 @@ _INCHES: Final = {
 
 
 class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
-    """Something drawn in millimetres from its bottom-left corner, as wide as there is room."""
+    """Something drawn in millimetres from its bottom-left corner, with the available width."""
 
     def __init__(self, high_mm: float, draw: Callable[[Canvas, float], None]) -> None:
         super().__init__()
@@ -100,10 +100,10 @@ class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
 
 @dataclass(frozen=True, kw_only=True)
 class Furniture:
-    """What stands beside the pictures of a sheet.
+    """The blocks beside the pictures of a sheet.
 
     Attributes:
-        paper: with the room that it takes.
+        paper: paper with the space that they take.
         placed: flowables, with left and bottom on the paper and width, in mm.
     """
 
@@ -111,7 +111,7 @@ class Furniture:
     placed: tuple[tuple[Any, tuple[float, float, float]], ...]
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw all of it, and the frame of the sheet."""
+        """Draw all blocks, and the frame of the sheet."""
         paper = self.paper
         for flowable, (left, bottom, wide) in self.placed:
             flowable.wrapOn(canvas, wide * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
@@ -129,10 +129,10 @@ class Furniture:
 def furnished(
     paper: Paper, drawing: WallDrawing, sheet: Sheet, *, is_brief: bool = False
 ) -> Furniture | None:
-    """Pack what stands beside the pictures; None where the paper is too small for it.
+    """Pack the blocks beside the pictures; None if the paper is too small.
 
-    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that takes all is taken.
-    Without key plans, `is_brief`, less paper does.
+    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that fits is used. Without
+    key plans, `is_brief`, a smaller paper suffices.
     """
     wide, high = paper.width_mm - 2 * MARGIN_MM, paper.height_mm - 2 * MARGIN_MM
     if paper.layout == "column":
@@ -172,7 +172,7 @@ def furnished(
 
 
 class _Stack:
-    """Flowables below each other, without gaps."""
+    """Return flowables stacked without gaps."""
 
     def __init__(self, flowables: Sequence[Any], wide_mm: float) -> None:
         self.flowables, self.wide_mm = flowables, wide_mm
@@ -196,9 +196,9 @@ def _packed(
     top_mm: float,
     high_mm: float,
 ) -> list[tuple[Any, tuple[float, float, float]]] | None:
-    """Fill columns from the left, each from its top; None where there is not the room.
+    """Fill columns from the left, each from its top; None if they do not fit.
 
-    Key plans, which come last, take what is left of a column up to their largest height.
+    Key plans, which come last, use the remaining height of a column up to their maximum.
     """
     placed: list[tuple[Any, tuple[float, float, float]]] = []
     column, used = 0, 0.0
@@ -242,7 +242,7 @@ def _notes(drawing: WallDrawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
 
 
 def _scale_bar(drawing: WallDrawing) -> _Picture:
-    """Draw segments of a round length, black and white, with its length at each end."""
+    """Draw segments of a round length, black and white, with the length at each end."""
     unit_m = FOOT_M if drawing.unit == "ft" else 1.0
     least = 1e-3 * drawing.scale * _SEGMENT_MM / 2.5 / unit_m
     # The largest round length that is at most 25 mm long.
@@ -360,7 +360,7 @@ def _empty_box(canvas: Canvas) -> None:
 
 
 class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
-    """A heading, and lines (n, 2) in metres below it, as large as there is room."""
+    """A heading, and lines (n, 2) in metres below it, as large as the space permits."""
 
     def __init__(
         self,
@@ -384,7 +384,7 @@ class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
         self.heading.drawOn(self.canv, 0.0, (self.high_mm - heading_mm) * POINTS_PER_MM)
         low = self.points.min(axis=0)
         size = np.maximum(self.points.max(axis=0) - low, 1e-6)
-        # On the right stands the arrow that points up.
+        # The arrow that points up is on the right.
         limits = np.array([wide_mm - 14.0, self.high_mm - heading_mm - 5.0])
         mm_per_m = float((limits / size).min())
         corner = np.array([2.0, 0.5 * (limits[1] - mm_per_m * size[1]) + 2.0])
@@ -411,7 +411,7 @@ def _key_plan(drawing: WallDrawing, plan: KeyPlan) -> tuple[str, NDArray[np.floa
         right = wide_mm - 4.0
         arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
         write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
-        # The marked one first: where walls lie close, not all of them have room.
+        # The marked one first: where walls are close together, not all numbers fit.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
         order = sorted(placed, key=lambda n: (n != drawing.number, -_length(placed[n])))
         _number_walls(canvas, {n: placed[n] for n in order})
@@ -420,7 +420,7 @@ def _key_plan(drawing: WallDrawing, plan: KeyPlan) -> tuple[str, NDArray[np.floa
 
 
 def _number_walls(canvas: Canvas, on_paper: Mapping[int, NDArray[np.float64]]) -> None:
-    """Write the numbers of walls into their middles, in this order, where there is room."""
+    """Write the numbers of walls at their middles, in this order, if there is room."""
     placed: list[NDArray[np.float64]] = []
     for number, wall in on_paper.items():
         middle = wall.mean(axis=0)
@@ -436,7 +436,7 @@ def _length(ends: NDArray[np.float64]) -> float:
 
 
 def _sheet_key(drawing: WallDrawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
-    """How a wall is cut into sheets, this one filled."""
+    """The division of a wall into sheets, with this one filled."""
     boxes = {
         number: np.array(
             [
@@ -549,7 +549,7 @@ def _scale_and_sheet(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[list[
 def _rows(
     cells: Sequence[tuple[list[Any], bool]], n_columns: int
 ) -> tuple[list[list[Any]], list[Any]]:
-    """Put cells into rows: wide ones take two columns, and the last of a row what is left of it."""
+    """Arrange cells in rows: wide ones take two columns, and the last of a row the rest of it."""
     rows: list[list[tuple[list[Any], int]]] = [[]]
     for content, is_wide in cells:
         span = 2 if is_wide else 1

@@ -1,4 +1,4 @@
-"""What stands on a sheet."""
+"""The contents of a sheet."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Unit = Literal["m", "ft"]
 
 @dataclass(frozen=True, kw_only=True)
 class Axes:
-    """What the coordinates beside a picture are, in metres.
+    """The coordinates beside a picture, in metres.
 
     Attributes:
         across: coordinate at the left edge of the drawn wall, and its change per metre to the
             right.
         down: coordinate at its top edge, and its change per metre downwards.
-        phrase: what they mean, for the sheet.
+        phrase: their meaning, for the sheet.
     """
 
     across: tuple[float, float]
@@ -38,14 +38,14 @@ class Axes:
 
 @dataclass(frozen=True, kw_only=True)
 class SheetText:
-    """What is written on every sheet of a wall.
+    """Texts on every sheet of a wall.
 
     Attributes:
         name: of the wall.
         block: the office's title block.
         notes: accuracy, colours, cells.
-        digest: what seals the record.
-        run: which run of which workflow, by which program.
+        digest: seal of the record.
+        run: run, workflow and program.
     """
 
     name: str
@@ -57,10 +57,10 @@ class SheetText:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedArea:
-    """An area that is outlined on the pictures of a wall.
+    """An area outlined on the pictures of a wall.
 
     Attributes:
-        text: written into it where it is wide enough, its parts (", ") below each other.
+        text: written into it if it is wide enough, its parts (", ") below each other.
         outline_m: (n, 2) metres to the right and down from the top-left corner of the drawn wall.
     """
 
@@ -70,23 +70,24 @@ class MarkedArea:
 
 @dataclass(frozen=True, kw_only=True)
 class WallDrawing:
-    """A wall that is drawn, on one sheet or more.
+    """A wall drawn on one sheet or more.
 
     Attributes:
         number: of the wall.
         rasters: kind of picture -> GeoTIFF.
         axes: coordinates.
         plan: the key plan, None without planes.
-        text: what is written.
+        text: its texts.
         scale: n of 1 : n.
         grid: distance of the crosses in `unit`, 0 for none.
-        unit: of everything that is written beside pictures.
-        language: of labels.
-        interval_m: of the contours of depth.
-        depth_range_m: depths that the grey of the depth picture shows as black and as white.
+        unit: unit of all numbers beside pictures.
+        language: language of labels.
+        interval_m: interval of the contours of depth.
+        depth_range_m: depths that are black and white in the grey of the depth picture.
         areas: openings of the wall.
         heights: metres down from the top edge that have a height mark.
-        north: (2,) right and up on the paper of what is up in the key plan; None where heights are.
+        north: (2,) right and up on the paper of the up direction of the key plan; None with
+            heights.
         is_flipped: the rows of the rasters go up the paper, as those of ceilings do.
         intensity_is_grey: the intensity is the grey of the scan's colours, not of its laser.
     """
@@ -114,11 +115,12 @@ class Sheet:
     """One sheet.
 
     Attributes:
-        paper: of it.
+        paper: its paper.
         views: pictures on it.
         number: 1 for the first; 0 for the index.
-        count: how many there are besides the index.
-        numbered: for the index the part of each sheet; for a sheet of several the same, as a key.
+        count: number of sheets without the index.
+        numbered: for the index the part of each sheet; for one of several sheets the same, as a
+            key.
     """
 
     paper: Paper
@@ -129,7 +131,7 @@ class Sheet:
 
 
 def axes_of(frame: WallFrame) -> Axes:
-    """Coordinates of a raster, those of its GeoTIFF; Y goes up the paper, also that of ceilings."""
+    """Coordinates of a raster, those of its GeoTIFF; Y goes up the paper, also for ceilings."""
     left_m, top_m = frame.raster_corner_m
     if frame.raster_down > 0.0:
         top_m += frame.height * frame.gsd_m
@@ -142,7 +144,7 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def _axis_words(up: NDArray[np.float64]) -> str:
-    """State which of the scan's axes heights count along, backwards or not."""
+    """Return the scan's axis along which heights count, with its sign."""
     if up.shape != (3,):
         return "?"
     axis = int(np.argmax(np.abs(up)))
@@ -152,7 +154,7 @@ def _axis_words(up: NDArray[np.float64]) -> str:
 
 
 def north_of(frame: WallFrame) -> tuple[float, float] | None:
-    """Where on the drawing the key plan's up is: right and up; None of walls that stand upright."""
+    """Return the key plan's up direction on the drawing: right and up; None for upright walls."""
     if frame.up is None or frame.raster_axes == "wall":
         return None
     north_world = basis_from_up(np.array(frame.up))[1]

@@ -1,4 +1,4 @@
-"""Which paper a wall is drawn on, and how it is cut up where none takes it."""
+"""The paper of a wall's drawing, and the division of walls that fit on none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from orthoflow.files.drawings.sheet_blocks import Furniture, furnished
 from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
 from orthoflow.files.drawings.title_blocks import TitleBlock
 
-# A wall that fits no paper is cut up onto sheets of this one.
+# A wall that fits on no paper is divided into sheets of this one.
 _CUT_PAPER: Final = "A1"
 
 # A drawing, and width and height of its wall in metres.
@@ -36,10 +36,10 @@ class Sheets:
     """The sheets of a wall.
 
     Attributes:
-        drawing: of the wall.
-        furniture: what stands beside the pictures of each sheet.
+        drawing: drawing of the wall.
+        furniture: blocks beside the pictures of each sheet.
         sheets: each with its pictures.
-        index: the drawing and sheet that show how the wall is cut, at a smaller scale.
+        index: the drawing and sheet that show the division of the wall, at a smaller scale.
     """
 
     drawing: WallDrawing
@@ -48,7 +48,7 @@ class Sheets:
 
 
 def _ways(paper: Paper, block: TitleBlock) -> list[Paper]:
-    """A paper with the title block in each place that the office allows."""
+    """Yield a paper with the title block in each permitted position."""
     layouts: tuple[Layout, ...] = (block.layout,) if block.layout else ("column", "strip")
     return [replace(paper, layout=layout) for layout in layouts]
 
@@ -60,7 +60,7 @@ def _on_one(
     *,
     is_brief: bool = False,
 ) -> tuple[Sheet, Furniture] | None:
-    """All pictures of a wall on one sheet of the first of some papers that takes them."""
+    """Return all pictures of a wall on one sheet of the first of some papers that fits."""
     kinds = tuple(drawing.rasters)
     for paper in papers:
         for way in _ways(paper, drawing.text.block):
@@ -79,12 +79,12 @@ def _on_one(
 def fitting_scale(
     drawn: Callable[[int], Sequence[Sized]], scales: Sequence[int], papers: Sequence[Paper]
 ) -> int:
-    """Return n of the largest scale 1 : n at which each wall fits onto one sheet.
+    """Return n of the largest scale 1 : n at which each wall fits on one sheet.
 
     Args:
-        drawn: gives the walls at a scale.
-        scales: from the largest.
-        papers: that are at hand.
+        drawn: returns the walls at a scale.
+        scales: largest first.
+        papers: available papers.
     """
     ways = [way for paper in papers for way in (paper, paper.turned)]
     for scale in scales:
@@ -94,7 +94,7 @@ def fitting_scale(
 
 
 def paper_for_one(walls: Sequence[Sized]) -> str:
-    """Name the smallest usual paper that takes each wall on one sheet; empty where none does."""
+    """Return the name of the smallest usual paper that fits each wall on one sheet, or ""."""
     for paper in usual_papers()[::2]:
         ways = (paper, paper.turned)
         if all(_on_one(drawing, size_m, ways) for drawing, size_m in walls):
@@ -105,18 +105,18 @@ def paper_for_one(walls: Sequence[Sized]) -> str:
 def lay_out(
     drawing: WallDrawing, size_m: tuple[float, float], given: Sequence[Paper] = ()
 ) -> Sheets:
-    """Lay a wall onto one sheet, or cut it up onto several of the same size.
+    """Place a wall on one sheet, or divide it into several of the same size.
 
     Args:
-        drawing: of the wall.
+        drawing: drawing of the wall.
         size_m: its width and height.
-        given: papers that may be taken; without any the smallest usual one that takes the wall.
+        given: permitted papers; without any the smallest usual one that fits the wall.
 
     Raises:
-        ArgumentError: the paper has no room for the title block, or the wall takes too many sheets.
+        ArgumentError: the title block does not fit on the paper, or the wall needs too many sheets.
     """
     papers = [way for paper in given for way in (paper, paper.turned)] or usual_papers()
-    # Key plans are left out only where the office's paper has no room for them.
+    # Key plans are omitted only if the office's paper has no room for them.
     for is_brief in (False, True) if given else (False,):
         if (alone := _on_one(drawing, size_m, papers, is_brief=is_brief)) is not None:
             return Sheets(drawing=drawing, sheets=(alone,))
@@ -145,9 +145,9 @@ def lay_out(
 def _cut(
     drawing: WallDrawing, size_m: tuple[float, float], paper: Paper, *, is_brief: bool
 ) -> list[tuple[tuple[Sheet, Furniture], ...]]:
-    """The sheets of a wall that is cut up; nothing where the paper has no room for them."""
+    """Return the sheets of a divided wall; none if the paper has no room for them."""
     whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
-    # As much text as any of them: with a key of several sheets.
+    # As much text as on any of them: with a key of several sheets.
     views = (View(kind=next(iter(drawing.rasters)), part=whole, corner_mm=(0.0, 0.0)),)
     several = ((1, whole), (2, whole))
     longest = Sheet(paper=paper, views=views, count=99, numbered=several)
@@ -179,7 +179,7 @@ def _cut(
 
 
 def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, Part], ...]:
-    """What of a wall is on which of the sheets of one picture; empty where it is not cut."""
+    """Return the part of a wall on each of the sheets of one picture; empty if undivided."""
     parts = tuple(
         (number, sheet[0].part)
         for number, sheet in enumerate(views, start=1)
@@ -195,7 +195,7 @@ def _index(
     numbered: tuple[tuple[int, Part], ...],
     count: int,
 ) -> tuple[WallDrawing, Sheet, Furniture] | None:
-    """The wall as large as one sheet takes; None where it is not cut, or no usual scale does."""
+    """Wall as large as fits on one sheet; None if it is undivided, or at no usual scale."""
     first = next(iter(drawing.rasters))
     whole = replace(drawing, grid=0.0, heights=(), rasters={first: drawing.rasters[first]})
     if len(numbered) < 2:

@@ -1,7 +1,7 @@
-"""Sheets: a wall's pictures on paper in exact scale, as PDF.
+"""Sheets: a wall's pictures on paper to scale, as PDF.
 
-Pictures are embedded once; all else is vectors and text. Lengths on the paper are millimetres from
-its bottom-left corner until reportlab takes them, in points.
+Pictures are embedded once; everything else is vectors and text. Lengths on the paper are
+millimetres from its bottom-left corner until they are passed to reportlab, in points.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
 _TICK_MM: Final = 1.5
-# Between what stands beside each other, at least.
+# Minimum distance between adjacent items.
 _APART_MM: Final = 1.5
 _MARK_ROW_MM: Final = 4.2
 
@@ -120,7 +120,7 @@ def _draw_view(
 
 
 def _edges(drawing: WallDrawing, view: View) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top of a picture on the paper."""
+    """Return left, bottom, right and top of a picture on the paper."""
     left, bottom = view.corner_mm
     wide, high = (1e3 * edge / drawing.scale for edge in view.part.size_m)
     return left, bottom, left + wide, bottom + high
@@ -148,7 +148,7 @@ def _draw_contours(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
 
 
 def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
-    """Outline openings, cut off where the picture ends."""
+    """Outline openings, clipped to the picture."""
     left, bottom, right, top = _edges(drawing, view)
     canvas.saveState()
     frame = canvas.beginPath()
@@ -156,7 +156,7 @@ def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     canvas.clipPath(frame, stroke=0, fill=0)
     for area in drawing.areas:
         outline = [_on_paper(drawing, view, x, y) for x, y in area.outline_m.tolist()]
-        # White below, so that the line is seen on any picture.
+        # White below, so that the line is visible on any picture.
         line(canvas, outline, width_mm=1.0, colour=WHITE, is_closed=True)
         line(canvas, outline, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True)
         xs, ys = zip(*outline, strict=True)
@@ -166,7 +166,7 @@ def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
 
 
 def _write_inside(canvas: Canvas, text: str, limits_mm: Sequence[float]) -> None:
-    """Write the parts of a text on white, from the top, where there is the room."""
+    """Write the parts of a text on white, from the top, if there is room."""
     left, right, bottom, top = limits_mm
     rows = shown(text).split(", ")
     wide = max(text_width_mm(row) for row in rows) + 2.0
@@ -180,7 +180,7 @@ def _write_inside(canvas: Canvas, text: str, limits_mm: Sequence[float]) -> None
 
 
 def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
-    """Crosses at round coordinates, and the coordinates beside the frame, as many as have room."""
+    """Draw crosses at round coordinates, and as many coordinates beside the frame as fit."""
     part = view.part
     left, bottom, right, top = _edges(drawing, view)
     unit_m = FOOT_M if drawing.unit == "ft" else 1.0
@@ -207,7 +207,7 @@ def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     for text, x in _with_room(columns, digits, (left - 4.0, right + 4.0)):
         at = (x, bottom - _TICK_MM - 1.0 - TEXT_MM)
         write_text(canvas, text, at, is_centred=True)
-    # Beside the picture, clear of those below it.
+    # Beside the picture, not overlapping those below it.
     for text, y in _with_room(rows, digits, (bottom, top)):
         write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
@@ -218,11 +218,11 @@ def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
 def _with_room(
     places: dict[float, float], digits: int, limits_mm: tuple[float, float]
 ) -> Iterator[tuple[str, float]]:
-    """Numbers at whole multiples of the smallest step of 1, 2, 5 ... marks at which all have room.
+    """Return numbers at multiples of the smallest step of 1, 2, 5 ... marks at which all fit.
 
     Args:
-        places: coordinate -> where it is along the edge.
-        digits: behind the point.
+        places: coordinate -> its position along the edge.
+        digits: decimal places.
         limits_mm: a number at an end is moved inside them.
     """
     values = sorted(places)
@@ -247,7 +247,7 @@ def _with_room(
 def _marks(
     axis: tuple[float, float], limits_m: tuple[float, float], step: float, unit_m: float
 ) -> Iterator[tuple[float, float]]:
-    """Places on the wall where a coordinate is a whole number of steps, and the coordinate."""
+    """Positions on the wall where a coordinate is a whole number of steps, and the coordinate."""
     start, slope = axis
     step_m = step * unit_m
     low, high = sorted(start + slope * place for place in limits_m)
@@ -256,7 +256,7 @@ def _marks(
 
 
 def _draw_heights(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
-    """Height marks right of the picture, moved apart where they would lie over each other."""
+    """Draw height marks right of the picture, moved apart if they would overlap."""
     _, bottom, right, top = _edges(drawing, view)
     unit_m = FOOT_M if drawing.unit == "ft" else 1.0
     start, slope = drawing.axes.down
@@ -267,7 +267,7 @@ def _draw_heights(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     )
     room = max(1, int((top - bottom) / _MARK_ROW_MM))
     if len(levels) > room + 1:
-        # Of many the lowest and the highest, and of the others every so many.
+        # Of many the lowest and the highest, and every nth of the others.
         every = math.ceil((len(levels) - 2) / max(1, room - 1))
         levels = [levels[0], *levels[1:-1][::every], levels[-1]]
     places: list[float] = []
@@ -283,7 +283,7 @@ def _draw_heights(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
 
 
 def _neighbours(sheet: Sheet, view: View) -> dict[str, int]:
-    """Sheets on which a part goes on: side of the picture -> number."""
+    """Return sheets on which a part continues: side of the picture -> number."""
     found: dict[str, int] = {}
     part = view.part
     for number, other in sheet.numbered:
@@ -303,10 +303,10 @@ def _neighbours(sheet: Sheet, view: View) -> dict[str, int]:
 def _draw_match_lines(
     canvas: Canvas, drawing: WallDrawing, view: View, neighbours: dict[str, int]
 ) -> None:
-    """Dash-dotted lines where the wall goes on, each with the number of the sheet."""
+    """Draw dash-dotted lines where the wall continues, each with the number of the sheet."""
     left, bottom, right, top = _edges(drawing, view)
     middle = (0.5 * (left + right), 0.5 * (bottom + top))
-    # Left and below they stand beyond the coordinates.
+    # Left and below they are beyond the coordinates.
     for side, ends, at, turned_deg in (
         ("left", [(left, bottom - 5.0), (left, top + 5.0)], (left - 6.8, middle[1]), 90.0),
         ("right", [(right, bottom - 5.0), (right, top + 5.0)], (right + 6.0, middle[1]), 90.0),
@@ -320,7 +320,7 @@ def _draw_match_lines(
 
 
 def _draw_cuts(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
-    """Draw onto the index what of the wall is on which sheet."""
+    """Draw the parts of the wall on each sheet into the index."""
     for number, part in sheet.numbered:
         corners = [
             _on_paper(drawing, sheet.views[0], x, y)
@@ -341,7 +341,7 @@ def _draw_cuts(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
 def _on_paper(
     drawing: WallDrawing, view: View, right_m: float, down_m: float
 ) -> tuple[float, float]:
-    """Where a place of the wall lies on the paper, in mm."""
+    """Return the position on the paper, in mm, of a position on the wall."""
     left, bottom = view.corner_mm
     return (
         left + 1e3 * (right_m - view.part.left_m) / drawing.scale,

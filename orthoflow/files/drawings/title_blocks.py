@@ -1,4 +1,4 @@
-"""The title block of a sheet: what an office writes on its drawings, from a YAML file.
+"""The title block of a sheet, as an office writes it in a YAML file.
 
 ```yaml
 layout: strip            # along the lower edge; column: on the right; without it what wastes less
@@ -42,7 +42,7 @@ _DIALECT: Final = Dialect(is_strict=False, empty="the title block is empty")
 
 
 def _checked_text(value: object) -> object:
-    """Take numbers for text, and refuse what is longer than a sheet has room for."""
+    """Convert numbers to text, and refuse text that does not fit on a sheet."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if isinstance(value, str) and len(value) > MOST_LETTERS:
@@ -67,23 +67,23 @@ class Revision(_Model):
 
 
 class TitleBlock(_Model):
-    """What stands in the title block; what is empty is left out.
+    """The content of the title block; empty fields are omitted.
 
     Attributes:
-        layout: where it stands; None for where less paper is left blank.
+        layout: its position; None for the one that wastes less paper.
         logo: PNG or JPEG of the office, beside the YAML file.
         project: what is surveyed.
-        title: of the drawing, in the place of the name of the wall.
-        site: where it stands.
-        client: for whom.
-        organisation: who answers for the drawing.
-        author: who drew it.
-        checked_by: who looked at it.
-        date: of the drawing.
-        drawing: its number; the numbers of wall and sheet follow it.
-        revision: its state; the mark of the last of the revisions without it.
+        title: title of the drawing, instead of the name of the wall.
+        site: its location.
+        client: the client.
+        organisation: the organisation responsible for the drawing.
+        author: the author.
+        checked_by: the person who checked it.
+        date: date of the drawing.
+        drawing: its number, followed by the numbers of wall and sheet.
+        revision: its state; by default the mark of the last of the revisions.
         note: anything else.
-        fields: what the client asks for besides, by name.
+        fields: further fields of the client, by name.
         revisions: the oldest first.
     """
 
@@ -106,7 +106,7 @@ class TitleBlock(_Model):
 
 @dataclass
 class _Problems:
-    """Keeps what is wrong with a document."""
+    """Collects the problems of a document."""
 
     found: list[tuple[Position, str]] = field(default_factory=list)
 
@@ -118,7 +118,7 @@ def read_title_block(path: Path) -> TitleBlock:
     """Read a title block.
 
     Raises:
-        InputError: the file cannot be read, or holds something else; one sentence, about the first
+        InputError: the file cannot be read, or has other content; one sentence, about the first
             place.
     """
     problems = _Problems()
@@ -146,7 +146,7 @@ def read_title_block(path: Path) -> TitleBlock:
 
 
 def _located(content: Table, item: Any) -> tuple[Position, str, str]:
-    """Find where in the document a mistake is, and say what it is."""
+    """Find the position of a mistake in the document, and describe it."""
     place: Value = content
     position, path = content.position, [str(key) for key in item["loc"] if key != "[key]"]
     for key in item["loc"]:

@@ -1,4 +1,4 @@
-"""Texts of drawings in the languages that offices ask for; `labels.txt` holds them."""
+"""Texts of drawings in the supported languages; `labels.txt` contains them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def label(key: str, language: Language = "en", **values: object) -> str:
 
 
 def surface_name(name: str, language: Language = "en") -> str:
-    """Translate the name that a run gives a surface; any other stays.
+    """Translate the name of a surface in a run; other names are unchanged.
 
     >>> surface_name("wall 3", "fr"), surface_name("Nordwand", "fr")
     ('mur 3', 'Nordwand')
@@ -50,9 +50,9 @@ class Phrase:
     """A statement that can be made in each language.
 
     Attributes:
-        key: of its text.
-        values: what is filled in.
-        asides: statements in parentheses behind it.
+        key: key of its text.
+        values: values to fill in.
+        asides: statements in parentheses after it.
     """
 
     key: str
@@ -67,7 +67,7 @@ class Phrase:
 
 
 def accuracy_phrase(accuracy: object) -> Phrase:
-    """State what `accuracy` of an orthoimage's sidecar holds."""
+    """Return the statement of the `accuracy` of an orthoimage's sidecar."""
     told = accuracy if isinstance(accuracy, dict) else {}
     median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
     if told.get("assessed") is not True or not (

@@ -1,4 +1,4 @@
-"""What every reader of point files returns: a description of the file, then blocks of points."""
+"""The result of every reader of point files: a description of the file, then blocks of points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from orthoflow.files.points.units import StatedUnit
 
 # 12 MB of float64 coordinates: large enough for memory speed, small enough to hold several copies.
 BLOCK_POINTS: Final = 500_000
-# Positions are counted in 32 bits by half the programs that will read our products.
+# Half of the programs that read our products count positions in 32 bits.
 MOST_POINTS: Final = 2**32
 # The densest encodings take a byte for eight points; a small file that states more is refused
 # before memory is allocated for them.
@@ -37,10 +37,10 @@ class Scan:
         fields: what each of its points has besides coordinates.
         fields_used: names of the file's fields that are read.
         fields_not_used: names of those that are not.
-        intensity_limits: smallest and largest intensity that the file states for it, or None.
+        intensity_limits: smallest and largest intensity stated in the file, or None.
         rgb_limit: stated value of full brightness, or None.
-        unit: of its coordinates, where the file states one.
-        station: (3,) where the scanner stood, in the file's unit, or None.
+        unit: unit of its coordinates, if the file states one.
+        station: (3,) position of the scanner, in the file's unit, or None.
         station_is_posed: the file states a pose other than the identity.
     """
 
@@ -57,20 +57,20 @@ class Scan:
 
 @dataclass(frozen=True, kw_only=True)
 class PointBlock:
-    """Some points of one scan, as the file has them, poses applied.
+    """Some points of one scan, as in the file, with poses applied.
 
     Attributes:
-        points: (n, 3) float64 in the file's unit; may hold NaN and infinities.
+        points: (n, 3) float64 in the file's unit; may contain NaN and infinities.
         scan: position of the scan in its file.
-        n_read: points of the file that this block accounts for, those left out included.
-        left_out: how many of them are left out, by cause: `invalid`, `no_return`, `withheld`,
+        n_read: points of the file that this block accounts for, including those left out.
+        left_out: number of points left out, by cause: `invalid`, `no_return`, `withheld`,
             `synthetic`, `other_class`, `damaged`.
-        intensity: (n,) float32 in the file's own scale, NaN where invalid; None without.
+        intensity: (n,) float32 in the file's own scale, NaN if invalid; None without.
         rgb: (n, 3) in the file's own scale and type, or None.
-        has_rgb: (n,) which points have a valid colour; None when all have.
-        row: (n,) int64 position in the scan's grid, or None; column alike.
-        bounds: (2, 3) smallest and largest coordinates, where the reader has them already and all
-            are finite; None where it has not.
+        has_rgb: (n,) which points have a valid colour; None if all have.
+        row: (n,) int64 position in the scan's grid, or None; column likewise.
+        bounds: (2, 3) smallest and largest coordinates, if the reader knows them and all are
+            finite; else None.
     """
 
     points: NDArray[np.float64]
@@ -87,16 +87,16 @@ class PointBlock:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanFile:
-    """One point file, opened as far as its header.
+    """One point file, opened up to its header.
 
     Attributes:
         name: file name without folder, for messages and the record.
         format_name: e.g. `E57`.
-        n_most: at most so many points will come.
-        scans: its scans, in the order in which their blocks come.
-        read: yields the points; may be called once.
-        notes: what the reader noticed, in sentences for the user; complete after reading.
-        is_chosen: only the parts of the file come that were asked for.
+        n_most: maximum number of points.
+        scans: its scans, in the order of their blocks.
+        read: yields the points; can be called once.
+        notes: notes of the reader, as sentences for the user; complete after reading.
+        is_chosen: only the requested parts of the file are read.
     """
 
     name: str
@@ -126,7 +126,7 @@ class ScanFile:
 
 
 def short_file_error(path: Path, what: str, found: str, expected: str) -> InputError:
-    """Build the error for a file that ends before its header says it does."""
+    """Return the error for a file that ends before its header says it does."""
     return InputError(
         f"{path.name} is cut off: its {what} holds {found}, its header states {expected}; copy or "
         "export it again"

@@ -1,7 +1,7 @@
-"""The octree of a COPC file: which of its chunks hold points of a box, so far apart.
+"""The octree of a COPC file: which of its chunks hold points of a box at a given spacing.
 
 A COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root holds
-some points of all the cloud, each node below holds points between those, twice as dense.
+some points of the whole cloud, each node below holds points between those, at twice the density.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _RECORD: Final = struct.Struct("<H16sHH32s")
 _INFO: Final = struct.Struct("<5d2Q")
 _ENTRY: Final = struct.Struct("<4iQii")
 _PAGE: Final = -1
-# Deeper trees have nodes smaller than any scanner's step.
+# Deeper trees have nodes smaller than any scanner's point spacing.
 _LEVELS_MOST: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wish:
-    """Which points of a file are asked for; a reader may give more.
+    """The requested points of a file; a reader may return more.
 
     Attributes:
         box: (2, 3) lowest and highest coordinates in the file's unit, or None for all.
-        spacing: points no denser than so far apart, in the file's unit; None for all.
+        spacing: minimum spacing of points, in the file's unit; None for all.
     """
 
     box: NDArray[np.float64] | None = None
@@ -49,7 +49,7 @@ class Node:
 
     Attributes:
         level: 0 for the root.
-        place: of the node among those of its level, along x, y and z.
+        place: position of the node in its level, along x, y and z.
         offset: of the chunk in the file, bytes.
         n_bytes: of the chunk.
         n_points: in the chunk.
@@ -79,14 +79,14 @@ class Octree:
     spacing: float
 
     def chosen(self, wish: Wish) -> tuple[Node, ...]:
-        """Return the nodes with points that somebody asks for, in the order of the file.
+        """Return the requested nodes with points, in the order of the file.
 
-        The first level whose points are no farther apart than asked for is the last one. Where no
-        node meets the box, the root is given, whose points tell where the cloud is.
+        The first level whose points are no farther apart than requested is the last one. If no node
+        meets the box, the root is returned, whose points show where the cloud is.
         """
         last = _LEVELS_MOST
         if wish.spacing is not None:
-            # One by one: a damaged file's spacing may be so large that the quotient has no number.
+            # One by one: a damaged file's spacing may be so large that the quotient is not finite.
             levels = math.log2(self.spacing) - math.log2(wish.spacing)
             last = max(0, math.ceil(levels - 1e-9))
         found = [node for node in self.nodes if node.level <= last and self._meets(node, wish)]
@@ -105,7 +105,7 @@ class Octree:
 
 
 def read_octree(path: Path, chunks: Collection[tuple[int, int, int]]) -> Octree | None:
-    """Read the octree of a LAZ file; None for one that has none.
+    """Read the octree of a LAZ file; None if it has none.
 
     Args:
         path: the file, whose header has been checked.
@@ -139,7 +139,7 @@ def _read_nodes(path: Path, root: tuple[int, int]) -> list[Node]:
     with path.open("rb") as file:
         while pages:
             offset, n_bytes = pages.pop()
-            # Pages lie beside each other, so that all of them are no longer than the file.
+            # Pages are adjacent, so that together they are no longer than the file.
             n_left -= n_bytes
             if offset + n_bytes > n_file or n_left < 0:
                 raise _damaged(path, "its pages lie outside the file")

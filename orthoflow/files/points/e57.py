@@ -1,9 +1,9 @@
 """E57 through libE57's block buffers: several scans with their poses, cartesian or spherical.
 
-Its XML is looked at before, bounded and nothing but elements: libE57 compares each child of a
-structure with all before it, so that 60,000 take over 50 s. Entities it refuses today as bad XML;
-that nothing is read which they name shall not hang on its version. The standard (ASTM E2807) needs
-none of that.
+Its XML is checked first, with limits and for elements only: libE57 compares each child of a
+structure with all previous ones, so that 60,000 take over 50 s. It currently refuses entities as
+bad XML; that the files which they name are not read must not depend on its version. The standard
+(ASTM E2807) does not need any of that.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _GRID: Final = ("rowIndex", "columnIndex")
-# Not zero where the value is invalid.
+# Non-zero if the value is invalid.
 _STATES: Final = (
     "cartesianInvalidState",
     "sphericalInvalidState",
@@ -55,7 +55,7 @@ _STATES: Final = (
 MOST_XML_BYTES: Final = 1 << 25
 MOST_XML_ELEMENTS: Final = 200_000
 DEEPEST_XML: Final = 64
-# Of a structure; vectors, as of scans and pictures, may have as many as they like.
+# For a structure; vectors, as of scans and pictures, may have any number.
 MOST_XML_CHILDREN: Final = 500
 # E57 3.3: pages of 1024 bytes, the last four of each a checksum.
 _PAGE: Final = 1024
@@ -66,16 +66,16 @@ _ENCODING: Final = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", re.I
 
 @dataclass(frozen=True, kw_only=True)
 class ScanHeader:
-    """What is needed of one Data3D entry.
+    """The required parts of one Data3D entry.
 
     Attributes:
         index: position in the file's data3D.
-        n_points: stated number of points, invalid ones included.
+        n_points: stated number of points, including invalid ones.
         names: fields of each point.
         intensity: name of the field that is the intensity, or None.
         rotation: (3, 3) world from scan.
         translation: (3,) position of the scanner in the file's world.
-        scan: what it states of itself.
+        scan: its own statements.
     """
 
     index: int
@@ -93,7 +93,7 @@ class ScanHeader:
 
     @property
     def invalid_state(self) -> str:
-        """Name of the field that is not zero for points without a position."""
+        """Name of the field that is non-zero for points without a position."""
         return "cartesianInvalidState" if self.axes is _CARTESIAN else "sphericalInvalidState"
 
 
@@ -119,7 +119,7 @@ def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _unit(root: Any) -> StatedUnit:
-    """Metres, as the standard says, unless the coordinate metadata state another unit."""
+    """Metres, as in the standard, unless the coordinate metadata state another unit."""
     metres = unit_of_name("m", "the E57 standard")
     if not root.isDefined("coordinateMetadata"):
         return metres
@@ -178,7 +178,7 @@ def _read_header(
 
 
 def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation and translation to the file's world; the identity where the file states none."""
+    """Return rotation and translation to the file's world; the identity without a pose."""
     rotation = np.eye(3)
     translation = np.zeros(3)
     if not node.isDefined("pose"):
@@ -193,13 +193,13 @@ def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
-    """World-from-scan of a quaternion w, x, y, z of any length; the identity for one without."""
+    """Return world-from-scan of a quaternion w, x, y, z of any length; the identity without one."""
     from scipy.spatial.transform import Rotation
 
     length = math.hypot(*quaternion)
     if not (math.isfinite(length) and length > 0.0):
         return np.eye(3)
-    # Of length 1 before scipy squares it: squares of what files hold may be too large or too small.
+    # Normalised before scipy squares it: the squares of stored numbers may overflow or underflow.
     unit = [item / length for item in quaternion]
     return np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix(), dtype=np.float64)
 
@@ -222,7 +222,7 @@ def _limits(node: Any, group: str, low: str, high: str) -> tuple[float, float] |
 
 
 def _rgb_limit(node: Any) -> float | None:
-    """Largest colour value that the header states for any of the three channels."""
+    """Return the largest colour value that the header states for any of the three channels."""
     stated = [_limits(node, "colorLimits", f"{name}Minimum", f"{name}Maximum") for name in _COLOURS]
     largest = [item[1] for item in stated if item is not None]
     return max(largest) if len(largest) == 3 else None
@@ -269,7 +269,7 @@ def _buffers(
     arrays: dict[str, NDArray[Any]] = {}
     buffers = libe57.VectorSourceDestBuffer()
     for name in names:
-        # No integers: pye57 takes numpy's 64-bit ones for 32-bit ones and leaves rubbish, and its
+        # No integers: pye57 treats numpy's 64-bit ones as 32-bit ones and returns garbage, and its
         # own readers' 16 bits are too few for rows and columns.
         is_exact = name.startswith(("cartesian", "spherical", "row", "column"))
         arrays[name] = np.zeros(capacity, dtype=np.float64 if is_exact else np.float32)
@@ -315,16 +315,16 @@ def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def check_xml(path: Path) -> None:
-    """Look at the XML of an E57 file.
+    """Check the XML of an E57 file.
 
     Raises:
-        InputError: it is too large or too deep, has a document type, or is no XML in UTF-8.
+        InputError: it is too large or too deep, has a document type, or is not XML in UTF-8.
     """
     xml = _xml_of(path)
     encoding = _ENCODING.match(xml)
     if encoding is not None and encoding[1].upper() != b"UTF-8":
         raise _refusal(path, f"it is in {encoding[1][:40]!r}, expected UTF-8")
-    # Of each element around the present place: how many children, and how many it may have.
+    # For each enclosing element: its number of children, and the maximum.
     around: list[list[int]] = [[0, 1]]
     n_elements = 0
 
@@ -351,7 +351,7 @@ def check_xml(path: Path) -> None:
     try:
         parser.Parse(xml, True)  # noqa: FBT003 - it is all there is
     except ExpatError as error:
-        raise _refusal(path, f"it is no XML ({error})") from error
+        raise _refusal(path, f"it is not XML ({error})") from error
 
 
 def _xml_of(path: Path) -> bytes:

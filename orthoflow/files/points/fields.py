@@ -1,4 +1,4 @@
-"""What the fields of a point are, by one table of names for all formats, and blocks of them."""
+"""The meaning of the fields of a point, by one table of names for all formats."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _ALIASES: Final = {
     "number": "number no nr id index pointid objectid fid name pointname point pt",
     "scan": "scan scanid scannumber scanindex scanname source sourceid pointsourceid",
 }
-# What may stand in for an intensity, the best first.
+# Substitutes for an intensity, the best first.
 _STAND_INS: Final = (
     *("reflectance", "reflectivity", "scalarreflectance", "amplitude", "scalaramplitude"),
     *("remission", "scalarremission", "intensity16", "returnintensity", "signalstrength"),
@@ -54,18 +54,18 @@ _INTENSITY_PARTS: Final = re.compile(
     "intens|reflect|amplitud|remission|signal|echo|power|grey|gray|luminance|bright"
 )
 _MEANINGS: Final = {alias: name for name, text in _ALIASES.items() for alias in text.split()}
-# Looking for brackets takes time with the square of it.
+# The search for brackets takes quadratic time.
 _LONGEST_NAME: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """What the columns of a table, or the fields of a point, are.
+    """The meaning of the columns of a table, or of the fields of a point.
 
     Attributes:
         names: meaning of each, `_` for one that is not used.
-        labels: what the file calls them.
-        unit: of the coordinates, where their names state it (`X [ft]`).
+        labels: their names in the file.
+        unit: unit of the coordinates, if their names state it (`X [ft]`).
     """
 
     names: tuple[str, ...]
@@ -101,7 +101,7 @@ class Columns:
         return frozenset(found)
 
     def labels_of(self, *, used: bool) -> tuple[str, ...]:
-        """What the file calls the fields that are read, or those that are not."""
+        """Return the names in the file of the fields that are read, or of the others."""
         labels = self.labels or self.names
         positions = set(self.positions)
         return tuple(
@@ -110,14 +110,14 @@ class Columns:
 
 
 def plain_name(name: str) -> str:
-    """Reduce a field's name to its lower-case letters and digits, without what brackets hold."""
+    """Reduce a field's name to its lower-case letters and digits, without bracketed parts."""
     if len(name) > _LONGEST_NAME:
         return ""
     return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
 
 
 def meaning_of(name: str) -> str:
-    """Meaning of a field's name in any format, `_` when it has none."""
+    """Return the meaning of a field's name in any format, `_` without one."""
     plain = plain_name(name)
     if plain in _MEANINGS:
         return _MEANINGS[plain]
@@ -126,25 +126,25 @@ def meaning_of(name: str) -> str:
 
 
 def may_be_intensity(name: str) -> bool:
-    """Whether a field's name sounds like a measure of the returned light."""
+    """Whether a field's name suggests a measure of the returned light."""
     return _INTENSITY_PARTS.search(plain_name(name)) is not None
 
 
 def columns_of_names(
     labels: Sequence[str], *, intensity_field: str | None = None
 ) -> Columns | None:
-    """Sort out fields by their names.
+    """Classify fields by their names.
 
     Args:
-        labels: names of the fields, in their order.
-        intensity_field: name of the field that is to be the intensity; None for the usual names,
-            else those of reflectance, amplitude and remission.
+        labels: names of the fields, in order.
+        intensity_field: name of the field to use as the intensity; None for the usual names, else
+            those of reflectance, amplitude and remission.
 
     Returns:
-        None when they name no x, y and z.
+        None if they do not include x, y and z.
     """
     names = [meaning_of(label) for label in labels]
-    # A meaning met twice (`I` and `Intensity`) is that of its first field.
+    # If a meaning occurs twice (`I` and `Intensity`), its first field is used.
     names = [IGNORED if name in names[:index] else name for index, name in enumerate(names)]
     if not {"x", "y", "z"} <= set(names):
         return None
@@ -166,10 +166,10 @@ def columns_of_names(
 
 
 def columns_of_user(text: str | Sequence[str]) -> Columns:
-    """Columns that the user names, e.g. `x y z r g b intensity`; `_` skips one.
+    """Return columns named by the user, e.g. `x y z r g b intensity`; `_` skips one.
 
     Raises:
-        InputError: a name is unknown or given twice, or x, y, z are not all there.
+        InputError: a name is unknown or given twice, or x, y, z are incomplete.
     """
     words = text.replace(",", " ").split() if isinstance(text, str) else [str(w) for w in text]
     names = [IGNORED if word.lower() in ("_", "-", "skip", "") else word for word in words]
@@ -191,16 +191,16 @@ def columns_of_user(text: str | Sequence[str]) -> Columns:
 def columns_of_values(
     file_name: str, samples: NDArray[np.float64], first_line: str, *, is_pts: bool
 ) -> Columns:
-    """Find out by their values what columns without a header are, where that leaves no doubt.
+    """Find the meaning of columns without a header from their values, if it is unambiguous.
 
     Args:
         file_name: for messages.
         samples: (n, columns) numbers of the first lines.
         first_line: for messages.
-        is_pts: the file is a PTS file, which puts the intensity before the colours.
+        is_pts: the file is a PTS file, with the intensity before the colours.
 
     Raises:
-        InputError: the columns can mean several things.
+        InputError: the columns are ambiguous.
     """
     n_columns = samples.shape[1]
     lead: tuple[str, ...] = ()
@@ -235,14 +235,14 @@ def point_block(
     causes: Mapping[str, NDArray[np.bool_]] | None = None,
     scan: int = 0,
 ) -> PointBlock:
-    """Make a block of points of what a file has for them.
+    """Make a block of points from the values in a file.
 
     Args:
-        axes: (3, n) x, y, z; points where all three are exactly zero have no return.
+        axes: (3, n) x, y, z; points with all three exactly zero have no return.
         values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
             `column`; in the file's own types.
         causes: (n,) points that are left out, by cause; each counts for the first one.
-        scan: for the block.
+        scan: index of the scan.
     """
     n_read = axes.shape[1]
     is_void = axes[0] == 0.0
@@ -283,9 +283,9 @@ def block_of_table(
     """Make a block of a table (n, used columns) of text.
 
     Args:
-        table: as text has it.
-        columns: what its columns are.
-        packed: type of packed colours; None for whole numbers.
+        table: as in the text.
+        columns: meaning of its columns.
+        packed: type of packed colours; None for integers.
     """
     values: dict[str, NDArray[np.generic]] = dict(zip(columns.used, table.T, strict=True))
     axes = np.stack([table[:, axis] for axis in range(3)])
@@ -303,15 +303,15 @@ def record_blocks(
     n_points: int,
     what: str,
 ) -> Iterator[dict[str, NDArray[np.generic]]]:
-    """Yield the used fields of records of one size, mapped into memory, a block at a time.
+    """Yield the used fields of fixed-size records, memory-mapped, a block at a time.
 
     Args:
         path: the file.
         dtype: of a record; its fields are in the order of the columns.
-        columns: what they are.
+        columns: their meaning.
         offset: of the first record, bytes.
         n_points: records that the header states.
-        what: holds them, for messages.
+        what: their name in messages.
 
     Raises:
         InputError: there are fewer.
@@ -325,7 +325,7 @@ def record_blocks(
 
 
 def used_fields(records: NDArray[np.void], columns: Columns) -> dict[str, NDArray[np.generic]]:
-    """Fields of records (n,) that are used, by what they are."""
+    """Return the used fields of records (n,), by meaning."""
     names = records.dtype.names or ()
     return {
         name: records[names[position]]
@@ -334,7 +334,7 @@ def used_fields(records: NDArray[np.void], columns: Columns) -> dict[str, NDArra
 
 
 def axes_of(values: Mapping[str, NDArray[np.generic]]) -> NDArray[np.float64]:
-    """(3, n) coordinates, axis by axis in memory: later passes go along the axes."""
+    """Return (3, n) coordinates, axis by axis in memory: later passes run along the axes."""
     axes = np.empty((3, len(values["x"])))
     for place, axis in enumerate("xyz"):
         axes[place] = values[axis]
@@ -342,7 +342,7 @@ def axes_of(values: Mapping[str, NDArray[np.generic]]) -> NDArray[np.float64]:
 
 
 def unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours (n, 3) from 0x00RRGGBB, which is kept in an integer or in the bits of a float."""
+    """Return colours (n, 3) from 0x00RRGGBB, stored in an integer or in the bits of a float."""
     if packed.dtype.kind == "f":
         bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
     else:
@@ -351,14 +351,14 @@ def unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def whole(values: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Whole numbers; 0 for what is not finite."""
+    """Return integers; 0 for values that are not finite."""
     if values.dtype.kind == "f":
         values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
     return values.astype(np.int64)
 
 
 def _split_unit(label: str) -> tuple[str, str | None]:
-    """Split a name from the unit behind it: `X [ft]`, `y_mm`, `Z(m)`."""
+    """Split a name from its unit: `X [ft]`, `y_mm`, `Z(m)`."""
     found = re.fullmatch(
         r"\s*(.+?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|[_ ]([A-Za-z-]+))\s*", label[:200]
     )
@@ -370,7 +370,7 @@ def _split_unit(label: str) -> tuple[str, str | None]:
 
 
 def _readings(n_columns: int) -> list[tuple[str, ...]]:
-    """All orders of an intensity, colours and normals that take so many columns."""
+    """Yield all orders of an intensity, colours and normals with this many columns."""
     parts = (("intensity",), COLOURS, NORMALS)
     return [
         tuple(itertools.chain(*order))
@@ -395,7 +395,7 @@ def _fits(name: str, values: NDArray[np.float64]) -> bool:
     is_whole = bool(np.all(finite == np.rint(finite)))
     largest = finite.max(axis=0)
     if (largest > 255.0).any() and not (largest > 255.0).all():
-        # Channels of other depth: one of them is an intensity.
+        # Channels of different depth: one of them is an intensity.
         return False
     return (is_whole and not (is_unit and finite.max() <= 1.0)) or (
         finite.max() <= 1.0 and not is_unit

@@ -1,4 +1,4 @@
-"""Which reader a point file needs, told by its content and its suffix."""
+"""Choice of the reader of a point file, by its content and its suffix."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Format:
     """One family of point files.
 
     Attributes:
-        name: as people call it.
+        name: its usual name.
         suffixes: lower case, with the dot.
-        signatures: what its files begin with; empty for plain text.
+        signatures: first bytes of its files; empty for plain text.
     """
 
     name: str
@@ -45,10 +45,10 @@ FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)
 
 
 def find_format(path: Path) -> Format:
-    """Format of a point file: by its content where that is certain, else by its suffix.
+    """Return the format of a point file: by its content if that is certain, else by its suffix.
 
     Raises:
-        InputError: the file is missing, empty, not what its suffix says, or of no known format.
+        InputError: the file is missing, empty, not what its suffix says, or of an unknown format.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"
@@ -71,7 +71,7 @@ def find_format(path: Path) -> Format:
     if named is None:
         known = " ".join(suffix for item in FORMATS for suffix in item.suffixes)
         raise InputError(
-            f"{path.name} is no point file that orthoflow reads: expected one of {known}"
+            f"{path.name} is not a point file that orthoflow reads: expected one of {known}"
         )
     if named.signatures:
         if named is PCD and b"\0" not in start[:64]:
@@ -92,14 +92,14 @@ def open_scan(
     wish: Wish | None = None,
     intensity_field: str | None = None,
 ) -> ScanFile:
-    """Open a point file as far as its header.
+    """Open a point file up to its header.
 
     Args:
         path: the file.
-        columns: what the columns of a text file are, if the user says so.
-        classes: of a LAS or LAZ file only points of these classes are given; all when empty.
-        wish: of a COPC file only parts are read that hold such points; others are read whole.
-        intensity_field: name of the field that is the intensity; None for the usual one.
+        columns: meaning of the columns of a text file, if the user states it.
+        classes: of a LAS or LAZ file only points of these classes are read; all if empty.
+        wish: of a COPC file only parts with such points are read; others are read completely.
+        intensity_field: name of the field to use as the intensity; None for the usual one.
 
     Raises:
         InputError: the file cannot be read, with the reason in one sentence.

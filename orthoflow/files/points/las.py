@@ -1,13 +1,13 @@
 """LAS, LAZ and COPC through laspy, block by block.
 
-Header and chunk table are checked before the libraries believe them: a damaged count of records
-keeps laspy busy for hours, and a damaged chunk table makes the decompressor ask for any amount of
-memory, which ends the process without a word that Python could catch.
+Header and chunk table are checked before the libraries use them: a damaged number of records keeps
+laspy busy for hours, and a damaged chunk table makes the decompressor allocate any amount of
+memory, which ends the process without an exception.
 
-lazrs decodes the chunks of a block in threads of its own.
+lazrs decodes the chunks of a block in its own threads.
 
-Of point formats 6 and up, whose fields are compressed apart, only the fields are decoded that make
-a cloud. Of a COPC file only those nodes of the octree are decoded that hold points asked for.
+For point formats 6 and up, whose fields are compressed separately, only the fields of a cloud are
+decoded. Of a COPC file only those nodes of the octree are decoded that hold requested points.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _VLR_BYTES: Final = 54
 _EVLR_BYTES: Final = 60
 _OFFSET_BYTES: Final = 8
 _CHUNKED: Final = (2, 3)
-# Of the compression's record: which compressor, where its items are listed, and of their types how
-# many layers each takes (point, colours, colours with infrared, wave packets).
+# From the compression's record: the compressor, the position of its list of items, and the number
+# of layers of each type (point, colours, colours with infrared, wave packets).
 _LAYERED: Final = 3
 _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
@@ -69,14 +69,14 @@ def open_las(
 
     Args:
         path: the file.
-        classes: only points of these classes are given; all when empty.
-        wish: of a COPC file only the nodes are read that hold such points.
-        intensity_field: name of the field that is the intensity; None for the usual one.
+        classes: only points of these classes are read; all if empty.
+        wish: of a COPC file only nodes with such points are read.
+        intensity_field: name of the field to use as the intensity; None for the usual one.
     """
     laspy = load_library("laspy", path)
     _check_header(path)
     notes: list[str] = []
-    # Records behind the points may claim any size: only that of the coordinate system is read.
+    # Records after the points may state any size: only that of the coordinate system is read.
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
         n_points = _n_points(path, header, notes)
@@ -120,13 +120,13 @@ def open_las(
 
 @dataclass(frozen=True, kw_only=True)
 class _Wanted:
-    """What is read of a file.
+    """The requested parts of a file.
 
     Attributes:
-        n_points: that its header states, or its octree for the nodes.
-        classes: of the points; empty for all.
-        intensity: name of the field that is the intensity.
-        nodes: of the octree, in the order of the file; None for all points of the file.
+        n_points: stated by its header, or by its octree for the nodes.
+        classes: classes of the points; empty for all.
+        intensity: name of the field to use as the intensity.
+        nodes: nodes of the octree, in the order of the file; None for all points of the file.
     """
 
     n_points: int
@@ -136,7 +136,7 @@ class _Wanted:
 
 
 def _n_points(path: Path, header: Any, notes: list[str]) -> int:
-    """Number of points; of an uncompressed file whose header states fewer than it holds, these."""
+    """Number of points; if an uncompressed file holds more than its header states, that."""
     stated = int(header.point_count)
     if header.are_points_compressed:
         return stated
@@ -156,7 +156,7 @@ def _n_points(path: Path, header: Any, notes: list[str]) -> int:
 
 
 def _unit(path: Path, header: Any) -> StatedUnit | None:
-    """Unit of the coordinate system, from WKT if the file has it, else from its GeoTIFF keys."""
+    """Unit of the coordinate system, from WKT if the file has it, else from GeoTIFF keys."""
     texts = [getattr(vlr, "string", "") for vlr in header.vlrs if vlr.record_id == _WKT_RECORD]
     texts += _wkt_behind_points(path)
     for text in texts:
@@ -176,7 +176,7 @@ def _unit(path: Path, header: Any) -> StatedUnit | None:
 
 
 def _wkt_behind_points(path: Path) -> list[str]:
-    """Coordinate systems in the records behind the points, of at most so many and so large."""
+    """Yield coordinate systems in the records after the points, limited in number and size."""
     found = []
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
@@ -198,7 +198,7 @@ def _wkt_behind_points(path: Path) -> list[str]:
 
 
 def _in_place_of_zeros(path: Path, laspy: Any, extra: tuple[str, ...]) -> str:
-    """Name of the extra field that is the intensity, where the usual one holds zeros only."""
+    """Name of the extra field to use as the intensity if the usual one holds only zeros."""
     columns = columns_of_names(("x", "y", "z", *extra))
     if columns is None or "intensity" not in columns.names:
         return "intensity"
@@ -241,9 +241,9 @@ def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
 
 
 def _coordinates(chunk: Any) -> NDArray[np.float64]:
-    """(3, n) coordinates of a record, axis by axis in memory: later passes go along the axes."""
+    """Return (3, n) coordinates of a record, axis by axis: later passes run along the axes."""
     axes = np.empty((3, len(chunk)))
-    # Part by part, so that a part stays in the processor's cache from one step to the next.
+    # In parts, so that a part stays in the processor's cache from one step to the next.
     for start in range(0, len(chunk), _PART_POINTS):
         part = slice(start, start + _PART_POINTS)
         for place, name in enumerate("XYZ"):
@@ -254,7 +254,7 @@ def _coordinates(chunk: Any) -> NDArray[np.float64]:
 
 
 def _bounds(axes: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """(2, 3) bounds of coordinates (3, n); None where some are not finite, or there are none."""
+    """Return (2, 3) bounds of coordinates (3, n); None without any or if some are not finite."""
     if not axes.size:
         return None
     bounds = np.stack([axes.min(axis=1), axes.max(axis=1)])
@@ -264,9 +264,9 @@ def _bounds(axes: NDArray[np.float64]) -> NDArray[np.float64] | None:
 class _BoundsCheck:
     """Compares points with the bounds that the header states.
 
-    Compressed points carry no checksum, so that the bounds are the only witness of a changed byte:
-    some points far outside are damage. Bounds of another place (the points were moved, or others
-    appended) are stale, and only reported.
+    Compressed points have no checksum, so the bounds are the only indication of a changed byte:
+    some points far outside are damage. Bounds elsewhere (the points were moved, or others appended)
+    are stale, and only reported.
     """
 
     def __init__(self, path: Path, header: Any) -> None:
@@ -275,7 +275,7 @@ class _BoundsCheck:
         self._low, self._high = (np.asarray(b, np.float64) for b in (header.mins, header.maxs))
         self._extent = float((self._high - self._low).max())
         bounds = np.stack([self._low, self._high])
-        # Bounds that no scan has state nothing; NaN compares as False.
+        # Implausible bounds are ignored; NaN compares as False.
         self._is_usable = bool(
             np.all(np.abs(bounds) < _FARTHEST)
             and np.all(self._high >= self._low)
@@ -315,7 +315,7 @@ class _BoundsCheck:
         self._n_outside += int(np.count_nonzero(is_outside))
 
     def notes(self) -> list[str]:
-        """What is to be reported."""
+        """Return what to report."""
         if not self._n_outside:
             return []
         text = f"{self._path.name}: {self._n_outside} points lie outside the bounds its header "
@@ -337,7 +337,7 @@ def _check_header(path: Path) -> None:
     if not header_size <= start <= n_file:
         raise _damaged(path, "its points begin outside the file, which is cut off")
     if n_records * _VLR_BYTES > start - header_size:
-        raise _damaged(path, f"its header states {n_records} records that have no room")
+        raise _damaged(path, f"its header states {n_records} records that do not fit")
     if header[25] >= 4 and len(header) >= _HEADER_BYTES:
         first, n_extended = struct.unpack_from("<QI", header, 235)
         if n_extended and first + n_extended * _EVLR_BYTES > n_file:
@@ -375,7 +375,7 @@ def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
         raise _damaged(path, "its chunks are larger than the file")
     is_variable = compression.uses_variable_size_chunks()
     if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * header.point_count):
-        raise _damaged(path, f"its chunks are said to hold {compression.chunk_size()} points each")
+        raise _damaged(path, f"its header states chunks of {compression.chunk_size()} points each")
     n_points = sum(count for count, _ in table)
     if _is_layered(record):
         _check_layers(path, record, start + _OFFSET_BYTES, [size for _, size in table])
@@ -393,10 +393,10 @@ def _is_layered(record: bytes) -> bool:
 
 
 def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
-    """Compare the layers of each chunk with its size: the decompressor makes room for them first.
+    """Compare the layers of each chunk with its size: the decompressor allocates them first.
 
-    A chunk of point formats 6 and up is its first point, the number of its points, the size of
-    each layer, and the layers.
+    A chunk of point formats 6 and up is its first point, the number of its points, the size of each
+    layer, and the layers.
     """
     (n_items,) = struct.unpack_from("<H", record, _ITEMS_AT)
     items = [struct.unpack_from("<HH", record, _ITEMS_AT + 2 + 6 * k) for k in range(n_items)]
@@ -410,12 +410,12 @@ def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> N
             file.seek(start + n_head - sizes.size)
             raw = file.read(sizes.size)
             if len(raw) < sizes.size or n_head + sum(sizes.unpack(raw)[1:]) != n_bytes:
-                raise _damaged(path, "the layers of its chunks are not as large as they are said")
+                raise _damaged(path, "the layers of its chunks do not have the stated sizes")
             start += n_bytes
 
 
 def _check_size(path: Path, file: Any, start: int, n_points: int) -> int:
-    """Check where the table lies and how long it is; give the bytes of the chunks before it."""
+    """Check position and length of the table; return the bytes of the chunks before it."""
     n_file = path.stat().st_size
     file.seek(start)
     table = _read_offset(path, file)

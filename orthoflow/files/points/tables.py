@@ -122,7 +122,7 @@ def take_lines(file: BinaryIO, n_lines: int, *, first_line: int) -> list[bytes]:
             place = next(place for place, line in enumerate(part) if len(line) > MOST_LINE_BYTES)
             raise InputError(
                 f"{Path(file.name).name}, line {first_line + len(lines) + place}: the line has "
-                f"more than {MOST_LINE_BYTES} bytes, so this is no list of points; export the "
+                f"more than {MOST_LINE_BYTES} bytes, so this is not a list of points; export the "
                 "file again"
             )
         lines += part

@@ -201,7 +201,7 @@ def _unknown_columns(
         f"{layout.n_columns} columns below it (first line {line[:80]!r})"
     )
     if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
-        text += "; degrees are no lengths, project them to a plane system in metres if they are any"
+        text += "; if these are degrees, project them to a plane system in metres first"
     # What is known stays, and x, y, z that are missing are as like to be the last of the others.
     names = [meaning_of(label) for label in labels] if len(labels) == layout.n_columns else []
     missing = [axis for axis in "xyz" if axis not in names]

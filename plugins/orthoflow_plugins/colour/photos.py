@@ -50,13 +50,13 @@ class ColourPhotos(Method):
         tolerance_m: float = Field(
             TOLERANCE_M,
             gt=0.0,
-            description="A point so little behind the nearest one is seen as well.",
+            description="Points at most this far behind the nearest one are seen, too.",
         )
         occluder_points_min: int = Field(
             OCCLUDER_POINTS_MIN,
             ge=1,
-            description="Points with fewer about them, themselves included, are outliers and hide "
-            "nothing.",
+            description="Points with fewer neighbours, themselves "
+            "included, are outliers and hide nothing.",
         )
         unseen: Literal["drop", "grey"] = Field(
             "drop", description="Points that no photo sees are left out, or are mid-grey."

@@ -63,7 +63,7 @@ _TOLD: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
     severity="warning",
-    text="{n_missed} of {n_points} check points count nowhere: {reasons}",
+    text="{n_missed} of {n_points} check points are not used: {reasons}",
     remedy="{ways}",
     rank_by="n_missed",
 )
@@ -120,10 +120,10 @@ class InspectCheckpoints(Method):
         """How points that were not measured are found."""
 
         search_m: float = Field(
-            0.03, gt=0.0, le=1.0, description="How far from its place a point is looked for."
+            0.03, gt=0.0, le=1.0, description="Radius in which a point is searched."
         )
         target_radius_m: float = Field(
-            0.04, gt=0.0, le=1.0, description="Radius of quadrant targets that counts."
+            0.04, gt=0.0, le=1.0, description="Radius of quadrant targets that is used."
         )
 
     class In(Ports):
@@ -204,7 +204,7 @@ class InspectCheckpoints(Method):
         _draw(pictures, [points[k] for k in found], own_names, ctx)
         _tell(shift_m, own_names, ctx)
         for name, reason in list(missed.items())[:_TOLD]:
-            ctx.log(f"check point {name}: counts nowhere, {reason}")
+            ctx.log(f"check point {name}: not used, {reason}")
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(

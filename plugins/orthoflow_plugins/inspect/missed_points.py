@@ -55,7 +55,7 @@ def missed_points(
 def with_reasons(missed: Mapping[str, str]) -> str:
     """Name the first few results of `missed_points`, each with its reason."""
     named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
-    more = f" and {len(missed) - _NAMED} more, as the log says" if len(missed) > _NAMED else ""
+    more = f" and {len(missed) - _NAMED} more, see the log" if len(missed) > _NAMED else ""
     return f"{', '.join(named)}{more}"
 
 

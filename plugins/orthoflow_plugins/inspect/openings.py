@@ -76,7 +76,7 @@ class InspectOpenings(Method):
         MetricSpec(
             "side_error_over_sigma", label="error of sides over the stated one", better="one"
         ),
-        MetricSpec("n_stray_sides", label="sides with no true one near", better="lower"),
+        MetricSpec("n_stray_sides", label="sides without a true one nearby", better="lower"),
     )
 
     class Params(MethodParams):
@@ -86,10 +86,10 @@ class InspectOpenings(Method):
             default=0.05,
             gt=0.0,
             le=2.0,
-            description="Recesses so deep, or deeper, are openings.",
+            description="Recesses at least this deep are openings.",
         )
         area_least_m2: float = Field(
-            default=0.1, gt=0.0, le=10_000.0, description="Smaller ones are not asked for."
+            default=0.1, gt=0.0, le=10_000.0, description="Smaller ones are ignored."
         )
 
     class In(Ports):

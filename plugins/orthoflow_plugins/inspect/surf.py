@@ -113,12 +113,12 @@ class InspectSurf(Method):
             40.0,
             ge=30.0,
             le=200.0,
-            description="Largest displacement that is looked for: wide enough for gross errors.",
+            description="Largest displacement that is searched: large enough for gross errors.",
         )
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
             description="refuse: fail where there is no laser intensity or too little in common; "
-            "warn: go on without these numbers.",
+            "warn: continue without these numbers.",
         )
 
     class In(Ports):

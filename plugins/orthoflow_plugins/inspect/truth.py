@@ -99,10 +99,8 @@ _OF_WALLS: Final = (
     MetricSpec(
         "step_rmse_[uv]_mm", label="error along {0} beside depth steps, RMS", better="lower"
     ),
-    MetricSpec(
-        "patch_rmse_[uv]_mm", label="error along {0} as patches show it, RMS", better="lower"
-    ),
-    MetricSpec("patch_mean_[uv]_mm", label="shift along {0} as patches show it"),
+    MetricSpec("patch_rmse_[uv]_mm", label="error along {0} from patches, RMS", better="lower"),
+    MetricSpec("patch_mean_[uv]_mm", label="shift along {0} from patches"),
     MetricSpec("n_patches", label="patches compared with the truth"),
     MetricSpec("displaced_share", label="cells displaced by more than one cell"),
     MetricSpec("depth_median_mm", label="shift of the depth, median"),
@@ -112,7 +110,7 @@ _OF_WALLS: Final = (
         label="error of the depth, RMS",
         better="lower",
         headline=True,
-        description="cells at edges hold two depths and weigh most; typical is depth_nmad_mm",
+        description="cells at edges have two depths and dominate; depth_nmad_mm is typical",
     ),
     MetricSpec("depth_step_rmse_mm", label="error of the depth beside steps, RMS", better="lower"),
     MetricSpec("depth_within_3sigma", label="depths within three stated sigmas"),
@@ -136,18 +134,18 @@ _OF_WALLS: Final = (
     ),
     MetricSpec(
         "completeness",
-        label="painted, not filled, of the surface that is seen at all",
+        label="painted, not filled, of the visible surface",
         better="higher",
         headline=True,
     ),
     MetricSpec(
         "completeness_filled",
-        label="painted or filled, of the surface that is seen at all",
+        label="painted or filled, of the visible surface",
         better="higher",
     ),
     MetricSpec(
         "completeness_seen_by_both",
-        label="painted, of what a station and a photo see",
+        label="painted, of what both a station and a photo see",
         better="higher",
         headline=True,
     ),
@@ -176,7 +174,7 @@ _OF_PLANES: Final = (
 NOT_COMPARED: Final = DiagnosticSpec(
     code="truth-not-compared",
     severity="warning",
-    text="not compared with the truth: {dropped}, for want of {missing}; only the planes and "
+    text="not compared with the truth: {dropped}, without {missing}; only the planes and "
     "their labels are",
     remedy="wire {missing} to {step}",
 )
@@ -344,18 +342,21 @@ class InspectTruth(Method):
         """How finely, and how much of, the truth is rendered."""
 
         supersample: int = Field(
-            3, ge=1, le=8, description="True colours are means of so many rays squared per cell."
+            3,
+            ge=1,
+            le=8,
+            description="True colours are means of this number squared of rays per cell.",
         )
         colour_cells_most: int = Field(
             250_000,
             ge=1,
-            description="Colours are compared in blocks of about so many cells of all walls.",
+            description="Colours are compared in blocks of about this many cells of all walls.",
         )
         seen_cells_most: int = Field(
             600_000,
             ge=1,
-            description="Completeness is counted on every nth row and column, about so many cells "
-            "of all walls.",
+            description="Completeness is counted on every nth row and "
+            "column, about this many cells of all walls.",
         )
 
     class In(Ports):

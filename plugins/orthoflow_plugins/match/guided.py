@@ -34,8 +34,8 @@ _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
-    text="photo {subject}: nothing on the walls agrees with it at its pose",
-    remedy="check its pose, or leave it out",
+    text="photo {subject}: no place on the walls matches it at its pose",
+    remedy="check its pose, or remove it",
 )
 
 
@@ -90,7 +90,7 @@ class MatchGuided(Method):
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: the mask of markiewicz2015 and no more: key points as OpenCV sets "
+            description="paper: only the mask of markiewicz2015: key points as OpenCV sets "
             "SIFT, those of a wall that the photo shows by its pose with their best match in "
             "the photo, once; of the other options `ratio` applies.",
         )
@@ -199,7 +199,7 @@ def _traced(
         return traces
     recovered = recovered_traces(inputs.photos, oriented, desk, list(traces.values()))
     for name in recovered:
-        ctx.log(f"photo {name}: found by what other photos show of the walls")
+        ctx.log(f"photo {name}: found with what other photos show of the walls")
     return traces | recovered
 
 

@@ -90,8 +90,12 @@ class PairingParams(MethodParams):
     max_side_px: int = Field(
         default=4000,
         ge=200,
-        description="Larger photos are shrunk to this for matching. Smaller sizes come first, "
+        description="Larger photos are reduced to this size for matching. Smaller sizes come "
+        "first, "
         "from 800 px on, until a wall is recognised; then the size at which a pixel is about "
+        ""
+        ""
+        ""
         "as wide as a cell of the walls.",
     )
 

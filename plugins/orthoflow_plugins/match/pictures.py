@@ -20,7 +20,7 @@ _OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-pyt
 # Each works on a picture of its own, which takes up to a gigabyte.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
-"""Local contrast is evened out up to this much (CLAHE)."""
+"""Limit of local contrast equalisation (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
 # Depths about a point that differ by more than this many cells are an edge of the relief.
@@ -82,8 +82,8 @@ def require_intensity(walls: Walls) -> None:
         raise MethodError("there are no walls to match photos with: choose planes to raster")
     if all(wall.intensity is None for wall in walls.walls):
         raise MethodError(
-            "the scan has neither intensity nor colour, so its walls show nothing that a photo "
-            "could be matched with: export the scan with intensity"
+            "the scan has neither intensity nor colour, so photos cannot be "
+            "matched with its walls: export the scan with intensity"
         )
 
 

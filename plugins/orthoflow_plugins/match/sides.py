@@ -55,7 +55,7 @@ _MIN_MARGIN_RATIO: Final = 2.0
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
     severity="warning",
-    text="neither stations nor photos say from which side {n} of {n_planes} planes were seen "
+    text="neither stations nor photos show from which side {n} of {n_planes} planes were seen "
     "({planes}); the side with more of the other points was taken",
     remedy="if an image comes out mirrored, set view_from of read.scan",
     rank_by="n",
@@ -75,8 +75,8 @@ class FaceByPhotos(Method):
     id: ClassVar[str] = "face.photos"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("n_planes_guessed", label="planes whose side the photos were asked for"),
-        MetricSpec("n_planes_seen", label="planes whose side photos decided"),
+        MetricSpec("n_planes_guessed", label="planes whose side was checked with photos"),
+        MetricSpec("n_planes_seen", label="planes whose side was decided by photos"),
         MetricSpec("n_planes_turned", label="planes turned to the photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (

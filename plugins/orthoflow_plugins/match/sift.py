@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 BY_EDGES: Final = DiagnosticSpec(
     code="photo-placed-by-edges",
     severity="warning",
-    text="photo {subject}: placed by where edges run alone; where patterns repeat, that can be a "
-    "wrong place",
+    text="photo {subject}: placed by edges alone, which can be wrong where patterns repeat",
     remedy="look at its overlay",
 )
 MIRRORED: Final = DiagnosticSpec(
@@ -113,8 +112,9 @@ class MatchSift(Method):
             "walls in many sizes and compared by where edges run, in colours, intensity and "
             "relief. confirmed: a place counts when another photo, at its own place, shows the "
             "same things there. alone: also when no photo says so, by which a photo of something "
-            "else with the same pattern may win: look at the overlays. Such ties err together, "
-            "more than an orientation by them states: match.guided measures anew.",
+            "else with the same pattern may be accepted: check the overlays. The errors of "
+            "such ties are correlated, so an orientation "
+            "from them states too small an error: match.guided measures again.",
         )
 
         @model_validator(mode="before")

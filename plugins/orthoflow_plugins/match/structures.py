@@ -53,7 +53,7 @@ _ROUGH_CELLS: Final = 160
 _SAMPLE_CELLS: Final = 2
 _LEVELS: Final = 3
 PHOTO_SIDE_PX: Final = 2 * _MAX_PART_CELLS
-"""Longer side to which a photo is shrunk first: no size needs more."""
+"""Longer side to which a photo is reduced first: no size needs more."""
 
 
 @dataclass(frozen=True, kw_only=True)

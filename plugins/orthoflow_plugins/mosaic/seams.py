@@ -84,14 +84,14 @@ CONTRADICTED: Final = DiagnosticSpec(
     code="photo-against-scan",
     severity="warning",
     text="{subject}: {share:.1%} of its cells are shown by one photo alone, and the scan has "
-    "another colour there: something that passed by may be painted",
+    "another colour there: a passer-by may be painted",
     remedy="take a second photo of it, or give the input seams",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
     code="orthoimage-of-one-tone",
     severity="warning",
-    text="{subject}: {share:.0%} of its orthoimage is {tone}: so are its sources there ({sources})",
+    text="{subject}: {share:.0%} of its orthoimage is {tone}: as are its sources there ({sources})",
     remedy="look at these photos, or at the colours of the scan",
     rank_by="share",
 )
@@ -105,7 +105,7 @@ UNCHECKED: Final = DiagnosticSpec(
 EMPTY_IMAGE: Final = DiagnosticSpec(
     code="orthoimage-empty",
     severity="error",
-    text="the orthoimage of {subject} is empty: no source shows any of it",
+    text="the orthoimage of {subject} is empty: no source shows it",
 )
 EMPTY_CELLS: Final = DiagnosticSpec(
     code="orthoimage-cells-empty",
@@ -180,7 +180,7 @@ class MosaicSeams(Method):
             label="offset of overlapping photos along v, RMS on the wall",
             better="lower",
         ),
-        MetricSpec("outvoted_share", label="cells whose colour the other photos outvote"),
+        MetricSpec("outvoted_share", label="cells whose colour contradicts the other photos"),
         MetricSpec(
             "contradicted_share", label="cells of one photo alone that the scan contradicts"
         ),
@@ -206,7 +206,7 @@ class MosaicSeams(Method):
             "best-view", description="Which layer paints what several of them show."
         )
         priority: tuple[str, ...] = Field(
-            (), description="Names of photos, the most wanted first, for `seams: priority`."
+            (), description="Names of photos, highest priority first, for `seams: priority`."
         )
         gains: Literal["none", "global"] = Field(
             "global",
@@ -216,31 +216,35 @@ class MosaicSeams(Method):
         )
         local_balance: bool = Field(
             default=True,
-            description="Balance what a lens loses towards the corners and what else is smooth "
-            "over a photo, too, as overlaps show it.",
+            description="Also balance vignetting and other differences that are "
+            "smooth over a photo, as measured in overlaps.",
         )
         feather_cells: int = Field(
             64,
             ge=0,
             le=4096,
-            description="What photos still differ by at a seam goes over within so many cells on "
-            "either side; only what is smooth, so that nothing is mixed. 0: a step may be left.",
+            description="Remaining differences at a seam are blended within this many cells "
+            "on either "
+            "side; only smooth differences, so that nothing is mixed. 0: a step may "
+            ""
+            ""
+            "remain.",
         )
         island_cells_min: int = Field(
             default=100,
             ge=1,
             description="Smaller patches from one source are painted from the one around them, "
-            "where it sees them too; 1 keeps every cell's best view.",
+            "where it sees them too; 1 keeps the best view of every cell.",
         )
 
         robust: bool = Field(
             default=True,
             description="Where photos contradict each other over a region, as with people and "
-            "vehicles that pass, one that most others and the scan bear out paints it.",
+            "vehicles that pass, one that most others and the scan confirm paints it.",
         )
         publish_layers: bool = Field(
             default=False,
-            description="Publish what each photo shows by itself, too, as GeoTIFFs of their own.",
+            description="Also publish the layer of each photo as a GeoTIFF.",
         )
 
     class In(Ports):
@@ -260,7 +264,9 @@ class MosaicSeams(Method):
         """Join wall by wall."""
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
-            raise MethodError("there is no layer to make an orthoimage of, at least one is needed")
+            raise MethodError(
+                "there is no layer to make an orthoimage from, at least one is needed"
+            )
         require_sources(layers, params.priority)
         cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
         drawn = read_seams(inputs.seams, {layer.source for layer in layers})
@@ -485,9 +491,9 @@ def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) 
     """Report why cells are empty, if photos are missing."""
     words = {
         OrthoMask.NONE: f"lie in no oriented photo ({_way_to_a_photo(cameras)})",
-        OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too flatly (take "
-        "one from another side)",
-        OrthoMask.NO_SURFACE: "have no surface (the step that rastered the wall says why)",
+        OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too "
+        "obliquely (take one from another side)",
+        OrthoMask.NO_SURFACE: "have no surface (see the step that rastered the wall)",
     }
     shares = {state: count_cells(image.mask, state) / image.mask.size for state in words}
     if shares[OrthoMask.NONE] + shares[OrthoMask.OCCLUDED] < _EMPTY_WORTH_WORDS:

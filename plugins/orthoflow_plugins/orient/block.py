@@ -40,8 +40,8 @@ LENS_CONFUSED: Final = DiagnosticSpec(
     severity="warning",
     text="the {parameter} of the lens of {subject} and the {pose} of its photos correlate by "
     "{correlation:.3f}",
-    remedy="photos from other sides, some turned by 90 degrees, or a calibration{also} would tell "
-    "them apart",
+    remedy="photos from other sides, some turned by 90 degrees, or a calibration{also} would "
+    "separate them",
     rank_by="correlation",
 )
 

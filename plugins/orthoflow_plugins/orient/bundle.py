@@ -56,7 +56,7 @@ _TESTED: Final = "focal-group"
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
     severity="warning",
-    text="the photos stay as each was oriented by itself: {reason}",
+    text="the photos keep their separate orientations: {reason}",
 )
 
 

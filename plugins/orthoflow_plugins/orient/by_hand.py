@@ -136,7 +136,7 @@ def _consistent(hand: SeenPoints, prior: LensPrior) -> tuple[NDArray[np.intp], _
             fits = _distinct(_fits(hand.take(kept), prior))
             if len(fits) > 1:
                 return (
-                    "two poses agree with its ties measured by hand: add some that lie off the "
+                    "two poses agree with its ties measured by hand: add some outside the "
                     "plane of the others"
                 )
             fitting += [(kept, fit) for fit in fits]

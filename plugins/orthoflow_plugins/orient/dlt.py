@@ -112,13 +112,14 @@ class OrientDlt(Method):
         )
         skew: bool = Field(
             default=False,
-            description="Keep the skew, the eleventh parameter: rows and columns of the camera's "
-            "pixels need not be square to each other. The way to the orthoimage knows it, too.",
+            description="Keep the skew, the eleventh parameter: rows and "
+            "columns of the camera's pixels need not be perpendicular. It is also used for "
+            "the orthoimage.",
         )
         prior: Literal["lens", "none"] = Field(
             default="lens",
-            description="What wrong ties are rejected by: the lens as calibration or EXIF know it, "
-            "or none, the usual focal lengths tried in turn (markiewicz2015).",
+            description="How wrong ties are rejected: with the lens from calibration or EXIF, "
+            "or without a known lens, by trying the usual focal lengths (markiewicz2015).",
         )
 
     In = OrientIn

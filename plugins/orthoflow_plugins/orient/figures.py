@@ -137,7 +137,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
             f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
             f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
             f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall. Bright places "
-            "far from ties are where the orthoimage may be off; more ties there would mend it.",
+            "far from ties are where the orthoimage may be off; more ties there would help.",
         )
 
 

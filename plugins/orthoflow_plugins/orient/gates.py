@@ -459,8 +459,9 @@ GATES_BY_HAND: Final = (
         source="the job",
         refuses=_each_other,
         text="without the tie at (u {u:.0f}, v {v:.0f}) its predicted error on the wall would be "
-        "{error_mm:.1f} mm, at most {allowed_mm:.1f} mm is allowed: were that tie wrong, the "
-        "others could not tell; measure more of them, farther apart",
+        "{error_mm:.1f} mm, at most {allowed_mm:.1f} mm is allowed: if that tie were wrong, "
+        "the others could "
+        "not reveal it; measure more of them, farther apart",
     ),
 )
 """What a pose from ties that a person measured must meet."""

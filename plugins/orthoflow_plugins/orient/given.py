@@ -103,7 +103,7 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
 def _said(unchecked: Sequence[str]) -> dict[str, JsonValue]:
     return {
         "given": list(unchecked),
-        "given_meaning": "photos whose poses were taken as they are; nothing has checked them",
+        "given_meaning": "photos whose poses were used unchecked",
     }
 
 
@@ -172,7 +172,7 @@ def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
     raise MethodError(
         f"none of the {len(oriented)} given poses shows a wall: they stand at {_extent(centres)}, "
         f"the walls at {_extent(corners)} (x, y, z in metres). Cameras and scan must be in one "
-        "frame and unit: bring the model into that of the scan before it is exported, or match "
+        "frame and unit: transform the model to that of the scan before exporting it, or match "
         "the photos instead"
     )
 

@@ -101,8 +101,8 @@ class OrientParams(MethodParams):
         default=3.5,
         gt=1,
         le=20,
-        description="Ties that deviate more than so many of their standard deviations are "
-        "rejected.",
+        description="Ties that deviate by more than this "
+        "many of their standard deviations are rejected.",
     )
     threshold_px: float | None = Field(
         default=None,
@@ -126,7 +126,7 @@ class OrientParams(MethodParams):
     quadrants: Literal["predicted", "strict"] = Field(
         default="predicted",
         description="strict: a photo with fewer than min_quadrant_ties in a quarter is refused "
-        "whatever is predicted there, also where the quarter shows no wall (markiewicz2015).",
+        "regardless of the predicted error, even if the quarter shows no wall (markiewicz2015).",
     )
     min_hull_ratio: float = Field(
         default=0.4,

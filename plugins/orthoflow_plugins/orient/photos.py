@@ -57,16 +57,17 @@ EXIF_CONTRADICTED: Final = DiagnosticSpec(
     code="exif-focal-contradicted",
     severity="warning",
     text="photos {subject}: EXIF states a focal length of {exif_px:.0f} px, but their ties ask "
-    "for {focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an adapter, "
-    "or a picture that was cut)",
-    remedy="a calibration file settles it",
+    "for {focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an "
+    "adapter, or "
+    "a cropped picture)",
+    remedy="a calibration file resolves this",
 )
 EXIF_LEFT_OUT: Final = DiagnosticSpec(
     code="exif-focal-left-out",
     severity="warning",
     text="photo {subject}: its EXIF contradicts the other photos of its camera, so it is oriented "
     "with their focal length of {focal_px:.0f} px",
-    remedy="a calibration file settles it",
+    remedy="a calibration file resolves this",
 )
 
 
@@ -109,13 +110,13 @@ def require(ties: Ties, photos: Photos) -> None:
     if not len(ties.photo):
         raise MethodError(
             "there are no ties between photos and walls, so no photo can be oriented: see the "
-            "matching step for what it found"
+            "matching step"
         )
     names = {photo.name for photo in photos.photos}
     strangers = [name for name in ties.photo_names if name not in names]
     if strangers:
         raise MethodError(
-            f"the ties speak of photo {strangers[0]}, which is not among the photos given: wire "
+            f"the ties name photo {strangers[0]}, which is not among the photos given: wire "
             "the photos that the ties were made from"
         )
 

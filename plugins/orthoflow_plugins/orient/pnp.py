@@ -36,7 +36,7 @@ from orthoflow_plugins.orient.pose import (
 )
 from orthoflow_plugins.orient.report import hand_over
 
-# solvePnP needs six points where they do not lie in a plane.
+# solvePnP needs six points where they are not in a plane.
 _LEAST: Final = 6
 
 
@@ -64,7 +64,8 @@ class OrientPnp(Method):
         method: Literal["weighted", "opencv"] = Field(
             default="weighted",
             description="weighted: each tie counts by its own sigmas and an uncalibrated lens is "
-            "refined; opencv: cv2.solvePnP, iterative, all ties alike, the lens as it is known "
+            "refined; opencv: cv2.solvePnP, iterative, all ties with equal weight, the lens "
+            "unchanged "
             "(markiewicz2015).",
         )
 

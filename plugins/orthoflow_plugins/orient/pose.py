@@ -359,8 +359,9 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
         return ""
     return (
         f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
-        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
-        "calibration of another lens, zoom or image size"
+        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: the "
+        "calibration belongs to another "
+        "lens, zoom or image size"
     )
 
 

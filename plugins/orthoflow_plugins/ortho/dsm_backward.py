@@ -91,23 +91,29 @@ class DsmBackward(Method):
 
         resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
             default="bilinear",
-            description="Colour between pixels; nearest paints the photo's pixels untouched.",
+            description="Interpolation of colours; nearest paints the photo's pixels unchanged.",
         )
         antialias: bool = Field(
             default=True,
-            description="Average over what a cell covers where the photo is finer than the wall "
+            description="Average over the cell where the photo is finer than the wall "
             "(not with nearest).",
         )
         visibility: Literal["full", "none"] = Field(
             default="full",
-            description="What hides cells: relief and cloud (full), or nothing, for comparison and "
-            "for flat walls with nothing before them.",
+            description="What hides cells: relief and cloud (full), or nothing, for "
+            "comparison and for flat "
+            "walls without objects in "
+            ""
+            ""
+            "front.",
         )
         erosion_cells: int = Field(
             default=1,
             ge=0,
             le=20,
-            description="Cells so near to a hidden patch are not painted: edges smear there.",
+            description=(
+                "Cells this close to a hidden patch are not painted, because edges smear there."
+            ),
         )
 
     In = PhotosOnWalls

@@ -19,8 +19,8 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
-    "no oriented photo sees a wall: their cameras stand behind the walls, look past them, or "
-    "something hides the walls; look at cameras.json and planes.json"
+    "no oriented photo sees a wall: their cameras are behind the walls, look past them, "
+    "or something hides the walls; check cameras.json and planes.json"
 )
 NO_PHOTO: Final = DiagnosticSpec(
     code="wall-without-photo",

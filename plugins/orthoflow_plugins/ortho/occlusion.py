@@ -21,8 +21,8 @@ from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityPar
 NO_CLOUD: Final = DiagnosticSpec(
     code="occluders-unknown",
     severity="warning",
-    text="no cloud is wired to {step}: things that stand free before a wall hide nothing, and "
-    "photos paint them onto it",
+    text="no cloud is wired to {step}: objects in front of a wall hide "
+    "nothing, and photos paint them onto it",
     remedy="wire the cloud to {step}",
 )
 

@@ -38,14 +38,14 @@ MIXED_BITS: Final = DiagnosticSpec(
     code="photos-of-mixed-depth",
     severity="warning",
     text="{n} of {n_photos} photos ({names}) have 8 bits per channel, the others 16: the "
-    "orthoimages have 16, levels of 8 bits are taken times 257",
+    "orthoimages have 16, levels of 8 bits are multiplied by 257",
     rank_by="n",
 )
 MIXED_PROFILES: Final = DiagnosticSpec(
     code="photos-of-mixed-profiles",
     severity="warning",
     text="the photos have {n} different colour profiles, or some have none: the orthoimages get "
-    "none, and colours may step where photos meet",
+    "none, and colours may change abruptly where photos meet",
     remedy="export all photos with one colour profile",
     rank_by="n",
 )
@@ -83,11 +83,15 @@ class VisibilityParams(MethodParams):
     tolerance_sigma: float = Field(
         default=3.0,
         ge=0,
-        description="A surface hides a cell when it is above the ray by more than so many "
-        "standard deviations of depth, and tolerance_cells.",
+        description="A surface hides a cell when it is above the ray by more than this many "
+        "standard "
+        "deviations of depth, and "
+        ""
+        ""
+        "tolerance_cells.",
     )
     tolerance_cells: float = Field(
-        default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
+        default=0.5, ge=0, description="The same in cells, for detail finer than the raster."
     )
     occluder_points_min: int = Field(
         default=6,
@@ -127,16 +131,16 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
         MethodError: there is none, there are no walls, or a camera has no photo.
     """
     if not walls.walls:
-        raise MethodError("there are no walls to lay photos onto: choose planes to raster")
+        raise MethodError("there are no walls to project photos onto: choose planes to raster")
     by_name = {photo.name: photo for photo in photos.photos}
     posed = [camera for camera in cameras.cameras if camera.status == "ok"]
     if not posed:
         reasons = "; ".join(f"{item.photo}: {item.status}" for item in cameras.cameras)
-        raise MethodError(f"no photo is oriented, so none can be laid onto a wall: {reasons}")
+        raise MethodError(f"no photo is oriented, so none can be projected onto a wall: {reasons}")
     missing = [camera.photo for camera in posed if camera.photo not in by_name]
     if missing:
         raise MethodError(
-            f"the cameras know {', '.join(missing)}, which the photos do not hold: wire the "
+            f"the cameras include {', '.join(missing)}, which are not among the photos: wire the "
             "photos that were oriented"
         )
     return [(by_name[camera.photo], camera) for camera in posed]

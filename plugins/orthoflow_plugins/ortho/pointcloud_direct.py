@@ -61,9 +61,9 @@ BLACK_POINTS: Final = DiagnosticSpec(
     severity="warning",
     text="{n_black} points of the cloud ({share:.1%}) are pure black, as points without a colour "
     "are in many files, and {n_almost} almost; they are painted as they are",
-    remedy="if black specks in the image are none of the wall's, set "
-    "{step}.skip_below_grey={grey} (1 for pure black alone), with which they keep their depth and "
-    "paint no cell",
+    remedy="if black specks in the image do not belong to the wall, set "
+    "{step}.skip_below_grey={grey} (1 for pure black alone), so that they keep their "
+    "depth and paint no cell",
     rank_by="share",
 )
 
@@ -91,7 +91,7 @@ class PointcloudDirect(Method):
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("painted_share", label="cells painted"),
         MetricSpec("filled_share", label="cells filled from neighbours"),
-        MetricSpec("void_share", label="cells that got no colour"),
+        MetricSpec("void_share", label="cells without a colour"),
         MetricSpec("projection_s", label="time of the projection", better="lower"),
         MetricSpec("filling_s", label="time of the filling", better="lower"),
     )
@@ -122,31 +122,33 @@ class PointcloudDirect(Method):
         )
         skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
             default=None,
-            description="Points no channel of which reaches this have no colour, as in many files "
-            "those that no camera saw: they paint no cell, and keep their depth. 1: those of pure "
+            description="Points of which no channel reaches this have no "
+            "colour, as points that no camera saw in many files: they paint no cell, and "
+            "keep their depth. 1: those of pure "
             "black; 10: almost black ones, too; 0: none. Without it those of pure black, where "
             "these are specks: at most a tenth of all, and more than there are almost black ones.",
         )
         layer_m: float = Field(
             default=0.02,
             gt=0,
-            description="Points so far below the topmost one lie on its surface (not with "
-            "topmost).",
+            description="Points at most this far below the topmost "
+            "one are on its surface (not with topmost).",
         )
         n_top: int = Field(
-            default=5, ge=1, le=50, description="Points that the median takes at most."
+            default=5, ge=1, le=50, description="Maximum number of points for the median."
         )
         inpaint: Inpainting = Field(
             default="between",
-            description="How gaps are filled: between the painted cells about them, by where their "
-            "points lie; telea and navier-stokes of OpenCV, as skarlatos2012 has it; none.",
+            description="How gaps are filled: by interpolation between the "
+            "painted cells around them; telea and navier-stokes of OpenCV, as skarlatos2012 "
+            "has it; none.",
         )
         inpaint_radius_px: float = Field(
             default=3.0,
             gt=0,
             le=100,
-            description="Reach from which a gap takes its colour; with between, one without a "
-            "painted cell so near stays void.",
+            description="Radius from which a gap takes its colour; with between, "
+            "a gap without a painted cell within it stays void.",
         )
 
     class In(Ports):
@@ -196,8 +198,9 @@ class PointcloudDirect(Method):
         ctx.figure(
             "filling",
             preview,
-            "Before and after filling; magenta is void. Fine magenta dots fill well; what was "
-            "a large area of it is invented from its rim.",
+            "Before and after filling; magenta is void. Fine magenta dots fill well; large "
+            "areas of it "
+            "are extrapolated from their border.",
         )
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))

@@ -34,7 +34,7 @@ _CHUNK: Final = 1 << 21
 NOT_BALANCED: Final = DiagnosticSpec(
     code="intensity-not-balanced",
     severity="warning",
-    text="intensities stay as they are: {reason}",
+    text="intensities are unchanged: {reason}",
 )
 
 

@@ -62,7 +62,7 @@ _LARGE_CUT_M: Final = 0.05
 NEAR_RELIEF: Final = DiagnosticSpec(
     code="near-takes-relief",
     severity="warning",
-    text="near takes {subject}, which is relief of {wall}",
+    text="near selects {subject}, which is relief of {wall}",
     remedy="where that wall is meant, set {step}.ranks=[{index}] and leave near out "
     "({step}.skip_covered=false states that the relief is)",
 )
@@ -125,21 +125,23 @@ class RasterGrid(Method):
         """Cell size, depth of the surface, choice of planes, and how gaps are closed."""
 
         gsd_m: float = Field(
-            default=0.005, gt=0, description="Side of a cell; not finer than the scan's step."
+            default=0.005, gt=0, description="Side of a cell; not finer than the point spacing."
         )
         buffer_m: float | None = Field(
             default=None,
             gt=0,
-            description="Points so far from the plane, on both sides, count; unset, as far as the "
-            "relief that is connected to the wall, 0.5 m in front and 1 m behind at most, and at "
-            "least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm); 3 m in "
-            "front of an upright wall, where what is connected to it hides 3 % of it.",
+            description="Distance from the plane, on both sides, within which points are used; "
+            "by default as far as the relief that is connected to the wall, 0.5 m in front "
+            "and 1 m behind at most, and at "
+            "least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm); 3 m "
+            "in front of an upright wall "
+            "if connected objects hide 3 % of it.",
         )
         buffer_front_m: float | None = Field(
-            default=None, ge=0, description="Reach towards the viewer instead of buffer_m."
+            default=None, ge=0, description="Depth towards the viewer instead of buffer_m."
         )
         buffer_behind_m: float | None = Field(
-            default=None, ge=0, description="Reach behind the plane instead of buffer_m."
+            default=None, ge=0, description="Depth behind the plane instead of buffer_m."
         )
         rectangle: RectangleRule = Field(
             default="room",
@@ -149,14 +151,15 @@ class RasterGrid(Method):
         )
         surface: Surface = Field(
             default="median",
-            description="Depth of a cell: median of its best supported layer, cells of outliers "
-            "left out; the same denoised, with steps kept; of the nearest point, also of the next "
+            description="Depth of a cell: median of its best supported layer, without "
+            "outliers; the same denoised, with steps preserved; of the nearest point, also "
+            "of the next "
             "cells (markiewicz2015); of its point nearest the centre; of the topmost point "
-            "(skarlatos2012); mean of all; or tin, a net of triangles, which closes windows (for "
-            "comparison).",
+            "(skarlatos2012); mean of all; or tin, a triangulation, "
+            "which closes windows (for comparison).",
         )
         denoise_cells: int = Field(
-            default=4, ge=0, le=20, description="Reach of the filter of surface denoised."
+            default=4, ge=0, le=20, description="Radius of the filter of surface denoised."
         )
         layer_m: float = Field(
             default=0.02,
@@ -167,12 +170,14 @@ class RasterGrid(Method):
         percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
             default=(),
             max_length=9,
-            description="Percentiles of the depths of a cell's points, rasters of their own.",
+            description=(
+                "Percentiles of the depths of a cell's points, written as separate rasters."
+            ),
         )
         balance_intensity: bool = Field(
             default=False,
-            description="Take out of the intensity what range, incidence and the scan itself "
-            "change, told from where scans overlap.",
+            description="Correct the intensity for range, incidence "
+            "and scan, estimated where scans overlap.",
         )
         recover_gap_cells: int = Field(
             default=2,
@@ -198,14 +203,14 @@ class RasterGrid(Method):
             description="Smallest rectangle of a plane; the one with the most support is exempt.",
         )
         n_walls_max: int = Field(
-            default=12, ge=1, le=1000, description="At most so many planes, by support."
+            default=12, ge=1, le=1000, description="Maximum number of planes, by support."
         )
         ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
             default=(),
             description="Raster exactly these planes, by their place in planes.json, where 0 has "
             "the most support: other planes where a tolerance, detector or scan finds others (near "
             "takes the one at a point); empty: as constraint, min_area_m2, n_walls_max and "
-            "skip_covered say.",
+            "skip_covered.",
         )
         near: tuple[Place, ...] = Field(
             default=(),
@@ -217,7 +222,7 @@ class RasterGrid(Method):
             description="Part of the wall to raster, metres to the right and down from the "
             "top-left corner of its whole raster: a rectangle [left, top, right, bottom], or a "
             "polygon [[right, down], ...] beyond which cells stay void. Photos are matched to this "
-            "part only: orient them on the whole wall first, and hand their cameras on.",
+            "part only: orient them on the whole wall first, and pass on their cameras.",
         )
         skip_covered: bool = Field(
             default=True,
@@ -365,9 +370,10 @@ def _log_cuts(
             if cut_m > frame.gsd_m:
                 notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
                 notify(
-                    f"{planes.names[index]}: what adjoins it at its {side} runs askew, and its "
+                    f"{planes.names[index]}: the surface that adjoins it at its {side} is "
+                    "askew, and its "
                     f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
-                    "plane are left out there, more of what stands out of it; margin_m adds them"
+                    "plane are left out there, more of its relief; margin_m adds them"
                 )
 
 

@@ -38,30 +38,33 @@ _VOID_WORTH_WORDS: Final = 0.01
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
     code="wall-front-left-out",
     severity="error",
-    text="{subject}: {share:.1%} of it is left out: what stands there up to {before_m} m before "
-    "its plane is not taken for a part of the wall",
+    text="{subject}: {share:.1%} of it is left out: objects there, up to {before_m} m in "
+    "front of its plane, are not considered part of the wall",
     remedy="{step}.buffer_front_m={buffer_front_m} shows it",
     rank_by="share",
 )
 STOOD_ON: Final = DiagnosticSpec(
     code="floor-stood-on",
     severity="note",
-    text="{subject}: {share:.1%} of its cells are empty under what stands up to {before_m} m on it",
+    text=(
+        "{subject}: {share:.1%} of its cells are empty under objects that project up to "
+        "{before_m} m from it"
+    ),
     rank_by="share",
 )
 BEHIND_BUFFER: Final = DiagnosticSpec(
     code="wall-behind-buffer",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: what was scanned there lies about "
-    "{behind_m} m behind its plane",
-    remedy="{step}.buffer_behind_m={buffer_behind_m} shows it, if that is the wall",
+    text="{subject}: {share:.1%} of its cells are empty: the points scanned "
+    "there are about {behind_m} m behind its plane",
+    remedy="{step}.buffer_behind_m={buffer_behind_m} shows them, if they are the wall",
     rank_by="share",
 )
 HIDDEN: Final = DiagnosticSpec(
     code="wall-hidden",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: something stands between them and every "
-    "scanner",
+    text="{subject}: {share:.1%} of its cells are empty: objects "
+    "are between them and every scanner",
     remedy="scan from another station",
     rank_by="share",
 )
@@ -69,7 +72,7 @@ SPARSE: Final = DiagnosticSpec(
     code="wall-sparse",
     severity="warning",
     text="{subject}: {share:.1%} of its cells are empty beside scanned ones: gaps between points, "
-    "shadows of relief, rims",
+    "shadows of relief, borders",
     remedy="a larger {step}.gsd_m or {step}.recover_gap_cells closes narrow gaps",
     rank_by="share",
 )
@@ -77,8 +80,12 @@ SPARSE_DENSE: Final = replace(SPARSE, remedy="{step}.recover_gap_cells closes na
 UNSEEN: Final = DiagnosticSpec(
     code="wall-unseen",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, glass, or "
-    "what no station sees)",
+    text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, "
+    "glass, or hidden "
+    "from all "
+    ""
+    ""
+    "stations)",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
@@ -91,18 +98,18 @@ PLAIN: Final = DiagnosticSpec(
 COVERED: Final = DiagnosticSpec(
     code="wall-includes-others",
     severity="warning",
-    text="{subject} shows {included} as its relief, so these have no orthoimage of their own",
-    remedy="{step}.skip_covered=false makes one of each",
+    text="{subject} shows {included} as its relief, so these have no orthoimages of their own",
+    remedy="{step}.skip_covered=false makes one for each",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-without-intensity",
     severity="warning",
-    text="the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in",
+    text="the cloud has no laser intensity; the grey of its colours (Rec. 601) is used instead",
 )
 DEPTH_ONLY: Final = DiagnosticSpec(
     code="scan-without-intensity-and-colour",
     severity="warning",
-    text="the cloud has neither intensity nor colour; only the depth of walls is rastered",
+    text="the cloud has neither intensity nor colour; only the depths of walls are rastered",
 )
 NO_POINT: Final = DiagnosticSpec(
     code="wall-without-points",
@@ -201,7 +208,7 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
                 tone=found[0],
                 share=found[1],
                 cause=f"the scans' intensities are scaled from {', '.join(scales) or '0 to 1'}",
-                way="{step[read.scan]}.intensity_max=NUMBER says what is white",
+                way="{step[read.scan]}.intensity_max=NUMBER sets the value of white",
             )
         if wall.rgb is None or wall.rgb_mask is None:
             continue
@@ -215,7 +222,7 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
                 tone=found[0],
                 share=found[1],
                 cause=f"so are the colours of its points{read_as}",
-                way="look whether the program that wrote the scan exported colours",
+                way="check whether the program that wrote the scan exported colours",
             )
 
 

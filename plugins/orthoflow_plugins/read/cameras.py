@@ -126,14 +126,14 @@ class ReadCameras(Method):
         if sigmas_mm:
             ctx.metric("sigma_wall_mm_median", float(np.median(sigmas_mm)), "mm")
             ctx.metric("sigma_wall_mm_worst", max(sigmas_mm), "mm")
-        ctx.log(f"{n_oriented} poses are taken as given; nothing here has checked them")
+        ctx.log(f"{n_oriented} poses are taken as given; they are not checked here")
         return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
 
 
 def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, list[str]]) -> Camera:
     found = given.of_photo(photo.name, photo.folder)
     if found is None:
-        return Camera(photo=photo.name, status="the files of given cameras say nothing of it")
+        return Camera(photo=photo.name, status="the files of given cameras do not mention it")
     if found.lens is None or found.rotation is None or found.translation is None:
         return Camera(photo=photo.name, status=found.reason)
     lens, note = found.lens, found.note
@@ -162,7 +162,7 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
     if not np.abs(translation_m).max() < FARTHEST_M:
         raise InputError(
             f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
-            f"as its given camera says; expected less than {FARTHEST_M:g} m: check the unit"
+            f"according to its given camera; expected less than {FARTHEST_M:g} m: check the unit"
         )
     return Camera(
         photo=photo.name,

@@ -22,7 +22,7 @@ UNUSED: Final = DiagnosticSpec(
     code="masks-of-no-photo",
     severity="warning",
     text="masks of no photo: {names}",
-    remedy="photos are found by their names",
+    remedy="photos are identified by their names",
     rank_by="n",
 )
 NO_MASKS: Final = DiagnosticSpec(
@@ -100,7 +100,7 @@ class Masks:
         if used is None or used.all():
             return None
         if not used.any():
-            raise InputError(f"the mask of {photo} leaves nothing of it: leave the photo out")
+            raise InputError(f"the mask of {photo} excludes all of it: remove the photo")
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:

@@ -52,7 +52,7 @@ class ReadOrthoimage(Method):
         wall: int = Field(
             0,
             ge=0,
-            description="Wall that images are of whose JSON file does not say it: the place of its "
+            description="Wall of images whose JSON file does not state it: the place of its "
             "plane in planes.json, as in the names of the files.",
         )
 
@@ -134,7 +134,7 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
         tags = {"name": raster.tags.get("name", path.stem)}
         return sidecar_of(raster.tags["frame"], path.name) | tags
     raise InputError(
-        f"{path.name} does not say where it lies in the world: put {path.stem}.json with "
+        f"{path.name} does not state its position in the world: put {path.stem}.json with "
         "origin_world, u_world, v_world and normal_world among the files, e.g. a copy of the "
         "wall_<k>_intensity.json that orthoflow wrote"
     )

@@ -65,14 +65,14 @@ _MOST_PROBLEMS: Final = 20
 NO_PHOTOS: Final = DiagnosticSpec(
     code="files-are-no-photos",
     severity="warning",
-    text="{n} of {n_files} files of the input {subject} are no photos (JPEG, PNG, TIFF, WebP, "
+    text="{n} of {n_files} files of the input {subject} are not photos (JPEG, PNG, TIFF, WebP, "
     "HEIC) and were left out: {names}",
     rank_by="n",
 )
 EXIF_DAMAGED: Final = DiagnosticSpec(
     code="exif-damaged",
     severity="warning",
-    text="the EXIF data of {photos} are damaged; what is readable was taken",
+    text="the EXIF data of {photos} are damaged; the readable part was used",
     rank_by="n",
 )
 REMARK: Final = DiagnosticSpec(
@@ -105,8 +105,8 @@ NOT_CALIBRATED: Final = DiagnosticSpec(
 UNUSED_ENTRIES: Final = DiagnosticSpec(
     code="calibration-entries-unused",
     severity="warning",
-    text="calibration entries that no photo takes: {names}",
-    remedy="the case of letters counts, and the first entry that matches holds",
+    text="calibration entries that match no photo: {names}",
+    remedy="upper and lower case differ, and the first matching entry applies",
     rank_by="n",
 )
 
@@ -516,9 +516,9 @@ def _read_photo(
     remarks = (
         ""
         if row is None
-        else f"seems damaged from row {row} on, where colours step along the blocks of the JPEG: "
-        "look at it, copy it again from the camera, or take it out",
-        f"holds bytes that its decoder passes over ({odd}), so it may be damaged" if odd else "",
+        else f"seems damaged from row {row} on, where colours change abruptly at the "
+        "blocks of the JPEG: check it, copy it again from the camera, or take it out",
+        f"holds bytes that its decoder skips ({odd}), so it may be damaged" if odd else "",
         f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
     )
     return _ReadPhoto(

@@ -43,7 +43,7 @@ FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", severity="warning", 
 COLOURS_ZERO: Final = DiagnosticSpec(
     code="scan-colours-zero",
     severity="warning",
-    text="{subject}: the colours of all points are zero: they are taken as absent, not as black",
+    text="{subject}: the colours of all points are zero: they are treated as missing, not as black",
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
@@ -54,19 +54,19 @@ COLOUR_LIMIT: Final = DiagnosticSpec(
 COLOURS_GREY: Final = DiagnosticSpec(
     code="scan-colours-grey",
     severity="warning",
-    text="the colours are all grey and follow the intensity: they are no photographs",
+    text="the colours are all grey and follow the intensity: they do not come from photos",
 )
 INTENSITY_ZERO: Final = DiagnosticSpec(
     code="scan-intensity-zero",
     severity="warning",
-    text="{subject}: the intensity of all points is zero: it is taken as absent",
+    text="{subject}: the intensity of all points is zero: it is treated as missing",
 )
 INTENSITY_LIMITS: Final = DiagnosticSpec(
     code="scan-intensity-limits-misfit",
     severity="warning",
     text="{subject}: it states intensities from {stated_low:g} to {stated_high:g}, which its data "
     "do not fit: they are scaled from {low:g} to {high:g}",
-    remedy="{step}.intensity_max=NUMBER says what is white",
+    remedy="{step}.intensity_max=NUMBER sets the value of white",
 )
 INTENSITY_CLIPPED: Final = DiagnosticSpec(
     code="scan-intensity-clipped",
@@ -86,7 +86,7 @@ INTENSITY_LUMINANCE: Final = DiagnosticSpec(
     code="scan-intensity-is-luminance",
     severity="warning",
     text="the intensity is not the laser's but the luminance of the colours (correlation "
-    "{correlation:.5f}): it is left out, the colours hold it",
+    "{correlation:.5f}): it is ignored, the colours contain it",
 )
 SCAN_WITHOUT: Final = DiagnosticSpec(
     code="scan-without-field",
@@ -104,13 +104,17 @@ NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-intensity-not-chosen",
     severity="warning",
     text="the scans have no intensity; fields not used: {names}",
-    remedy="{step}.intensity_field={candidate} takes one as the intensity",
+    remedy="{step}.intensity_field={candidate} uses one as the intensity",
 )
 FEW_STATIONS: Final = DiagnosticSpec(
     code="scan-stations-missing",
     severity="warning",
-    text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest station "
-    "decides the front of a wall",
+    text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest "
+    "station determines "
+    "the front of a "
+    ""
+    ""
+    "wall",
 )
 COARSE_OFFSETS: Final = DiagnosticSpec(
     code="scan-offsets-coarse",
@@ -143,7 +147,7 @@ TOO_FAR: Final = DiagnosticSpec(
 NO_RETURN: Final = DiagnosticSpec(
     code="points-without-return",
     severity="warning",
-    text="{n_points} points at 0 0 0 are no returns of the scanner and were left out",
+    text="{n_points} points at 0 0 0 are not returns of the scanner and were left out",
     rank_by="n_points",
 )
 NOT_FINITE: Final = DiagnosticSpec(
@@ -164,17 +168,17 @@ THICK: Final = DiagnosticSpec(
     severity="warning",
     text="the cloud is thicker than its point spacing: across surfaces, in pieces of about "
     "{side_cm:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within {width_mm:.1f} mm), "
-    "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths are no "
-    "better than that",
-    remedy="look for noise, rough surfaces and scans that were joined without fitting",
+    "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths "
+    "cannot be more accurate",
+    remedy="check for noise, rough surfaces and misaligned scans",
     rank_by="sigma_mm",
 )
 DISAGREE: Final = DiagnosticSpec(
     code="scans-disagree",
     severity="warning",
-    text="the scans disagree: where two show one surface they lie {apart_mm:.1f} mm apart across "
-    "it (median), while each scatters by {sigma_mm:.1f} mm",
-    remedy="register them again, or take one at a time",
+    text="the scans disagree: where two show one surface they are {apart_mm:.1f} "
+    "mm apart (median), while the scatter of each is {sigma_mm:.1f} mm",
+    remedy="register them again, or use one at a time",
     rank_by="apart_mm",
 )
 RULES: Final = {

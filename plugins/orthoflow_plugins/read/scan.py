@@ -95,8 +95,12 @@ class ReadScan(Method):
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
-            description="Where a viewer stands, [x, y, z], world metres (unit applied); tells the "
-            "front of a wall from its back when the files have no scanner positions.",
+            description="Position of a viewer, [x, y, z], world metres (unit applied); "
+            "distinguishes the front of a wall from its "
+            "back if the files have no scanner "
+            ""
+            ""
+            "positions.",
         )
         columns: str | tuple[str, ...] | None = Field(
             None,
@@ -172,8 +176,9 @@ class ReadScan(Method):
         ctx.figure(
             "plan",
             plan_view_png(cloud),
-            "The cloud from above, brighter where denser: walls are thin bright lines; double "
-            "lines are scans that do not fit each other.",
+            "The cloud from above, brighter where denser: walls are thin bright lines; "
+            "double lines "
+            "are misaligned scans.",
         )
         polar = polar_view_png(cloud)
         if polar is not None:

@@ -43,13 +43,13 @@ class ReadTies(Method):
         sigma_px: float = Field(
             1.0,
             gt=0,
-            description="Standard deviation of each pixel coordinate where the files say none.",
+            description="Standard deviation of each pixel coordinate if the files state none.",
         )
         sigma_m: float = Field(
             0.002,
             ge=0,
             description="Standard deviation of each world coordinate, metres: of the survey, or of "
-            "a place that was picked in the scan.",
+            "a point picked in the scan.",
         )
 
     class In(Ports):

@@ -152,7 +152,9 @@ def fit_similarity(
     source, target = points_source - middle_source, points_target - middle_target
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > _LINE_SHARE * spread[0]:
-        raise GeometryError("the points of a similarity lie on one line: it could turn about that")
+        raise GeometryError(
+            "the points of a similarity lie on one line: a rotation about it is undetermined"
+        )
     u, values, vt = np.linalg.svd(target.T @ source)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation: NDArray[np.float64] = u @ np.diag(signs) @ vt
@@ -185,8 +187,8 @@ def _require_same_hand(
     if off_m > _MIRRORED_TIMES * mirrored_off_m and off_m > 1e-3:
         raise GeometryError(
             f"the lists of points mirror each other: they fit to {off_m:.3g} m as they are, and "
-            f"to {mirrored_off_m:.3g} m with the sign of one axis changed; exchange x and y, or "
-            "change that sign, in one of them"
+            f"to {mirrored_off_m:.3g} m with the sign of one axis changed; swap x and y, or change "
+            "that sign, in one of them"
         )
 
 

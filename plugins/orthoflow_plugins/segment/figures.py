@@ -19,7 +19,8 @@ _KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
     "no data": (200, 30, 160),
 }
 CAPTION: Final = (
-    "blue went through, orange a back was measured, purple nothing came back. Sides should lie on "
+    "blue: rays passed through, orange: a back was measured, purple: no returns. Sides "
+    "should lie on "
     "the edges of what is seen; a side that cuts across something, or an outline round nothing, "
     "is wrong."
 )

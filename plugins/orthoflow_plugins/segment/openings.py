@@ -49,8 +49,8 @@ _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_
 NO_CLOUD: Final = DiagnosticSpec(
     code="openings-without-cloud",
     severity="warning",
-    text="without the cloud an opening looks like a place that furniture hides, and one that was "
-    "looked through like one that gave nothing",
+    text="without the cloud an opening cannot be distinguished from a place "
+    "that furniture hides, nor an open one from one without returns",
     remedy="wire the cloud to {step}",
 )
 OTHER_SURFACE: Final = DiagnosticSpec(
@@ -62,8 +62,8 @@ OTHER_SURFACE: Final = DiagnosticSpec(
 OTHER_CELLS: Final = DiagnosticSpec(
     code="orthoimage-of-other-cells",
     severity="warning",
-    text="{subject}: its orthoimage has other cells than its depth, so sides are measured by "
-    "depth alone",
+    text="{subject}: its orthoimage has other cells than its depth, so sides are "
+    "measured from depth alone",
     remedy="use the same gsd_m for both",
 )
 
@@ -96,7 +96,7 @@ class SegmentOpenings(Method):
         MetricSpec("openings_share", label="share of the walls that is open"),
         MetricSpec("side_sigma_mm", label="stated error of a side, median"),
         MetricSpec("image_side_share", label="sides that a photo placed"),
-        MetricSpec("n_unbounded", label="open areas that are no openings by rim or shape"),
+        MetricSpec("n_unbounded", label="open areas rejected by border or shape"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Pu and Vosselman 2009, doi:10.1016/j.isprsjprs.2009.04.001 (holes of walls as windows)",
@@ -110,13 +110,13 @@ class SegmentOpenings(Method):
             default=0.05,
             gt=0.0,
             le=5.0,
-            description="What lies so far behind the wall's face, or farther, is not of it.",
+            description="Cells at least this far behind the wall's face do not belong to it.",
         )
         width_least_m: float = Field(
             default=0.25,
             gt=0.0,
             le=100.0,
-            description="A square of this side fits into an opening.",
+            description="Side of a square that fits into an opening.",
         )
         area_least_m2: float = Field(
             default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."
@@ -125,10 +125,14 @@ class SegmentOpenings(Method):
             default=0.5,
             ge=0.0,
             le=1.0,
-            description="Share of the outline along which the wall's face must be measured: less "
-            "is the end of what was scanned.",
+            description="Share of the outline along which the wall's face must be measured: "
+            "with less it is "
+            "the border of the "
+            ""
+            ""
+            "scan.",
         )
-        level: bool = Field(default=False, description="Look at floors, ceilings and slopes, too.")
+        level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
 
     class In(Ports):
         """Walls; the cloud shows what is hidden, orthoimages refine sides."""

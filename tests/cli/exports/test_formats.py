@@ -77,9 +77,13 @@ def test_nothing_else_is_refused() -> None:
 @pytest.mark.parametrize(
     ("chosen", "target", "said"),
     [
-        (Choices(), None, "say what to write: --to "),
-        (Choices(split=True), "csv", "so it does not go with --to csv: split first"),
-        (Choices(split=True, embed=True), None, "so it does not go with --embed: split first"),
+        (Choices(), None, "choose what to write: --to "),
+        (Choices(split=True), "csv", "so it cannot be combined with --to csv: split first"),
+        (
+            Choices(split=True, embed=True),
+            None,
+            "so it cannot be combined with --embed: split first",
+        ),
         (Choices(embed=True), "csv", "--to csv writes no record, so nothing can be embedded"),
         (Choices(inputs=("a=b",)), "csv", "--input belongs to --embed, not to --to csv"),
         (Choices(inputs=("a=b",), split=True), None, "--input belongs to --embed, not to --split"),

@@ -49,9 +49,9 @@ def test_of_one_cell_its_figures_alone_are_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("choices", "lacking"),
     [
-        ({}, "; it does not say what --license and --author would"),
-        ({"author": "A. Nobody"}, "; it does not say what --license would"),
-        ({"license_text": "CC0-1.0", "author": "  "}, "; it does not say what --author would"),
+        ({}, "; it does not state what --license and --author would"),
+        ({"author": "A. Nobody"}, "; it does not state what --license would"),
+        ({"license_text": "CC0-1.0", "author": "  "}, "; it does not state what --author would"),
         ({"license_text": "CC0-1.0", "author": " A. Nobody "}, ""),
     ],
 )

@@ -43,7 +43,7 @@ def test_every_field_is_read_as_text(tmp_path: Path) -> None:
             "block.yaml:1:23: revisions.0.texts: no field of a title block; did you mean text?",
         ),
         ("logo: none.png\n", "none.png cannot be read: No such file"),
-        ("logo: block.yaml\n", "block.yaml is no JPEG, PNG, TIFF"),
+        ("logo: block.yaml\n", "block.yaml is not a JPEG, PNG, TIFF"),
         ("title: [", "block.yaml:"),
         ("a" * 100_001, "block.yaml has 100001 bytes, a title block (YAML) at most 100000"),
     ],
@@ -59,5 +59,5 @@ def test_files_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"missing.yaml cannot be read: No such file"):
         read_title_block(tmp_path / "missing.yaml")
     (tmp_path / "latin.yaml").write_bytes(b"title: \xe9\n")
-    with pytest.raises(InputError, match="is no UTF-8 text"):
+    with pytest.raises(InputError, match="is not UTF-8 text"):
         read_title_block(tmp_path / "latin.yaml")

@@ -44,7 +44,7 @@ def nested(depth: int) -> str:
             "it is in b'latin-1', expected UTF-8",
         ),
         ("<a/>", "<!DOCTYPE a><a/>", "it declares a document type or entities"),
-        ("<a/>", "<a>", "it is no XML"),
+        ("<a/>", "<a>", "it is not XML"),
     ],
     ids=["wide", "deep", "many", "encoding", "document type", "no XML"],
 )
@@ -74,7 +74,7 @@ def test_a_header_may_ask_for_32_mib_of_xml(n_bytes: int, is_read: bool, tmp_pat
     path.write_bytes(content)
     # What is there ends long before.
     with pytest.raises(
-        InputError, match="it is no XML" if is_read else "at most 33554432 are read"
+        InputError, match="it is not XML" if is_read else "at most 33554432 are read"
     ):
         check_xml(path)
 

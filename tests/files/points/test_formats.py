@@ -30,7 +30,7 @@ from tests.scan_files import read_all
         ),
         ("room.ply", "this is text\n", "room.ply is named as PLY but does not begin with 'ply'"),
         ("room.pcd", "this is text\n", "room.pcd has no PCD header that can be read"),
-        ("room.rcp", "this is text\n", "room.rcp is no point file .* one of .e57 .las .laz"),
+        ("room.rcp", "this is text\n", "room.rcp is not a point file .* one of .e57 .las .laz"),
         ("room.e57", "", "room.e57 is empty"),
         ("room.xyz", "", "room.xyz is empty"),
         ("room.ptx", "this is text\n", "room.ptx, line 1: expected the ten header lines"),

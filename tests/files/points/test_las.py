@@ -117,7 +117,7 @@ def chunk_table(path: Path) -> int:
     ("position", "content", "message"),
     [
         (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
-        (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that have no room"),
+        (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that do not fit"),
         (243, b"\x05\x00\x00\x00", "records at its end are missing"),
     ],
     ids=["offset", "records", "extended-records"],

@@ -136,7 +136,7 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
     assert (metrics["n_points"], metrics["n_found"]) == (4, 1)
     (said,) = ctx.warnings
     assert said.startswith(
-        f"3 of 4 check points count nowhere: P1 (2 mm below {image.name}), "
+        f"3 of 4 check points are not used: P1 (2 mm below {image.name}), "
         f"P2 (1.2 m left of {image.name}), P3 (250 mm before {image.name}, beyond its buffer): "
     )
     assert "margin_m" in said
@@ -153,7 +153,7 @@ def test_points_that_are_no_targets_are_not_helped_by_larger_walls(tmp_path: Pat
     _, _, ctx = inspect(tmp_path, points, walls, image)
     (said,) = ctx.warnings
     assert said == (
-        "1 of 2 check points count nowhere: P1 (no black and white quadrant target was recognised "
+        "1 of 2 check points are not used: P1 (no black and white quadrant target was recognised "
         f"on {image.name}): measure them in an orthoimage"
     )
 

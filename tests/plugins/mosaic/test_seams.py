@@ -242,7 +242,7 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
     ctx = scenes.context(tmp_path)
     inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
     (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
-    assert ctx.warnings == ["the orthoimage of west is empty: no source shows any of it"]
+    assert ctx.warnings == ["the orthoimage of west is empty: no source shows it"]
     assert image.sources == ()
     assert (image.source == -1).all()
     assert (image.mask[:5] == OrthoMask.NONE).all()

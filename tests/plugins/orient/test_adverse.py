@@ -54,4 +54,4 @@ def test_of_two_hundred_photos_in_trouble_the_solvable_ones_are_ok(tmp_path: Pat
 
 def test_the_calibration_of_another_lens_is_told_from_the_ties(tmp_path: Path) -> None:
     status = oriented(adverse_case("calibration of another lens", 1), tmp_path).status
-    assert "it is the calibration of another lens, zoom or image size" in status
+    assert "the calibration belongs to another lens, zoom or image size" in status

@@ -65,7 +65,7 @@ def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
     assert first.intrinsics is not None
     assert first.intrinsics.source == "given"
     assert ms.wall_error_m(SCENE, first.viewing(), CAMERA) < 1e-9
-    assert second.status == "the files of given cameras say nothing of it"
+    assert second.status == "the files of given cameras do not mention it"
     assert warnings == [f"photo b.jpg is not oriented: {second.status}"]
 
 
@@ -73,7 +73,9 @@ def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
 def test_a_photo_taken_from_nowhere_on_earth_is_refused(folder: Path, metres: float) -> None:
     far = replace(CAMERA, translation=np.array([0.0, metres, 0.0]))
     write_colmap_model(folder / "given", oriented(far))
-    with pytest.raises(InputError, match=r"m from the origin, as its given camera says; expected"):
+    with pytest.raises(
+        InputError, match=r"m from the origin, according to its given camera; expected"
+    ):
         read(folder)
 
 

@@ -506,7 +506,7 @@ def test_what_cannot_be_painted_is_refused_with_the_reason(tmp_path: Path) -> No
         scenes.cameras(turned_away(viewer, where)), tmp_path
     )
     renamed = Cameras(cameras=(dataclasses.replace(good.cameras[0], photo="x.png"),))
-    assert "x.png, which the photos do not hold" in refused(renamed, tmp_path)
+    assert "x.png, which are not among the photos" in refused(renamed, tmp_path)
     small = scenes.photos(scenes.rendered()[:-1])
     assert "0.png has 1000 x 799 pixels" in refused(good, tmp_path, photos=small)
     none = dataclasses.replace(scenes.walls(where), walls=())

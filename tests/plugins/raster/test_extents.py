@@ -147,9 +147,10 @@ def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said
     assert edges_m(walls)[2] == pytest.approx(rise * WIDTH_M, abs=CORNER_M)
     (told,) = [text for text in ctx.warnings if "askew" in text]
     assert told == (
-        "plane 0: what adjoins it at its bottom runs askew, and its raster ends where that comes "
-        "nearest: up to 80 mm of its plane are left out there, more of what stands out of it; "
-        "margin_m adds them"
+        "plane 0: the surface that adjoins it at its bottom is askew, and its raster ends "
+        "where that comes "
+        "nearest: up to 80 mm of its plane are left out there, more of its "
+        "relief; margin_m adds them"
     )
     # What a margin has added is not missing.
     (tmp_path / "wider").mkdir()

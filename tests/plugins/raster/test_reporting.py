@@ -96,7 +96,7 @@ def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
     [
         ("laser", []),
         ("luminance", ["the cloud has no laser intensity; the grey of its colours (Rec. 601)"]),
-        ("none", ["the cloud has neither intensity nor colour; only the depth of walls"]),
+        ("none", ["the cloud has neither intensity nor colour; only the depths of walls"]),
     ],
 )
 def test_what_the_cloud_lacks_is_told(listener: Listener, source: str, said: list[str]) -> None:

@@ -114,7 +114,7 @@ def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
     ]
     (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
     assert photo.mask is None
-    assert "masks of no photo: c.png, x*.jpg: photos are found by their names" in said
+    assert "masks of no photo: c.png, x*.jpg: photos are identified by their names" in said
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,7 @@ def test_sixteen_bits_and_nodata_are_understood(tmp_path: Path) -> None:
 
 def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:
     image, place = foreign(tmp_path)
-    with pytest.raises(InputError, match=r"theirs\.tif does not say where it lies"):
+    with pytest.raises(InputError, match=r"theirs\.tif does not state its position"):
         read(tmp_path, image)
     with pytest.raises(InputError, match="holds no GeoTIFF"):
         read(tmp_path, place)

@@ -290,7 +290,7 @@ def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) ->
 def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:
     block = made.exif_block({made.MODEL: "a long name of a camera"})[:-9]
     read(*made.write(tmp_path, {"a.jpg": made.jpeg(made.picture(), block)}))
-    assert "the EXIF data of photo a.jpg are damaged; what is readable was taken" in read.warnings
+    assert "the EXIF data of photo a.jpg are damaged; the readable part was used" in read.warnings
 
 
 def test_a_line_of_the_log_tells_what_is_known_of_each_photo(tmp_path: Path) -> None:
@@ -487,7 +487,7 @@ def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: Rea
     whole = encode_jpeg(made.picture(256, 192))
     padded = whole[:-2] + b"\0" * 40 + whole[-2:]
     assert len(read(*made.write(tmp_path, {"a.jpg": padded, "b.jpg": whole}))) == 2
-    assert "photo a.jpg: holds bytes that its decoder passes over" in read.warnings
+    assert "photo a.jpg: holds bytes that its decoder skips" in read.warnings
 
 
 def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
@@ -506,9 +506,9 @@ def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        (b"", "is no JPEG"),
-        (b"<html>", "is no JPEG"),
-        (b"\0" * 500, "is no JPEG"),
+        (b"", "is not a JPEG"),
+        (b"<html>", "is not a JPEG"),
+        (b"\0" * 500, "is not a JPEG"),
         (b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", r"is camera raw \(Canon CR3\).*develop to TIFF"),
         (b"%PDF-1.7", "is PDF, which is not read: convert it"),
         (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", r"is a HEIC file: install orthoflow-tls\[heic\]"),
@@ -562,7 +562,7 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
     assert (
         "the calibration has no entry for photo c.jpg; the others are calibrated" in read.warnings
     )
-    assert "calibration entries that no photo takes: B.jpg: the case" in read.warnings
+    assert "calibration entries that match no photo: B.jpg: upper and lower" in read.warnings
     assert "the focal length of photo c.jpg is unknown" in read.warnings
 
 
@@ -597,7 +597,7 @@ def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Read
     ]  # fmt: skip
     assert {(p.width, p.height, p.exif_orientation) for p in photos} == {(4000, 3000, 6)}
     assert [photo.exif_focal_px for photo in photos] == pytest.approx([3004.6] * 3, abs=0.1)
-    assert "4 of 7 files of the input photos are no photos" in read.warnings
+    assert "4 of 7 files of the input photos are not photos" in read.warnings
 
 
 def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(

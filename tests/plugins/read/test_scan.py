@@ -422,7 +422,7 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
     assert cloud.intensity is None
     assert cloud.rgb is None
     assert cloud.source["intensity_source"] == "none"
-    assert "the intensity of all points is zero: it is taken as absent" in read.warnings
+    assert "the intensity of all points is zero: it is treated as missing" in read.warnings
     assert "the colours of all points are zero" in read.warnings
 
 
@@ -447,7 +447,7 @@ def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
     cloud = read(path)
     assert cloud.intensity is not None
     assert cloud.source["intensity_source"] == "laser"
-    assert "they are no photographs" in read.warnings
+    assert "they do not come from photos" in read.warnings
 
 
 # Colours
