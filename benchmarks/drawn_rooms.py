@@ -84,7 +84,7 @@ def numbers(inspection: Inspection) -> dict[str, float]:
 
 def planes(seed: int) -> Iterator[tuple[str, str, float]]:
     """Return every detector's errors in a room."""
-    room = room_of(seed, scan_step_m=0.02)
+    room = room_of(seed, scan_step_m=0.03)
     for name, (method, params) in DETECTORS.items():
         out, metrics = run(method, method.In(cloud=room.cloud), seed, **params)
         inputs = InspectTruth.In(truth=room.truth, planes=out.planes, labels=out.labels)
