@@ -369,9 +369,7 @@ def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) ->
     inputs = InspectTruth.In(truth=truth, planes=truth.planes, cameras=Cameras(cameras=()))
     InspectTruth().run(inputs, InspectTruth.Params(), context)
     (said,) = context.warnings
-    assert said.startswith(
-        "not compared with the truth: cameras, for want of orthoimages and walls"
-    )
+    assert said.startswith("not compared with the truth: cameras, without orthoimages and walls")
     image = rendered(truth)
     _, _, context = inspect(
         tmp_path, truth, painted(image), walled(image), cameras=Cameras(cameras=())
