@@ -15,7 +15,7 @@ from orthoflow.products import LayerMask, OrthoMask, SurfaceMask, TieRole
     [
         (SurfaceMask, ["VOID", "MEASURED", "RECOVERED"]),
         (LayerMask, ["OUTSIDE", "PAINTED", "OCCLUDED", "NO_SURFACE"]),
-        (OrthoMask, ["NONE", "PAINTED", "FILLED", "OCCLUDED", "NO_SURFACE"]),
+        (OrthoMask, ["NONE", "PAINTED", "FILLED", "OCCLUDED", "NO_SURFACE", "CONTRADICTED"]),
         (TieRole, ["CONTROL", "CHECK", "REJECTED"]),
         (SurfaceRole, ["WALL", "RELIEF", "RECESS", "OBJECT"]),
         (TextureKind, ["PLAIN", "FRESCO", "TEXTILE", "TILES", "WOOD"]),

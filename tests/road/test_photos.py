@@ -23,10 +23,10 @@ from tests.scan_files import write_las
 # A third of the shipped recipe's cells, and of its points of the main wall, fewer of the others;
 # less than half of its pixels.
 SMALL = (
-    *("--set", "room.scan_step_m=0.0047", "--set", "room.panorama_step_m=0.03"),
-    *("--set", "room.photo_gsd_m=0.004", "--set", "wall.gsd_m=0.007"),
+    *("--set", "room.scan_step_m=0.0045", "--set", "room.panorama_step_m=0.03"),
+    *("--set", "room.photo_gsd_m=0.0038", "--set", "wall.gsd_m=0.007"),
 )
-GSD_MM, PHOTO_GSD_MM = 7.0, 4.0
+GSD_MM, PHOTO_GSD_MM = 7.0, 3.8
 # What the recipe for simulated data sets, for the recipe for own data.
 SAME_WALL = (
     *("--set", "wall.gsd_m=0.007", "--set", "wall.buffer_m=0.3"),

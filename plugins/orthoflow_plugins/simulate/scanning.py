@@ -180,8 +180,10 @@ def station_positions(
     places = np.array(_PLACES_M[:n_stations])
     if rng is not None:
         places += rng.uniform(-1.0, 1.0, places.shape) * _PLACES_DRAWN_M
-    axes = np.vstack([main_wall_axes(), [0.0, 0.0, 1.0]])
-    return np.asarray(places @ axes)
+    along, towards = main_wall_axes()
+    up = np.array([0.0, 0.0, 1.0])
+    # Not as a product of matrices, whose last digit depends on the processor.
+    return np.array([a * along + t * towards + h * up for a, t, h in places])
 
 
 def planned_sweeps(

@@ -114,7 +114,7 @@ def test_the_worst_of_all_walls_has_no_sign() -> None:
 def test_planes_without_labels_are_compared_alone(tmp_path: Path) -> None:
     truth: Any = SimpleNamespace(planes=floors(0.0, 3.0))
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    found = plane_errors.inspect_planes(floors(-0.01, 3.004), None, truth, ctx)
+    found = plane_errors.inspect_planes(floors(-0.01, 3.004), None, None, truth, ctx)
     by_name = counts(list(found.findings))
     assert by_name["true_planes_found"] == 2.0
     assert not any("label" in name for name in by_name)
@@ -137,7 +137,7 @@ def test_planes_without_labels_are_compared_alone(tmp_path: Path) -> None:
 def test_a_main_wall_that_was_not_found_is_told(tmp_path: Path) -> None:
     truth: Any = SimpleNamespace(planes=floors(0.0, 3.0))
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    plane_errors.inspect_planes(floors(3.0), None, truth, ctx)
+    plane_errors.inspect_planes(floors(3.0), None, None, truth, ctx)
     (warning,) = ctx.warnings
     assert "the main wall of the scene is none of the 1 planes" in warning
     told = {item.name: item.value for item in ctx.metrics}
@@ -155,12 +155,13 @@ def test_points_are_counted_by_both_labels() -> None:
     assert plane_errors._joint_counts(nothing, nothing, 2).tolist() == [[3], [0], [0]]
 
 
-def test_labels_are_scored_by_plane_whichever_number_they_have() -> None:
+def test_labels_are_scored_by_plane_whichever_number_they_have(tmp_path: Path) -> None:
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     labels: Any = SimpleNamespace(plane_index=np.array([2, 2, -1, 0, 0, 0], dtype=np.int16))
     truth: Any = SimpleNamespace(
         labels=np.array([0, 0, 0, 1, 1, -1], dtype=np.int16), planes=floors(0.0, 3.0, 6.0)
     )
-    found = counts(plane_errors.label_findings(labels, truth))
+    found = counts(plane_errors.label_findings(labels, None, truth, ctx))
     # Of the third plane there is no point.
     expected = {
         "precision": (1.0, 2.0 / 3.0, 0.0),

@@ -125,7 +125,11 @@ def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
             picture(size=(48, 64), masked=False),
             r"a.png has 48 x 64 pixels, but a.jpg 64 x",
         ),
-        ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "the mask of a.jpg leaves nothing"),
+        (
+            "a.png",
+            encode_png(np.zeros(SIZE[::-1], np.uint8)),
+            "the mask of a.jpg excludes all of it",
+        ),
         ("a.png", b"no picture", "mask a.png"),
         ("a.txt", "words", r"no file of the masks is a picture .* only a\.txt"),
         ("a.json", "{", "a.json is not a mask of photos: expected a GeoJSON FeatureCollection"),

@@ -195,7 +195,7 @@ def test_mirrored_points_are_turned_as_well_as_may_be() -> None:
 def test_lists_that_mirror_each_other_are_refused(tmp_path: Path, with_scale: bool) -> None:
     source = places(3)
     control = source[:, [1, 0, 2]] + SURVEY  # north, east
-    with pytest.raises(MethodError, match=r"mirror each other: .* exchange x and y"):
+    with pytest.raises(MethodError, match=r"mirror each other: .* swap x and y"):
         register(tmp_path, points_at(source), points_at(control), with_scale=with_scale)
 
 
