@@ -475,7 +475,7 @@ class Store:
             (self.failures / key).unlink()
 
     def last_failure(self, key: str) -> str:
-        """State how a cell failed; empty when it did not, or when nobody knows any more."""
+        """Return how a cell failed; empty if it did not, or if the sentence is no longer kept."""
         with contextlib.suppress(OSError), open_file(self.failures / key) as stream:
             # Twice, for letters that no terminal shows are longer when they are written out.
             text = stream.read(4 * _LONGEST_FAILURE).decode(errors="replace")

@@ -27,7 +27,7 @@ from orthoflow.products import (
     is_painted,
     is_shown,
 )
-from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.findings import count_true, rms
 from orthoflow_plugins.inspect.image_quality import n_shown as n_shown_of
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
 
@@ -230,14 +230,14 @@ def wall_errors(
         step_colour=square[compares & painted & steps],
         shift_m=patches.shift * true.frame.gsd_m,
         shift_cells=patches.shift,
-        n_painted=_count(asked),
-        n_seen=_count(seen),
-        n_seen_painted=_count(seen & painted),
-        n_seen_shown=_count(seen & (painted | filled)),
-        n_unseen_painted=_count(asked & ~seen & ~steps),
-        n_coloured=_count(compared),
-        n_gross=_count(gross),
-        n_ghost=_count(gross & behind),
+        n_painted=count_true(asked),
+        n_seen=count_true(seen),
+        n_seen_painted=count_true(seen & painted),
+        n_seen_shown=count_true(seen & (painted | filled)),
+        n_unseen_painted=count_true(asked & ~seen & ~steps),
+        n_coloured=count_true(compared),
+        n_gross=count_true(gross),
+        n_ghost=count_true(gross & behind),
     )
     return WallErrors(samples=samples, patches=patches, depth_m=depth, grey=np.sqrt(square))
 
@@ -325,10 +325,6 @@ def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.
 
     whole = cv2.erode((coloured | ~known).view(np.uint8), np.ones((3, 3), dtype=np.uint8))
     return coloured & np.asarray(whole, dtype=np.bool_)
-
-
-def _count(mask: NDArray[np.bool_]) -> int:
-    return int(np.count_nonzero(mask))
 
 
 def _depth_numbers(samples: WallSamples) -> list[_Number]:

@@ -259,6 +259,11 @@ def pooled(samples: Sequence[_Samples]) -> _Samples:
     return type(samples[0])(**together)
 
 
+def count_true(mask: NDArray[np.bool_]) -> int:
+    """Return how many are true."""
+    return int(np.count_nonzero(mask))
+
+
 def rms(values: ArrayLike) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))

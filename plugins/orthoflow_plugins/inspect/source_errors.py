@@ -13,7 +13,7 @@ from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, Truth, Wall, is_painted
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
-from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.findings import count_true, rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
 
 if TYPE_CHECKING:
@@ -66,12 +66,12 @@ class SourceErrors:
         return SourceSamples(
             away_m=self.displacement_m[counted & ~self.steps][::error_step],
             step_m=self.displacement_m[counted & self.steps][::error_step],
-            n_traced=_count(self.traced),
-            n_far=_count(is_far),
-            n_ghosts=_count(self.ghosts),
+            n_traced=count_true(self.traced),
+            n_far=count_true(is_far),
+            n_ghosts=count_true(self.ghosts),
             n_stated=sigmas.size,
-            n_within_1_sigma=_count(sigmas <= 1.0),
-            n_within_2_sigma=_count(sigmas <= 2.0),
+            n_within_1_sigma=count_true(sigmas <= 1.0),
+            n_within_2_sigma=count_true(sigmas <= 2.0),
             n_seen_by_both=self.n_seen_by_both,
             n_seen_painted=self.n_seen_painted,
         )
@@ -161,8 +161,8 @@ def trace_sources(
         traced=traced,
         steps=depth_step_band(true.depth_m),
         ghosts=ghosts,
-        n_seen_by_both=_count(both),
-        n_seen_painted=_count(both & is_painted(image.mask)),
+        n_seen_by_both=count_true(both),
+        n_seen_painted=count_true(both & is_painted(image.mask)),
         expected_m=image.error_m,
     )
 
@@ -226,7 +226,3 @@ def _seen_by_photos(
     mask = np.zeros(true.frame.shape, dtype=np.bool_)
     mask[rows, columns] = seen
     return mask
-
-
-def _count(mask: NDArray[np.bool_]) -> int:
-    return int(np.count_nonzero(mask))

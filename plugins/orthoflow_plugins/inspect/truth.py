@@ -516,7 +516,9 @@ class _Judge:
     def verdict_on(self, image: Orthoimage) -> _Verdict:
         """Compare one wall, a large one in bands of whole blocks with a block about them."""
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
-        bands = [self._of_band(image, wall, band) for band in _bands(image)]
+        n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
+        cell_step = max(1, n_painted // _TRACED_POINTS)
+        bands = [self._of_band(image, wall, band, cell_step) for band in _bands(image)]
         sources = [band.sources for band in bands if band.sources is not None]
         together = pooled(sources) if sources else None
         return _Verdict(
@@ -531,8 +533,15 @@ class _Judge:
             quality=tuple(quality_findings(image, wall, self.inputs.cameras)),
         )
 
-    def _of_band(self, image: Orthoimage, wall: Wall, band: Band) -> _Verdict:
-        """Compare some rows of a wall; what is kept of them does not grow with the wall."""
+    def _of_band(self, image: Orthoimage, wall: Wall, band: Band, cell_step: int) -> _Verdict:
+        """Compare some rows of a wall; what is kept of them does not grow with the wall.
+
+        Args:
+            image: of the whole wall.
+            wall: on the same cells.
+            band: the rows.
+            cell_step: traced cells are kept in steps of this.
+        """
         part, surface = rows_of(image, band.around), rows_of(wall, band.around)
         chosen = sampling(part, self.rule, band.around.start)
         true = self._true_orthoimage(part, chosen)
@@ -557,8 +566,7 @@ class _Judge:
             sources = traced.samples(self.rule.error_step)
             length_m = np.linalg.norm(traced.displacement_m[drawn], axis=2)
             is_known = np.isfinite(traced.displacement_m).all(axis=2)
-            n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
-            cells = np.argwhere(is_known)[:: max(1, n_painted // _TRACED_POINTS)]
+            cells = np.argwhere(is_known)[::cell_step]
             shift_m = traced.displacement_m[cells[:, 0], cells[:, 1]]
         return _Verdict(
             samples=errors.samples,
