@@ -62,6 +62,14 @@ _NO_SEARCH: Final = (
     "</script><style>.by-file .md-search, .by-file [for=__search] {display: none}</style>"
 )
 _METRICS_HEAD: Final = "| metric | meaning | unit | better | method |\n|---|---|---|---|---|"
+_LIMITED: Final = {
+    "orthoflow": ROOT / "orthoflow",
+    "orthoflow_provenance": ROOT / "provenance" / "orthoflow_provenance",
+}
+# A limit of what files may ask for, with the comment that says of what it is the largest number.
+_LIMIT: Final = re.compile(
+    r"^(?:#: (?P<what>.+)\n)?(?P<name>(?:MOST|MAX|DEEPEST|FARTHEST)\w*): Final", re.MULTILINE
+)
 _LINK: Final = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -80,6 +88,7 @@ def written(folder: Path) -> None:
         "products.md": "\n".join(_products(catalog)),
         "metrics.md": "\n".join(_metrics(catalog)),
         "commands.md": "\n".join(_commands()),
+        "limits.md": "\n".join(_limits()),
     }.items():
         (reference / name).write_text(text, encoding="utf-8")
 
@@ -287,6 +296,31 @@ def _command(command: click.Command, context: click.Context) -> Iterator[str]:
         if inner is not None:
             with click.Context(inner, info_name=name, parent=context) as own:
                 yield from _command(inner, own)
+
+
+def limits() -> Iterator[tuple[str, str, str]]:
+    """Yield module, name and meaning of each limit; the meaning is empty without a comment."""
+    for package, folder in _LIMITED.items():
+        for path in sorted(folder.rglob("*.py")):
+            module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
+            for found in _LIMIT.finditer(path.read_text(encoding="utf-8")):
+                yield module, found["name"], found["what"] or ""
+
+
+def _limits() -> Iterator[str]:
+    yield (
+        "# Limits\n\nThe most that a file may ask for. A larger file is refused in one sentence "
+        "before memory or time is spent on it, because a few kilobytes could otherwise demand "
+        "gigabytes or hours. Numbers that files state are also compared with the size of the file. "
+        "If a genuine file meets a limit, change the constant and report it; "
+        "`python -m tests.fuzz.campaign --cases 1000` tests them with damaged files.\n\n"
+        "| at most | of | constant |\n|---:|---|---|"
+    )
+    for module, name, what in limits():
+        if what:
+            value = getattr(import_module(module), name)
+            yield f"| {value:,} | {_cell(what)} | `{module}.{name}` |"
+    yield ""
 
 
 def _cell(text: str) -> str:

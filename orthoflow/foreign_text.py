@@ -196,6 +196,7 @@ def text_of_file(path: Path, most_bytes: int, what: str, *, way_out: str = "") -
         return stream.read()
 
 
+#: bytes of an SVG figure that is written as a file of its own
 MOST_SVG_BYTES: Final = 16_000_000
 # What plotting libraries draw with; `a`, `script`, `foreignObject`, animations are not among them.
 _SVG_ELEMENTS: Final = frozenset(

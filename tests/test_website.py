@@ -85,3 +85,14 @@ def test_the_reference_has_every_method_product_metric_and_command(
     for page in tmp_path.rglob("*.md"):
         for link in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
             assert "://" in link or (page.parent / link).exists(), (page.name, link)
+
+
+def test_every_limit_of_a_reader_says_what_it_limits() -> None:
+    readers = ("orthoflow.files.", "orthoflow.workflow.", "orthoflow_provenance.")
+    found = [(module, name, what) for module, name, what in site().limits()]
+    assert len(found) > 30
+    assert not [
+        f"{module}.{name}"
+        for module, name, what in found
+        if module.startswith(readers) and not what
+    ]

@@ -56,8 +56,11 @@ from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 
 # Some seconds of parsing; a calibration of a thousand cameras has about 150 kB.
+#: bytes of a calibration file
 MOST_BYTES: Final = 400_000
+#: entries of a calibration file
 MOST_CAMERAS: Final = 1000
+#: values of a calibration file, aliases expanded
 MOST_VALUES: Final = 20_000
 _REQUIRED: Final = ("width", "height", "fx", "fy", "cx", "cy")
 _START: Final = Position(line=1, column=1)

@@ -37,6 +37,7 @@ FACES: Final[Mapping[str, NDArray[np.float64]]] = {
 # From the axes of a camera that looks forwards: x right, y down, z forward.
 PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Limit of OpenCV's remap.
+#: columns of a panorama; columns and rows of a fisheye photo and its faces
 MOST_PX: Final = 32_766
 
 

@@ -47,7 +47,9 @@ SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 _NAMED_SUFFIXES: Final = (".tif", ".json", ".geojson", ".html")
 _NO_NAME: Final = re.compile(r"[^\w .,()-]", re.ASCII)
 # Data that are read are kept in memory, with copies.
+#: pixels of an imported orthoimage
 MOST_CELLS: Final = 1 << 28
+#: bands of an imported orthoimage
 MOST_BANDS: Final = 4
 TILE_PX: Final = 512
 # Larger images are not kept in memory, but in a file beside the output.

@@ -31,16 +31,21 @@ from orthoflow.products import Intrinsics
 
 # Limits for models with the observations of each photo, which are read line by line, and for other
 # files.
+#: bytes of a file of a COLMAP model, or Bundler's
 MOST_MODEL_BYTES: Final = 500_000_000
+#: bytes of a file of cameras (`cameras.json`, Metashape's XML, RealityCapture's list)
 MOST_BYTES: Final = 50_000_000
+#: characters of a line of a file of cameras
 MOST_LINE: Final = 20_000_000
 _WHAT: Final = "a file of cameras"
+#: cameras of one file
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _ORTHONORMAL: Final = 1e-4
 # A lens this close to another one is equivalent for any matcher; beyond the other limit its error
 # is visible in an orthoimage.
 NEGLIGIBLE_PX: Final = 0.05
+#: error in pixels of what a file of cameras states and cannot be represented
 MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
 _FAR_PX: Final = 1e4

@@ -42,6 +42,7 @@ from orthoflow.files.given_cameras import (
 from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Intrinsics
 
+#: tags of Metashape's XML
 MOST_TAGS: Final = 2_000_000
 _RADIAL: Final = ("k1", "k2", "k3", "k4")
 _SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"

@@ -34,6 +34,7 @@ READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "
 HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
 # 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
+#: pixels that a photo states before it is decoded
 MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"

@@ -19,8 +19,10 @@ from orthoflow.products.product import JsonValue
 
 Feature: TypeAlias = dict[str, JsonValue]
 
+#: bytes of a GeoJSON file of masks or seams
 MOST_BYTES: Final = 50_000_000
 # Each may be filled over a whole photo.
+#: polygons of a GeoJSON file of masks or seams
 MOST_POLYGONS: Final = 10_000
 _CORNERS_LEAST: Final = 3
 

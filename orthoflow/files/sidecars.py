@@ -22,8 +22,10 @@ from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
 
+#: bytes of the JSON file beside it
 MOST_SIDECAR_BYTES: Final = 1 << 20
 # Numbers of walls are kept in 16 bits.
+#: largest number of a wall
 MOST_WALLS: Final = 32_000
 _LONGEST_SHOWN: Final = 100
 _UNIT: Final = 1e-6

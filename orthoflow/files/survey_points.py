@@ -20,9 +20,12 @@ _IN_IMAGE: Final = ("u_px", "v_px")
 _IN_MAP: Final = ("map_x", "map_y")
 _IN_SPACE: Final = ("shown_x", "shown_y", "shown_z")
 _SEPARATORS: Final = (";", "\t", ",")
+#: bytes of a file of check points
 MOST_BYTES: Final = 20_000_000
+#: lines of a file of check points
 MOST_POINTS: Final = 100_000
 _MAX_PROBLEMS: Final = 20
+#: characters of a line of a file of check points
 MOST_LINE: Final = 10_000
 
 

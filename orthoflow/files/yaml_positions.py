@@ -28,8 +28,11 @@ from ruamel.yaml.tag import Tag
 
 from orthoflow.products.product import JsonValue
 
+#: levels of a workflow or calibration file
 DEEPEST: Final = 60
+#: digits of an integer in a workflow or calibration file
 MOST_DIGITS: Final = 1000
+#: values of a workflow file, aliases expanded
 MOST_VALUES: Final = 10_000
 _LONGEST_SHOWN: Final = 100
 # Letters, by YAML's own rule.

@@ -18,6 +18,7 @@ from orthoflow.geometry.planes import Plane
 # the viewer" would depend on the noise of a nearly vertical normal.
 LEVEL_LIMIT_DEG: Final = 10.0
 # Beyond any survey frame on Earth: larger coordinates come from damaged numbers.
+#: metres from the origin; points beyond are left out with a warning
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
 

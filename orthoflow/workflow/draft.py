@@ -45,7 +45,9 @@ _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
 # Files in a run folder: pictures in there are not photos.
 _OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
+#: levels of folders in a folder given to `orthoflow new`
 DEEPEST: Final = 3
+#: files that `orthoflow new` visits in a folder
 MOST_FILES: Final = 20_000
 
 

@@ -33,6 +33,7 @@ from orthoflow.workflow.parameters import SWEEP, MethodInfo, describe_method
 
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]
+#: steps of a workflow with all variants, datasets, seeds and repeats, excluded ones included
 MOST_CELLS: Final = 20_000
 # The product of methods that measure the quality of others' results.
 _JUDGEMENT: Final = "inspection"

@@ -61,10 +61,15 @@ from orthoflow.workflow.source import (
 )
 
 # Files and folders that are examined for one input: `/**` would take hours.
+#: files and folders visited for one entry of an input (a folder, or a pattern such as `**/*.e57`)
 MOST_LOOKED_AT: Final = 100_000
+#: bytes of a table of datasets
 MOST_TABLE_BYTES: Final = 4_000_000
+#: datasets of a table
 MOST_DATASETS: Final = 10_000
+#: columns of a table of datasets
 MOST_COLUMNS: Final = 200
+#: characters of a line of a table of datasets
 MOST_LINE: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200

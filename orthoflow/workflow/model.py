@@ -35,9 +35,12 @@ FORMAT: Final = 1
 # Errors of the models whose message is shown unchanged.
 FORMAT_TOO_NEW: Final = "format_too_new"
 NOT_A_NAME: Final = "not_a_name"
+#: `repeat` of a method call
 MOST_REPEATS: Final = 10_000
 # More values than are readable in a curve, and more runs than are practical.
+#: values of a sweep
 MOST_SWEPT: Final = 100
+#: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
 # Records keep numbers of fewer than a hundred digits.
 _MOST_OF_A_NUMBER: Final = 10**80

@@ -8,6 +8,7 @@ from typing import Final, NoReturn, TypeAlias
 from orthoflow.errors import ArgumentError, OrthoflowError, PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Entry, Listing, Position, Table, Value, read_yaml
 
+#: problems of a workflow that are reported at once
 MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 # Keys and indices that lead to a value: `("steps", "wall", "in", "cloud", 0)`.

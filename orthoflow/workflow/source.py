@@ -26,6 +26,7 @@ from orthoflow.workflow.model import (
 )
 from orthoflow.workflow.problems import Location, ProblemLog
 
+#: bytes of a workflow file
 MOST_BYTES: Final = 400_000
 _INSTALLED: Final = Path(__file__).parent / "shipped"
 _CHECKOUT: Final = Path(__file__).parents[2] / "workflows"

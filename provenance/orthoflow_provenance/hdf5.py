@@ -64,6 +64,7 @@ _LONGEST_FORMAT_BYTES: Final = 256
 # Nobody packs what is this small and read at once; more would be a flood from a few bytes.
 _PACKED_BYTES_MOST: Final = 4 << 20
 # Groups, datasets and attributes; a cell with its products has some fifty.
+#: groups, datasets and attributes of a record (more limits in `provenance/SPEC.md`, section 2)
 MAX_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
     h5py.h5z.FILTER_SHUFFLE: "shuffle",

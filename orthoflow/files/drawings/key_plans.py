@@ -17,7 +17,9 @@ from orthoflow.geometry.outlines import RoomOutline, room_outline
 from orthoflow.products import Planes
 
 # Every pair and some triples are compared, and a record may state any number.
+#: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
 MOST_PLANES: Final = 200
+#: connected parts of them
 MOST_PARTS: Final = 20_000
 
 

@@ -28,6 +28,7 @@ LONG_MM: Final = {
     "A2.0": (1189.0, 420.0),
     "A1.0": (1189.0, 594.0),
 }
+#: sheets of a picture of a wall
 MOST_SHEETS: Final = 200
 SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
 # Inches to the foot: 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16", and engineers' 1" = 20 ft ...

@@ -35,7 +35,9 @@ from orthoflow.files.yaml_positions import (
 )
 from orthoflow.foreign_text import open_file, reading, text_of_file
 
+#: bytes of the title block of sheets
 MOST_BYTES: Final = 100_000
+#: characters of one of its fields
 MOST_LETTERS: Final = 300
 _MOST_LOGO_BYTES: Final = 4_000_000
 _DIALECT: Final = Dialect(is_strict=False, empty="the title block is empty")

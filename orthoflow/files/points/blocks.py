@@ -16,13 +16,17 @@ from orthoflow.files.points.units import StatedUnit
 # 12 MB of float64 coordinates: large enough for memory speed, small enough to hold several copies.
 BLOCK_POINTS: Final = 500_000
 # Half of the programs that read our products count positions in 32 bits.
+#: points of a scan file (one less is read)
 MOST_POINTS: Final = 2**32
 # The densest encodings take a byte for eight points; a small file that states more is refused
 # before memory is allocated for them.
+#: points that a file states, per byte that it has
 MOST_POINTS_PER_BYTE: Final = 8
 # Lines of text scans and headers are much shorter.
+#: bytes of a line of a text scan
 MOST_LINE_BYTES: Final = 10_000
 # Fields of a point, known or not.
+#: fields of a point in PLY and PCD files
 MOST_FIELDS: Final = 1000
 
 PointField = Literal["intensity", "rgb", "grid"]

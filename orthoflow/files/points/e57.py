@@ -52,10 +52,14 @@ _STATES: Final = (
     "isColorInvalid",
 )
 # Scans of large buildings, a thousand scans with pictures, have a few million bytes.
+#: bytes of the XML of an E57 file
 MOST_XML_BYTES: Final = 1 << 25
+#: elements of the XML of an E57 file
 MOST_XML_ELEMENTS: Final = 200_000
+#: levels of elements in the XML of an E57 file
 DEEPEST_XML: Final = 64
 # For a structure; vectors, as of scans and pictures, may have any number.
+#: elements of a structure in the XML of an E57 file; vectors may have more
 MOST_XML_CHILDREN: Final = 500
 # E57 3.3: pages of 1024 bytes, the last four of each a checksum.
 _PAGE: Final = 1024

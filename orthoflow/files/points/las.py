@@ -50,6 +50,7 @@ _LAYERED: Final = 3
 _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES: Final = 14
+#: points of a LAZ chunk, or twice those of the file
 MOST_FIXED_CHUNK: Final = 50_000_000
 _WKT_RECORD: Final = 2112
 _GEO_KEYS: Final = 34735
