@@ -110,7 +110,7 @@ def _serve() -> None:
     import orthoflow.workflow.document
     import orthoflow.workflow.views
     from orthoflow.engine.environment import cpu_name, git_commit
-    from orthoflow.report.pages import environment
+    from orthoflow.report.rendering import environment
 
     cpu_name()
     git_commit()

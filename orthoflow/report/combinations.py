@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -138,24 +137,29 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
 
     What was found decides which wall is the first, so that numbers of it may be of different ones.
     """
-    by_room: dict[tuple[Path, str], list[tuple[Combination, _Wall]]] = {}
+    by_room: dict[tuple[Path, str], list[tuple[Combination, tuple[float, ...]]]] = {}
     for one in combinations:
-        wall = _Wall.of(one)
-        if wall is not None:
+        # Of the last step that gives walls.
+        steps = [cell.step for cell in one.cells if gives(cell, Walls.type_name)][-1:]
+        found = [one.measured(step, name) for step in steps for name in _FIRST_WALL]
+        wall = tuple(value.value for value in found if value is not None)
+        if len(wall) == len(_FIRST_WALL):
             room = (one.run.path, one.assignment.get(DATA, ""))
             by_room.setdefault(room, []).append((one, wall))
     told = []
-    for found in by_room.values():
+    for shown in by_room.values():
         # What most of them show is what the odd ones do not.
-        counts = Counter(wall for _, wall in found)
-        usual = max(
-            counts, key=lambda wall: sum(counts[one] for one in counts if wall.is_like(one))
-        )
-        odd = [f"{one.name} shows {wall}" for one, wall in found if not wall.is_like(usual)]
+        walls = [wall for _, wall in shown]
+        usual = max(walls, key=lambda wall: sum(_may_be_one_wall(wall, other) for other in walls))
+        odd = [
+            f"{one.name} shows {_wall_words(wall)}"
+            for one, wall in shown
+            if not _may_be_one_wall(wall, usual)
+        ]
         if odd:
-            n_others = len(found) - len(odd)
+            n_others = len(shown) - len(odd)
             others = "the other shows" if n_others == 1 else f"the {n_others} others show"
-            told.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {usual}")
+            told.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {_wall_words(usual)}")
     if not told:
         return ""
     return (
@@ -165,40 +169,25 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Wall:
-    """Which wall a step that gives walls reports on."""
+# Metrics of the first wall.
+_FIRST_WALL: Final = ("omega_deg", "phi_deg", "area_m2")
 
-    omega_deg: float
-    phi_deg: float
-    area_m2: float
 
-    @classmethod
-    def of(cls, one: Combination) -> _Wall | None:
-        """The first wall of the last step that gives walls; None where none says which it is."""
-        steps = [cell.step for cell in one.cells if gives(cell, Walls.type_name)]
-        values = {
-            name: found.value
-            for name in ("omega_deg", "phi_deg", "area_m2")
-            if steps and (found := one.measured(steps[-1], name)) is not None
-        }
-        return cls(**values) if len(values) == len(fields(cls)) else None
+def _may_be_one_wall(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    """Whether omega, phi and area may be those of one wall, its edges a little elsewhere."""
+    is_turned = angle_between_deg(_normal(*one[:2]), _normal(*other[:2])) >= _TURNED_DEG
+    return not is_turned and max(one[2], other[2]) <= _LARGER * min(one[2], other[2])
 
-    def is_like(self, other: _Wall) -> bool:
-        """Whether it can be the same wall, its edges a little elsewhere."""
-        larger, smaller = max(self.area_m2, other.area_m2), min(self.area_m2, other.area_m2)
-        is_turned = angle_between_deg(self._normal, other._normal) >= _TURNED_DEG
-        return not is_turned and larger <= _LARGER * smaller
 
-    @property
-    def _normal(self) -> NDArray[np.float64]:
-        """(3,) unit vector; markiewicz2015 equation 3, as `omega_phi_deg`."""
-        omega, phi = math.radians(self.omega_deg), math.radians(self.phi_deg)
-        across = math.cos(phi)
-        return np.array([across * math.cos(omega), across * math.sin(omega), math.sin(phi)])
+def _normal(omega_deg: float, phi_deg: float) -> NDArray[np.float64]:
+    """(3,) unit vector; markiewicz2015 equation 3, as `omega_phi_deg`."""
+    omega, phi = math.radians(omega_deg), math.radians(phi_deg)
+    across = math.cos(phi)
+    return np.array([across * math.cos(omega), across * math.sin(omega), math.sin(phi)])
 
-    def __str__(self) -> str:
-        return f"{self.area_m2:.3g} m2 at omega {self.omega_deg:.0f}, phi {self.phi_deg:.0f} deg"
+
+def _wall_words(wall: tuple[float, ...]) -> str:
+    return f"{wall[2]:.3g} m2 at omega {wall[0]:.0f}, phi {wall[1]:.0f} deg"
 
 
 def gives(cell: RecordedCell, *type_names: str) -> bool:
@@ -259,6 +248,65 @@ def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
     found = combinations_of(run)
     chosen = next((one for one in found if one.is_baseline), found[0] if found else None)
     return tuple(cell for cell in chosen.cells if cell.repeat == 0) if chosen else ()
+
+
+def baseline_addresses(run: Run) -> tuple[str, ...]:
+    """The cells whose figures lie beside the page: of the baseline, and before all variants."""
+    baseline = {cell.address for cell in baseline_cells(run)}
+    return tuple(
+        address
+        for address, cell in run.cells.items()
+        if address in baseline or not (cell.assignment or cell.repeat)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """Where on the page the cells of one combination stand, a row of the comparison.
+
+    Attributes:
+        anchor: where the page tells of it.
+        name: the variants in words.
+        cells: addresses of the cells that are shown here.
+        elsewhere: address -> anchor of the combination above that shows it; empty for what stands
+            in the page's own sections.
+    """
+
+    anchor: str
+    name: str
+    cells: tuple[str, ...]
+    elsewhere: Mapping[str, str]
+
+
+def ways(run: Run, prefix: str) -> tuple[Way, ...]:
+    """Return the combinations of a run, each cell with the first that it belongs to.
+
+    Args:
+        run: the run.
+        prefix: what the anchors begin with.
+    """
+    places = dict.fromkeys(baseline_addresses(run), "")
+    found = []
+    for index, one in enumerate(combinations_of(run)):
+        anchor = f"{prefix}way-{index + 1}"
+        addresses = [cell.address for cell in one.varied_cells]
+        own = tuple(address for address in addresses if address not in places)
+        elsewhere = {address: places[address] for address in addresses if address not in own}
+        found.append(Way(anchor=anchor, name=one.name, cells=own, elsewhere=elsewhere))
+        places |= dict.fromkeys(own, anchor)
+    return tuple(found)
+
+
+def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
+    """Cells whose result a later step of the same kind takes further: a first orientation, say."""
+    return frozenset(
+        before.address
+        for address in addresses
+        for before in run.upstream(address)
+        if before.address != address
+        and before.address in addresses
+        and before.method.partition(".")[0] == run.cells[address].method.partition(".")[0]
+    )
 
 
 def wanted_metrics(run: Run) -> tuple[str, ...]:

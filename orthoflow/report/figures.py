@@ -14,9 +14,9 @@ from orthoflow.foreign_text import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
-from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.diagrams import run_diagram
+from orthoflow.report.combinations import baseline_addresses
 from orthoflow.report.pictures import Picture, data_uri
+from orthoflow.report.rendering import graph_file
 
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
 # What the baseline may take of it as it is, before the others share the rest.
@@ -87,16 +87,6 @@ def figure_groups(
     return tuple(groups)
 
 
-def baseline_addresses(run: Run) -> tuple[str, ...]:
-    """The cells whose figures lie beside the page: of the baseline, and before all variants."""
-    baseline = {cell.address for cell in baseline_cells(run)}
-    return tuple(
-        address
-        for address, cell in run.cells.items()
-        if address in baseline or not (cell.assignment or cell.repeat)
-    )
-
-
 def write_figures(
     run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "", as_pdf: bool = False
 ) -> int:
@@ -120,39 +110,29 @@ def write_figures(
         StoreError: the folder cannot be written.
     """
     named = figure_files(run, addresses)
-    contents: dict[str, Callable[[], bytes | None]] = {
-        GRAPH_FILE: lambda: run_diagram(run, stands_alone=True).encode("utf-8")
-    }
+    contents: dict[str, Callable[[], bytes | None]] = {GRAPH_FILE: partial(graph_file, run)}
     for path, figure in named.items():
-        if as_pdf and figure.media_type != "image/svg+xml":
-            name = f"{path.rpartition('.')[0]}.pdf"
-            contents[name] = partial(_as_pdf, figure)
-        else:
-            contents[path] = partial(_content, figure)
+        is_pdf = as_pdf and figure.media_type != "image/svg+xml"
+        name = f"{path.rpartition('.')[0]}.pdf" if is_pdf else path
+        contents[name] = partial(_content, figure, as_pdf=is_pdf)
     way = f"{inside}/" if inside else ""
     written = write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
     return written - 1
 
 
-def _content(figure: RecordedFigure) -> bytes | None:
-    """The bytes of a figure's file; None for one that gets none."""
-    if figure.media_type == "image/webp":
-        # What papers and word processors take.
-        try:
-            return encode_png(decode_image(figure.data, figure.name))
-        except InputError:
-            return None
-    if figure.media_type == "image/svg+xml" and not is_plain_svg(figure.data):
-        return None
-    return figure.data
-
-
-def _as_pdf(figure: RecordedFigure) -> bytes | None:
-    """A picture as a page of a PDF; None for one that is damaged."""
+def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
+    """The bytes of a figure's file; None for one that is damaged, or more than a drawing."""
+    if figure.media_type == "image/svg+xml":
+        return figure.data if is_plain_svg(figure.data) else None
     try:
-        return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)
+        if as_pdf:
+            return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)
+        # PNG is what papers and word processors take.
+        if figure.media_type == "image/webp":
+            return encode_png(decode_image(figure.data, figure.name))
     except InputError:
         return None
+    return figure.data
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:

@@ -3,73 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from html import escape
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Camera, Cameras, Inspection, TieRole, Ties
+from orthoflow.products import Camera, Cameras, Inspection, TieRole
 from orthoflow.records.runs import Run
-from orthoflow.report.pictures import Picture, embedded_products
+from orthoflow.report.pictures import Picture, embedded_products, frame_of
 
 _MARKS_MOST: Final = 600  # in one drawing
 _MARKS_FEW: Final = 50
 _MARKS_IN_ALL: Final = 12_000  # on a page, about 130 bytes each
-# Drawn length of a vector of RMS length, as a share of the drawing's longer side.
+# Drawn length of a vector of RMS length, and of the reference, as shares of the longer side.
 _RMS_SHARE: Final = 0.025
+_REFERENCE_SHARE: Final = 0.08
 _STEP_M: Final = 1e-3  # for derivatives; photos change by about a pixel over it
-# Magnifications are round numbers, so that they can be said.
-_ROUND: Final = np.array([1, 2, 5], dtype=np.float64)
-# Colours of markiewicz2015, Figure 17; shapes say the same to those who cannot tell colours.
-_ROLES: Final[Mapping[int, str]] = {
-    TieRole.CONTROL: "control",
-    TieRole.CHECK: "check",
-    TieRole.REJECTED: "rejected",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overlay:
-    """A drawing over the picture of a wall.
+    """A drawing over the picture of a wall, in its cells.
 
     Attributes:
-        svg: an `<svg>` element with transparent ground.
         title: what it shows.
         caption: magnification and counts, in words.
         cell: address of the cell that gave the vectors.
-        walls_cell: address of the cell that made the wall's raster.
-        wall: index of the wall.
-        name: of the wall.
-        check_rms_mm: RMS of the ties that only check along u and v, None without any.
+        ground: the picture that it lies over.
+        marks: kind, and (column, row) of foot and end, of each vector.
+        reference: words and length of a reference arrow.
     """
 
-    svg: str
     title: str
     caption: str
     cell: str
-    walls_cell: str
-    wall: int
-    name: str
-    check_rms_mm: tuple[float, float] | None
+    ground: Picture
+    marks: Sequence[tuple[str, tuple[float, float, float, float]]]
+    reference: tuple[str, float]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Vectors:
-    """Vectors on one wall.
-
-    Attributes:
-        pixels_wall: (n, 2) float64 (column, row).
-        lengths_m: (n, 2) float64 metres along u and v.
-        kinds: (n,) name of each vector's kind, a CSS class.
-    """
-
-    pixels_wall: NDArray[np.float64]
-    lengths_m: NDArray[np.float64]
-    kinds: NDArray[np.str_]
+    @property
+    def frame(self) -> WallFrame:
+        """Frame of the wall's raster."""
+        return frame_of(self.ground)
 
 
 def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Iterator[Overlay]:
@@ -80,19 +57,74 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
         walls: pictures of its walls, which the drawings lie over.
         share: which part of a page's bytes they may take.
     """
-    places = embedded_products(run, "cameras")
-    n_places = len(places) + len(embedded_products(run, "inspection"))
-    if not n_places:
+    cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
+    # Digest of a walls product -> the first picture of each of its walls.
+    known: dict[str, dict[int, Picture]] = {}
+    for picture in walls:
+        for product in run.cells[picture.cell].outputs.values():
+            if product.type_name == "walls" and picture.frame is not None:
+                known.setdefault(product.digest, {}).setdefault(picture.wall, picture)
+    n_drawings = (len(cameras) + len(inspections)) * max(map(len, known.values()), default=1)
+    most = min(_MARKS_MOST, max(_MARKS_FEW, round(share * _MARKS_IN_ALL / max(1, n_drawings))))
+    for (address, _), payload in zip(cameras, run.payloads(cameras), strict=True):
+        yield from _of_ties(
+            address, Cameras.from_payload(payload), _behind(run, address, known), most
+        )
+    for (address, _), payload in zip(inspections, run.payloads(inspections), strict=True):
+        found = Inspection.from_payload(payload)
+        for wall, ground in _behind(run, address, known).items():
+            here = (found.wall == wall) & np.isfinite(found.displacement_m).all(axis=1)
+            if here.any():
+                lengths_m = found.displacement_m[here]
+                names = np.array(found.kinds)[found.kind[here]]
+                yield _overlay(
+                    address,
+                    ground,
+                    (found.points_world[here], lengths_m, np.full(len(names), "shown")),
+                    f"Displacements in the orthoimage of {ground.name}, {address}",
+                    # The numbers of a method leave out what lies beside depth steps.
+                    f"{_counts(names, lengths_m)}, beside depth steps, too",
+                    most,
+                )
+
+
+def _behind(
+    run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
+) -> Mapping[int, Picture]:
+    """Pictures of the nearest walls that went into a cell."""
+    for cell in run.upstream(address):
+        for given in cell.inputs.values():
+            if given.digest in known:
+                return known[given.digest]
+    return {}
+
+
+def _of_ties(
+    address: str, cameras: Cameras, grounds: Mapping[int, Picture], most: int
+) -> Iterator[Overlay]:
+    ties = cameras.ties
+    if ties is None:
         return
-    frames = _Frames.of(run, walls, share=share / n_places)
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        cameras = Cameras.from_payload(payload)
-        if cameras.ties is not None:
-            yield from _tie_overlays(address, cameras, cameras.ties, frames)
-    places = embedded_products(run, "inspection")
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        inspection = Inspection.from_payload(payload)
-        yield from _inspection_overlays(address, inspection, frames)
+    lengths_m = np.full((len(ties.photo), 2), np.nan)
+    by_name = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
+    for index, name in enumerate(ties.photo_names):
+        for wall, ground in grounds.items() if name in by_name else ():
+            here = (ties.photo == index) & (ties.wall == wall)
+            lengths_m[here] = residuals_on_wall(
+                by_name[name], ties.points_world[here], ties.residual_px[here], frame_of(ground)
+            )
+    kinds = np.array([TieRole(role).name.lower() for role in ties.role.tolist()], dtype=np.str_)
+    for wall, ground in grounds.items():
+        here = np.flatnonzero((ties.wall == wall) & np.isfinite(lengths_m).all(axis=1))
+        if len(here):
+            yield _overlay(
+                address,
+                ground,
+                (ties.points_world[here], lengths_m[here], kinds[here]),
+                f"Ties of {ground.name}, {address}",
+                _counts(kinds[here], lengths_m[here]),
+                most,
+            )
 
 
 def residuals_on_wall(
@@ -101,7 +133,7 @@ def residuals_on_wall(
     residual_px: NDArray[np.float64],
     frame: WallFrame,
 ) -> NDArray[np.float64]:
-    """What residuals in a photo amount to on the wall.
+    """Convert residuals in a photo to the wall.
 
     Args:
         camera: an oriented one.
@@ -115,31 +147,16 @@ def residuals_on_wall(
     viewing = camera.viewing().shifted(frame.origin_world)
     points = points_world - frame.origin_world
     at = viewing.project(points)[:, :2]
-    along_u = (viewing.project(points + _STEP_M * frame.u_world)[:, :2] - at) / _STEP_M
-    along_v = (viewing.project(points + _STEP_M * frame.v_world)[:, :2] - at) / _STEP_M
-    # The 2 x 2 system of each point by Cramer's rule; a wall seen edge-on has no answer.
-    determinant = along_u[:, 0] * along_v[:, 1] - along_u[:, 1] * along_v[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = (residual_px[:, 0] * along_v[:, 1] - residual_px[:, 1] * along_v[:, 0]) / determinant
-        v = (residual_px[:, 1] * along_u[:, 0] - residual_px[:, 0] * along_u[:, 1]) / determinant
-    return np.column_stack([u, v])
-
-
-def draw_vectors(frame: WallFrame, vectors: Vectors, *, label: str, magnification: float) -> str:
-    """Draw vectors with a mark at their foot as an `<svg>` element in the wall's cells."""
-    radius = max(frame.width, frame.height) / 260
-    ends = vectors.pixels_wall + magnification * vectors.lengths_m / frame.gsd_m
-    marks = [
-        _mark(kind, foot, radius) + _line(kind, foot, end)
-        for kind, foot, end in zip(
-            vectors.kinds.tolist(), vectors.pixels_wall.tolist(), ends.tolist(), strict=True
-        )
+    along = [
+        (viewing.project(points + _STEP_M * axis)[:, :2] - at) / _STEP_M
+        for axis in (frame.u_world, frame.v_world)
     ]
-    return (
-        f'<svg class="over" viewBox="0 0 {frame.width} {frame.height}" role="img" '
-        f'aria-label="{escape(shown(label))}" stroke-width="{radius / 2:.3g}">'
-        f"{''.join(marks)}</svg>"
-    )
+    jacobian = np.stack(along, axis=2)
+    found = np.full((len(points), 2), np.nan)
+    # A wall seen edge-on has no answer.
+    solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
+    found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
+    return found
 
 
 def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float:
@@ -148,204 +165,53 @@ def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float
     rms_m = float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else 0.0
     if rms_m == 0.0:
         return 1.0
-    wanted = _RMS_SHARE * max(frame.width, frame.height) * frame.gsd_m / rms_m
-    power = 10.0 ** np.floor(np.log10(wanted))
-    steps = _ROUND[_ROUND * power <= wanted * (1 + 1e-9)]
-    return float(max(1.0, power * steps.max()))
+    return max(1.0, _round_below(_RMS_SHARE * max(frame.width, frame.height) * frame.gsd_m / rms_m))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Known:
-    """A wall that drawings lie over."""
-
-    name: str
-    frame: WallFrame
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Frames:
-    """Finds the wall rasters behind a cell.
-
-    Attributes:
-        run: the run.
-        known: digest of a walls product -> pictures of its walls by their index.
-        cells: digest of a walls product -> the cell whose pictures the page shows.
-        marks_most: in each drawing.
-    """
-
-    run: Run
-    known: Mapping[str, Mapping[int, _Known]]
-    cells: Mapping[str, str]
-    marks_most: int
-
-    @staticmethod
-    def of(run: Run, pictures: Sequence[Picture], *, share: float) -> _Frames:
-        """Take the frames from the pictures of walls."""
-        known: dict[str, dict[int, _Known]] = {}
-        cells: dict[str, str] = {}
-        for picture in pictures:
-            if picture.frame is None:
-                continue
-            for product in run.cells[picture.cell].outputs.values():
-                if product.type_name == "walls":
-                    at = _Known(name=picture.name, frame=picture.frame)
-                    known.setdefault(product.digest, {})[picture.wall] = at
-                    cells[product.digest] = picture.cell
-        n_walls = max((len(frames) for frames in known.values()), default=1)
-        wanted = round(share * _MARKS_IN_ALL / n_walls)
-        return _Frames(
-            run=run,
-            known=known,
-            cells=cells,
-            marks_most=min(_MARKS_MOST, max(_MARKS_FEW, wanted)),
-        )
-
-    def behind(self, address: str) -> tuple[str, Mapping[int, _Known]]:
-        """Address, names and frames of the nearest walls that went into a cell."""
-        for cell in self.run.upstream(address):
-            for given in cell.inputs.values():
-                if given.digest in self.known:
-                    return self.cells[given.digest], self.known[given.digest]
-        return "", {}
-
-
-def _tie_overlays(address: str, cameras: Cameras, ties: Ties, frames: _Frames) -> Iterator[Overlay]:
-    walls_cell, known = frames.behind(address)
-    lengths_m = np.full((len(ties.photo), 2), np.nan)
-    by_name = {camera.photo: camera for camera in cameras.cameras}
-    for index, name in enumerate(ties.photo_names):
-        camera = by_name.get(name)
-        if camera is None or camera.status != "ok":
-            continue
-        for wall, at in known.items():
-            here = (ties.photo == index) & (ties.wall == wall)
-            lengths_m[here] = residuals_on_wall(
-                camera, ties.points_world[here], ties.residual_px[here], at.frame
-            )
-    kinds = np.array([_ROLES[TieRole(role)] for role in ties.role.tolist()], dtype=np.str_)
-    for wall, at in known.items():
-        here = np.flatnonzero((ties.wall == wall) & np.isfinite(lengths_m).all(axis=1))
-        if len(here):
-            vectors = Vectors(
-                pixels_wall=at.frame.wall_from_world(ties.points_world[here])[:, :2],
-                lengths_m=lengths_m[here],
-                kinds=kinds[here],
-            )
-            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, known=at)
-            yield _overlay(place, vectors, what="ties of", marks_most=frames.marks_most)
-
-
-def _inspection_overlays(
-    address: str, inspection: Inspection, frames: _Frames
-) -> Iterator[Overlay]:
-    if not len(inspection.wall):
-        return
-    walls_cell, known = frames.behind(address)
-    for wall, at in known.items():
-        here = np.flatnonzero(
-            (inspection.wall == wall) & np.isfinite(inspection.displacement_m).all(axis=1)
-        )
-        if len(here):
-            vectors = Vectors(
-                pixels_wall=at.frame.wall_from_world(inspection.points_world[here])[:, :2],
-                lengths_m=inspection.displacement_m[here],
-                kinds=np.full(len(here), "shown"),
-            )
-            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, known=at)
-            names = np.array(inspection.kinds)[inspection.kind[here]]
-            yield _overlay(
-                place,
-                vectors,
-                what="displacements in the orthoimage of",
-                marks_most=frames.marks_most,
-                # The numbers of a method leave out what lies beside depth steps.
-                counted=f"{_counts(replace(vectors, kinds=names))}, beside depth steps, too",
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Place:
-    """Where a drawing belongs."""
-
-    cell: str
-    walls_cell: str
-    wall: int
-    known: _Known
+def _round_below(most: float) -> float:
+    """Return the largest of 1, 2, 5, 10 ... that is no larger."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= most * (1 + 1e-9)))
 
 
 def _overlay(
-    place: _Place, vectors: Vectors, *, what: str, marks_most: int, counted: str = ""
+    address: str,
+    ground: Picture,
+    vectors: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]],
+    title: str,
+    counted: str,
+    most: int,
 ) -> Overlay:
-    frame = place.known.frame
-    judged = vectors.kinds != "rejected"
-    magnification = magnification_for(frame, vectors.lengths_m[judged])
-    shown = _spread_evenly(vectors, marks_most)
-    # Rejected ties may be metres off: a mark says that they are there, a vector would cross all.
-    lengths_m = np.where((shown.kinds == "rejected")[:, None], 0.0, shown.lengths_m)
-    shown = Vectors(pixels_wall=shown.pixels_wall, lengths_m=lengths_m, kinds=shown.kinds)
-    caption = f"{counted or _counts(vectors)}; vectors drawn {magnification:g} times as long" + (
-        "" if len(shown.kinds) == len(vectors.kinds) else f", {len(shown.kinds)} of them shown"
-    )
-    title = f"{what} {place.known.name}, {place.cell}"
+    """Draw vectors: world points (n, 3), lengths (n, 2) in metres along u and v, and kinds (n,)."""
+    points_world, lengths_m, kinds = vectors
+    frame = frame_of(ground)
+    magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
+    # Left out evenly. Rejected ties may be metres off: a mark says that they are there.
+    chosen = np.unique(np.linspace(0, len(kinds) - 1, min(most, len(kinds))).astype(np.int64))
+    drawn_m = np.where((kinds == "rejected")[:, None], 0.0, lengths_m)[chosen]
+    feet = frame.wall_from_world(points_world[chosen])[:, :2]
+    ends = np.hstack([feet, feet + magnification * drawn_m / frame.gsd_m])
+    reference_px = _REFERENCE_SHARE * max(frame.width, frame.height)
+    reference_mm = _round_below(1e3 * reference_px * frame.gsd_m / magnification)
+    some = "" if len(chosen) == len(kinds) else f", {len(chosen)} of them shown"
     return Overlay(
-        svg=draw_vectors(frame, shown, label=f"{title}: {caption}", magnification=magnification),
-        title=title[0].upper() + title[1:],
-        caption=caption,
-        cell=place.cell,
-        walls_cell=place.walls_cell,
-        wall=place.wall,
-        name=place.known.name,
-        check_rms_mm=_rms_mm(vectors, "check") if "check" in vectors.kinds else None,
+        title=title,
+        caption=f"{counted}; vectors drawn {magnification:g} times as long{some}",
+        cell=address,
+        ground=ground,
+        marks=[
+            (kind, (row[0], row[1], row[2], row[3]))
+            for kind, row in zip(kinds[chosen].tolist(), ends.tolist(), strict=True)
+        ],
+        reference=(f"{reference_mm:g} mm", 1e-3 * reference_mm * magnification / frame.gsd_m),
     )
 
 
-def _rms_mm(vectors: Vectors, kind: str) -> tuple[float, float]:
-    u, v = 1e3 * np.sqrt(np.mean(vectors.lengths_m[vectors.kinds == kind] ** 2, axis=0))
-    return float(u), float(v)
-
-
-def _counts(vectors: Vectors) -> str:
+def _counts(kinds: NDArray[np.str_], lengths_m: NDArray[np.float64]) -> str:
     parts = []
-    for kind in dict.fromkeys(vectors.kinds.tolist()):
-        here = vectors.kinds == kind
-        u, v = _rms_mm(vectors, kind)
+    for kind in dict.fromkeys(kinds.tolist()):
+        here = kinds == kind
+        u, v = 1e3 * np.sqrt(np.mean(lengths_m[here] ** 2, axis=0))
         rms = "" if kind == "rejected" else f" (RMS {u:.2f} mm along u, {v:.2f} mm along v)"
         parts.append(f"{int(here.sum())} {kind}{rms}")
     return ", ".join(parts)
-
-
-def _spread_evenly(vectors: Vectors, most: int) -> Vectors:
-    n_vectors = len(vectors.kinds)
-    if n_vectors <= most:
-        return vectors
-    chosen = np.unique(np.linspace(0, n_vectors - 1, most).astype(np.int64))
-    return Vectors(
-        pixels_wall=vectors.pixels_wall[chosen],
-        lengths_m=vectors.lengths_m[chosen],
-        kinds=vectors.kinds[chosen],
-    )
-
-
-def _mark(kind: str, foot: Sequence[float], radius: float) -> str:
-    u, v = foot
-    if kind == "check":
-        side = 2 * radius
-        return (
-            f'<rect class="{kind}" x="{u - radius:.1f}" y="{v - radius:.1f}" '
-            f'width="{side:.3g}" height="{side:.3g}"/>'
-        )
-    if kind == "rejected":
-        return (
-            f'<path class="{kind}" d="M{u - radius:.1f} {v - radius:.1f}L{u + radius:.1f} '
-            f"{v + radius:.1f}M{u - radius:.1f} {v + radius:.1f}L{u + radius:.1f} "
-            f'{v - radius:.1f}"/>'
-        )
-    return f'<circle class="{escape(kind)}" cx="{u:.1f}" cy="{v:.1f}" r="{radius:.3g}"/>'
-
-
-def _line(kind: str, foot: Sequence[float], end: Sequence[float]) -> str:
-    if end == foot:
-        return ""
-    return (
-        f'<path class="{escape(kind)}" d="M{foot[0]:.1f} {foot[1]:.1f}L{end[0]:.1f} {end[1]:.1f}"/>'
-    )

@@ -2,102 +2,62 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import os
-import re
-import secrets
-import shlex
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib.resources import files
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Final
-from urllib.parse import quote
-
-import jinja2
-from markupsafe import Markup, escape
 
 from orthoflow.errors import StoreError
-from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
-from orthoflow.records import COSTS, RecordedCell
+from orthoflow.records import RecordedCell
 from orthoflow.records.comparison import compare_runs
 from orthoflow.records.datasets import pages_of, parts_of
-from orthoflow.records.deliverables import DeliveredWall, delivered_walls
+from orthoflow.records.deliverables import delivered_walls
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.runs import FIGURES_FOLDER, Run, figure_files
-from orthoflow.records.tables import CommonPoints, common_points
+from orthoflow.records.tables import common_points
 from orthoflow.records.verification import sealed_page
-from orthoflow.records.wall_results import UncountedPoints, uncounted_points
-from orthoflow.report.combinations import baseline_cells, is_missing
-from orthoflow.report.comparisons import ComparisonTable, comparison_table
-from orthoflow.report.cursors import cursor_places
-from orthoflow.report.curves import Curve, curves, curves_over
-from orthoflow.report.dataset_tables import DatasetTable, dataset_table
+from orthoflow.records.wall_results import uncounted_points
+from orthoflow.report.combinations import (
+    baseline_addresses,
+    baseline_cells,
+    improved_on,
+    is_missing,
+    ways,
+)
+from orthoflow.report.comparisons import comparison_table
+from orthoflow.report.curves import curves, curves_over
+from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
-from orthoflow.report.environments import told_apart
-from orthoflow.report.figures import (
-    FigureGroup,
-    baseline_addresses,
-    figure_groups,
-    write_figures,
-)
-from orthoflow.report.legends import depth_gradient
-from orthoflow.report.numbers import number, number_with_unit
-from orthoflow.report.overlays import overlays
-from orthoflow.report.paired import MetricOverDatasets, over_datasets, who_leads
-from orthoflow.report.photo_plans import PhotoPlan, photo_plan
+from orthoflow.report.figures import FigureGroup, figure_groups, write_figures
+from orthoflow.report.overlays import Overlay, overlays
+from orthoflow.report.paired import over_datasets, who_leads
+from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import (
-    DIVERGING,
     Picture,
+    cursor_places,
     embedded_products,
     orthoimage_pictures,
     sliders,
     wall_pictures,
 )
-from orthoflow.report.plane_tables import PlaneTable, plane_tables
-from orthoflow.report.summaries import (
-    Answer,
-    Limit,
-    answers,
-    citations,
-    limits,
-    results,
-    says_how_far_off,
-)
-from orthoflow.report.ways import Way, improved_on, ways
-from orthoflow.version import __version__
+from orthoflow.report.rendering import environment, write_whole
+from orthoflow.report.summaries import answers, citations, limits, results, says_how_far_off
+from orthoflow.report.tables import PlaneTables, plane_tables
 
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
-
-# Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
-_DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
 
 # Pages that exports write where no other folder is named.
 _VIEWERS: Final = {
     "model of the room": Path("export/gltf/room.html"),
     "orthoimages to measure on": Path("export/tiles/index.html"),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Ground:
-    """A drawing and the id of the picture that it lies over."""
-
-    svg: Markup
-    title: str
-    caption: str
-    ground: str
-    cell: str
-    wall: str
-    check_rms_mm: tuple[float, float] | None
+_NO_DOUBTS: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +67,8 @@ class _Part:
     cells: tuple[RecordedCell, ...] = ()
     orthoimages: tuple[Picture, ...] = ()
     walls: tuple[Picture, ...] = ()
-    overlays: tuple[_Ground, ...] = ()
-    planes: tuple[PlaneTable, ...] = ()
+    overlays: tuple[Overlay, ...] = ()
+    planes: tuple[PlaneTables, ...] = ()
     figures: tuple[FigureGroup, ...] = ()
 
     def of(self, addresses: Collection[str]) -> _Part:
@@ -123,44 +83,8 @@ class _Part:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Section:
-    """All that the templates need of one run."""
-
-    run: Run
-    prefix: str
-    answers: tuple[Answer, ...]
-    limits: tuple[Limit, ...]
-    delivered: tuple[DeliveredWall, ...]
-    results: Mapping[str, tuple[str, ...]]
-    comparison: ComparisonTable | None
-    curves: tuple[Curve, ...]
-    common_points: tuple[CommonPoints, ...]
-    main: _Part
-    earlier: frozenset[str]
-    ways: tuple[tuple[Way, _Part], ...]
-    sliders: list[dict[str, object]]
-    places: list[dict[str, object]]
-    photos: tuple[str, ...]
-    plan: PhotoPlan | None
-    diagram: Markup
-    record_file: str
-    citations: Mapping[str, tuple[str, ...]]
-    viewers: Mapping[str, str]
-    files: Mapping[str, Mapping[str, str]]
-    title: str = ""
-    whole: str = ""
-    doubt: str = ""
-    is_measured: bool = True
-    is_unfinished: bool = False
-    uncounted: UncountedPoints | None = None
-    datasets: DatasetTable | None = None
-    over: tuple[MetricOverDatasets, ...] = ()
-    leads: str = ""
-
-
 def write_page(
-    run: Run, path: Path, *, go_on: str = "", doubts: Mapping[Path, str] = MappingProxyType({})
+    run: Run, path: Path, *, go_on: str = "", doubts: Mapping[Path, str] = _NO_DOUBTS
 ) -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
@@ -187,20 +111,14 @@ def write_page(
         parts = parts_of(opened)
         for name, page in pages.items():
             target = path.parent / page
-            title = f"{run.record.name}: {name}"
-            place = _Place(
-                folder=target.parent, title=title, whole=f"../{path.name}", doubts=doubts
-            )
-            _write([parts[name]], target, place)
-        place = _Place(
-            folder=path.parent,
-            title=run.record.name,
-            go_on=go_on,
-            doubts=doubts,
-            pages=pages,
-            has_figures=True,
-        )
-        _write([opened], path, place)
+            section = _section(parts[name], "r1-", target.parent, doubts)
+            section.title, section.whole = f"{run.record.name}: {name}", f"../{path.name}"
+            _write([parts[name]], [section], target, section.title)
+        if pages:
+            section = _overview(opened, "r1-", path.parent, pages)
+        else:
+            section = _section(opened, "r1-", path.parent, doubts, with_files=True)
+        _write([opened], [section], path, run.record.name, go_on=go_on)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
@@ -209,7 +127,7 @@ def write_report(
     path: Path,
     *,
     go_on: str = "",
-    doubts: Mapping[Path, str] = MappingProxyType({}),
+    doubts: Mapping[Path, str] = _NO_DOUBTS,
     stores: Sequence[Store] = (),
 ) -> None:
     """Write one self-contained HTML file about one or more runs.
@@ -225,9 +143,14 @@ def write_report(
         StoreError: the file cannot be written.
         RecordError: a record is damaged.
     """
+    sections = [
+        _overview(run, f"r{index}-", path.parent, {})
+        if pages_of(run)
+        else _section(run, f"r{index}-", path.parent, doubts, share=1 / len(runs))
+        for index, run in enumerate(runs, start=1)
+    ]
     title = ", ".join(dict.fromkeys(run.record.name for run in runs))
-    place = _Place(folder=path.parent, title=title, go_on=go_on, doubts=doubts, stores=stores)
-    _write(runs, path, place)
+    _write(runs, sections, path, title, go_on=go_on, stores=stores)
 
 
 def _make_folder(folder: Path) -> None:
@@ -240,170 +163,81 @@ def _make_folder(folder: Path) -> None:
         raise StoreError(f"{folder} cannot be made: {error.strerror}") from error
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Place:
-    """Where a page stands among others.
-
-    Attributes:
-        folder: that the page lies in.
-        title: of the page.
-        go_on: of a run that was interrupted, the command that goes on with it.
-        doubts: record -> why nobody should rely on it.
-        pages: dataset -> its own page; empty for a page that leads to none.
-        whole: the page of all datasets, for the one of a single dataset.
-        has_figures: the figures' own files are written beside it.
-        stores: where products are that the records of two runs only name.
-    """
-
-    folder: Path
-    title: str
-    go_on: str = ""
-    doubts: Mapping[Path, str] = field(default_factory=dict)
-    pages: Mapping[str, str] = field(default_factory=dict)
-    whole: str = ""
-    has_figures: bool = False
-    stores: Sequence[Store] = ()
-
-
-def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
+def _write(
+    runs: Sequence[Run],
+    sections: Sequence[SimpleNamespace],
+    path: Path,
+    title: str,
+    *,
+    go_on: str = "",
+    stores: Sequence[Store] = (),
+) -> None:
     text = (
         environment()
         .get_template("page.html.j2")
         .render(
-            sections=[
-                (_overview if pages_of(run) else _section)(
-                    run, f"r{index + 1}-", place, share=1 / len(runs)
-                )
-                for index, run in enumerate(runs)
-            ],
+            sections=sections,
             comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
-            differences=differences(compare_runs(*runs, stores=place.stores))
-            if len(runs) == 2
-            else None,
-            title=place.title,
-            go_on=place.go_on,
+            differences=differences(compare_runs(*runs, stores=stores)) if len(runs) == 2 else None,
+            title=title,
+            go_on=go_on,
         )
     )
     write_whole(path, sealed_page(text, runs))
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a page, as a whole or not at all.
+def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> SimpleNamespace:
+    """Describe a run on several datasets, whose pictures and figures stand on own pages.
 
-    Raises:
-        StoreError: it cannot be written.
+    Args:
+        run: the run.
+        prefix: what the anchors begin with.
+        folder: that the page lies in.
+        pages: dataset -> its own page; empty for a page that leads to none.
     """
-    aside = path.with_name(f".report-{secrets.token_hex(8)}")
-    try:
-        # A new file: through a link that lies there it would be another's.
-        with aside.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-        aside.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            aside.unlink()
-        raise StoreError(
-            f"the report {path} cannot be written: {error.strerror}; choose another place with -o"
-        ) from error
-
-
-@cache
-def environment() -> jinja2.Environment:
-    """Return the templates, with what all pages share."""
-    environment = jinja2.Environment(
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_shown,
-        loader=jinja2.PackageLoader("orthoflow.report"),
-    )
-    environment.filters["with_unit"] = number_with_unit
-    environment.filters["number"] = number
-    environment.filters["environments"] = told_apart
-    environment.filters["cited"] = cited
-    environment.filters["breakable"] = _breakable
-    environment.filters["urlpath"] = quote
-    environment.filters["shell"] = shlex.quote
-    environment.filters["drawing"] = Markup
-    environment.globals["costs"] = COSTS
-    environment.globals["version"] = __version__
-    environment.globals["depth_gradient"] = Markup(depth_gradient(DIVERGING.tolist()))
-    # Ours, and no template: braces in them mean nothing.
-    css, early, script = (_packaged(name) for name in ("page.css", "early.js", "page.js"))
-    environment.globals["css"] = Markup(css)
-    environment.globals["early_script"] = Markup(early)
-    environment.globals["script"] = Markup(script)
-    environment.globals["policy"] = (
-        "default-src 'none'; img-src data:; "
-        f"style-src {_hash_source(css)}; script-src {_hash_source(early)} {_hash_source(script)}; "
-        "base-uri 'none'; form-action 'none'"
-    )
-    return environment
-
-
-def _shown(value: object) -> object:
-    """Write out what turns reading round; what is markup already was made of escaped parts."""
-    is_text = isinstance(value, str) and not isinstance(value, Markup)
-    return shown(str(value), keep="\n\t") if is_text else value
-
-
-def _hash_source(text: str) -> str:
-    """Name a style or a script for the policy of the page, by its content."""
-    digest = hashlib.sha256(text.encode("utf-8")).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
-
-
-def _packaged(name: str) -> str:
-    return files("orthoflow.report").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-def cited(citation: str) -> Markup:
-    """Escape a citation and make its DOI a link: a page that links needs no network itself."""
-    return Markup(
-        _DOI.sub(
-            lambda found: (
-                f'<a href="https://doi.org/{quote(found[1], safe="/.()-;")}">doi:{found[1]}</a>'
-            ),
-            str(escape(shown(citation))),
-        )
-    )
-
-
-def _breakable(name: str) -> Markup:
-    """Let a long name or address be broken behind its underscores, and before its variants."""
-    return Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name)))))
-
-
-def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
-    """Describe a run on several datasets, whose pictures and figures stand on own pages."""
     parts = parts_of(run)
     over = over_datasets(parts)
-    empty = replace(run, record=replace(run.record, cells=()))
-    return replace(
-        _section(empty, prefix, place, share=share),
+    section = _section(replace(run, record=replace(run.record, cells=())), prefix, folder)
+    vars(section).update(
         run=run,
-        title=run.record.name,
         limits=limits(run),
         results=results(run),
-        diagram=Markup(run_diagram(next(iter(parts.values())))),
+        diagram=run_diagram(next(iter(parts.values()))),
         citations=citations(run),
-        datasets=dataset_table(parts, place.pages),
+        datasets=dataset_table(parts, pages),
         curves=curves_over(parts),
         over=over,
         leads=who_leads(over, len(parts)),
     )
+    return section
 
 
-def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
+def _section(
+    run: Run,
+    prefix: str,
+    folder: Path,
+    doubts: Mapping[Path, str] = _NO_DOUBTS,
+    *,
+    share: float = 1.0,
+    with_files: bool = False,
+) -> SimpleNamespace:
+    """Collect all that the templates need of one run.
+
+    Args:
+        run: the run.
+        prefix: what the anchors begin with.
+        folder: that the page lies in; files are named from there.
+        doubts: record -> why nobody should rely on it.
+        share: which part of the page's bytes pictures may take.
+        with_files: the figures' own files are written beside the page.
+    """
+    from_page = Path(os.path.relpath(run.folder, folder))
     # The baseline's stand first: they are what the numbers beside them are of.
     baseline = {cell.address for cell in baseline_cells(run)}
     orthoimages, walls = (
         sorted(pictures(run, share=share), key=lambda picture: picture.cell not in baseline)
         for pictures in (orthoimage_pictures, wall_pictures)
     )
-    # Files are named from where the page will lie.
-    from_page = Path(os.path.relpath(run.folder, place.folder))
     numbered = [
         replace(
             picture,
@@ -417,18 +251,22 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         cells=tuple(cell for cell in run.record.cells if cell.repeat == 0),
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),
-        overlays=_grounded(run, walls, share=share),
+        overlays=tuple(overlays(run, walls, share=share)),
         planes=plane_tables(run),
-        figures=figure_groups(run, share=share, with_files=place.has_figures),
+        figures=figure_groups(run, share=share, with_files=with_files),
     )
     main = baseline_addresses(run)
     on_show = next((picture.name for picture in every.of(main).orthoimages), "")
     is_measured = says_how_far_off(run)
-    shown_ways = ways(run, prefix)
     comparison = comparison_table([run])
-    return _Section(
+    places = embedded_products(run, "cameras")
+    photographed = [Cameras.from_payload(payload) for payload in run.payloads(places)]
+    return SimpleNamespace(
         run=run,
         prefix=prefix,
+        title=run.record.name,
+        whole="",
+        doubt=doubts.get(run.path, ""),
         answers=answers(run),
         is_measured=is_measured,
         is_unfinished=any(is_missing(cell) for cell in run.record.cells),
@@ -441,13 +279,12 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         common_points=common_points(run) if comparison else (),
         main=every.of(main),
         earlier=improved_on(run, main),
-        ways=tuple((way, every.of(way.cells)) for way in shown_ways) if comparison else (),
-        sliders=_slider_data(numbered, len(orthoimages)),
+        ways=[(way, every.of(way.cells)) for way in ways(run, prefix)] if comparison else [],
+        sliders=sliders(numbered, len(orthoimages)),
         places=cursor_places(orthoimages, walls),
-        photos=_photo_names(run),
+        photos=sorted({camera.photo for one in photographed for camera in one.cameras}),
         plan=photo_plan(run, walls),
-        # Built from escaped parts only, as the overlays are.
-        diagram=Markup(run_diagram(run)),
+        diagram=run_diagram(run),
         record_file=(from_page / run.file_name).as_posix(),
         citations=citations(run),
         viewers={
@@ -456,68 +293,19 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
             if (run.folder / page).is_file()
         },
         files=_files(run, from_page),
-        title=place.title if place.whole else run.record.name,
-        whole=place.whole,
-        doubt=place.doubts.get(run.path, ""),
+        datasets=None,
+        over=(),
+        leads="",
     )
 
 
-def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Ground, ...]:
-    """What is drawn over pictures of walls, each with the picture that it lies over."""
-    grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
-    return tuple(
-        _Ground(
-            svg=Markup(overlay.svg),
-            title=overlay.title,
-            caption=overlay.caption,
-            ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
-            cell=overlay.cell,
-            wall=overlay.name,
-            check_rms_mm=overlay.check_rms_mm,
-        )
-        for overlay in overlays(run, walls, share=share)
-    )
-
-
-def _files(run: Run, from_page: Path) -> dict[str, dict[str, str]]:
+def _files(run: Run, from_page: Path) -> Mapping[str, Mapping[str, str]]:
     """The files that cells published: address -> name -> where it lies from the page."""
     published = {file.path for file in run.record.published}
-    found = {
-        address: {
-            path.name: (from_page / PRODUCTS_FOLDER / path.parent.name / path.name).as_posix()
-            for path in files
-            if path.name != METRICS_FILE and path.relative_to(run.folder).as_posix() in published
-        }
-        for address, files in run.files.items()
-    }
-    return defaultdict(dict, {address: files for address, files in found.items() if files})
-
-
-def _photo_names(run: Run) -> tuple[str, ...]:
-    """Names of the photos that were oriented, or were to be."""
-    places = embedded_products(run, "cameras")
-    found = [Cameras.from_payload(payload) for payload in run.payloads(places)]
-    return tuple(sorted({camera.photo for cameras in found for camera in cameras.cameras}))
-
-
-def _slider_data(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
-    """What the page's script needs to know of pictures that show the same place."""
-    return [
-        {
-            "name": shown(slider.name),
-            "ratio": slider.ratio,
-            "pictures": [
-                {
-                    "id": pictures[laid.picture].id,
-                    "title": shown(laid.title),
-                    "layer": shown(pictures[laid.picture].layer),
-                    "left": laid.left,
-                    "top": laid.top,
-                    "width": laid.width,
-                    "height": laid.height,
-                }
-                for laid in slider.pictures
-            ],
-        }
-        for slider in sliders(pictures, n_orthoimages)
-    ]
+    found: dict[str, dict[str, str]] = defaultdict(dict)
+    for address, paths in run.files.items():
+        for path in paths:
+            if path.name != METRICS_FILE and path.relative_to(run.folder).as_posix() in published:
+                place = from_page / PRODUCTS_FOLDER / path.parent.name / path.name
+                found[address][path.name] = place.as_posix()
+    return found

@@ -16,30 +16,11 @@ from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
 from orthoflow.report.charts import ChartFormat, PlanPhoto, PlanWall, as_image, plan_chart
 from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.numbers import number
 from orthoflow.report.pictures import Picture, embedded_products
+from orthoflow.report.tables import Table
 
 _LEVEL: Final = 1.0 - 1e-6
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotoRow:
-    """How well one photo is oriented.
-
-    Attributes:
-        name: of the photo.
-        status: `ok`, or why it is not oriented.
-        n_control: ties that determine its pose; None where the orientation hands on no ties.
-        n_check: ties that were withheld and agree, likewise.
-        check_mm: RMS of a coordinate of these on the wall; None without any.
-        sigma_wall_mm: expected error of a coordinate on the wall; None where none is stated.
-    """
-
-    name: str
-    status: str
-    n_control: int | None = None
-    n_check: int | None = None
-    check_mm: float | None = None
-    sigma_wall_mm: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +32,7 @@ class PhotoPlan:
         photos: likewise, those that are oriented.
         caption: what it shows, and which photos are missing, in words.
         cell: address of the orientation.
-        rows: a row per photo; none where nothing is known of any but its pose.
+        table: how well each photo is oriented; without rows where only poses are known.
         is_map: the axes are the world's x and y.
     """
 
@@ -59,7 +40,7 @@ class PhotoPlan:
     photos: tuple[PlanPhoto, ...]
     caption: str
     cell: str
-    rows: tuple[PhotoRow, ...] = ()
+    table: Table
     is_map: bool = True
 
     @property
@@ -106,33 +87,40 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
                 is_map=bool(up[2] > _LEVEL),
                 caption=_caption(address, cameras, oriented),
                 cell=address,
-                rows=_rows(orientation),
+                table=_table(orientation),
             )
     return None
 
 
-def _rows(orientation: Cameras) -> tuple[PhotoRow, ...]:
+def _table(orientation: Cameras) -> Table:
     squares: dict[str, list[float]] = {}
     for residual in orientation.residual_table:
         if (residual.role, residual.unit) == ("check", "mm"):
             squares.setdefault(residual.photo, []).append(residual.rmse**2)
     cameras, ties = orientation.cameras, orientation.ties
-    is_stated = any(camera.sigma_wall_m is not None for camera in cameras)
-    if not (squares or is_stated or ties is not None):
-        return ()
+    is_known = bool(squares) or ties is not None
+    is_known |= any(camera.sigma_wall_m is not None for camera in cameras)
     control, check = (_counts(ties, role) for role in (TieRole.CONTROL, TieRole.CHECK))
-    return tuple(
-        PhotoRow(
-            name=camera.photo,
-            status=camera.status,
-            n_control=None if ties is None else control.get(camera.photo, 0),
-            n_check=None if ties is None else check.get(camera.photo, 0),
-            check_mm=_mean_root(squares.get(camera.photo, [])),
-            sigma_wall_mm=None if camera.sigma_wall_m is None else 1000 * camera.sigma_wall_m,
-        )
-        if camera.status == "ok"
-        else PhotoRow(name=camera.photo, status=camera.status)
-        for camera in cameras
+    rows = []
+    for camera in cameras if is_known else ():
+        values = ["-"] * 4
+        if camera.status == "ok":
+            if camera.sigma_wall_m is not None:
+                values[0] = number(1000 * camera.sigma_wall_m, significant=3)
+            if own := squares.get(camera.photo):
+                values[1] = number(math.sqrt(sum(own) / len(own)), significant=3)
+            if ties is not None:
+                values[2:] = [str(counts.get(camera.photo, 0)) for counts in (check, control)]
+        rows.append((camera.photo, *values, camera.status))
+    return Table(
+        name="photos",
+        caption="how well each photo is oriented, of one coordinate on the wall",
+        head=(
+            *("photo", "expected error / mm", "check points, RMS / mm"),
+            *("check points", "control points", "status"),
+        ),
+        rows=tuple(rows),
+        numeric=frozenset({1, 2, 3, 4}),
     )
 
 
@@ -142,10 +130,6 @@ def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
         return {}
     counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
     return dict(zip(ties.photo_names, counts.tolist(), strict=True))
-
-
-def _mean_root(squares: Sequence[float]) -> float | None:
-    return math.sqrt(sum(squares) / len(squares)) if squares else None
 
 
 def _up(run: Run) -> NDArray[np.float64]:

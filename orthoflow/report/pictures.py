@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
+from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.levels import eight_bits
@@ -27,8 +28,6 @@ from orthoflow.products import (
 )
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.cursors import CoarseDepths, coarse_depths
-from orthoflow.report.legends import depth_bar, scale_bar
 
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
@@ -39,6 +38,10 @@ _FULL_PICTURES: Final = 24
 # 0.15 bytes each.
 _CLOSE_CELLS: Final = 12_000_000
 
+# Depths are told to a millimetre at so many places of a wall, some 40 kB of a page.
+_PLACES_MOST: Final = 8_000
+# The bar of the scale takes this share of the picture's width, at most.
+_BAR_SHARE: Final = 0.3
 # From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
 # red-green blindness. Colours of the classes RdBu, Brewer 2003.
 DIVERGING: Final = np.array(
@@ -71,8 +74,9 @@ class Picture:
         name: of that wall.
         frame: where it lies in the world, None for what is no raster of a wall.
         id: name of its place on the page; empty where nothing refers to it.
-        depths: of the wall, where it shows its depth.
-        legend: `<svg>` elements that stand under it: scale, and what its colours mean.
+        depths: `columns` and `rows` of a coarse grid, and `mm` row by row, None where unknown; of
+            a picture of depth.
+        depth_limit_m: depth of the last of its colours; the first is as far behind the plane.
         reading: how to read it and what would be bad, a sentence.
     """
 
@@ -86,14 +90,23 @@ class Picture:
     name: str = ""
     frame: WallFrame | None = None
     id: str = ""
-    depths: CoarseDepths | None = None
-    legend: str = ""
+    depths: Mapping[str, object] | None = None
+    depth_limit_m: float | None = None
     reading: str = ""
 
     @property
     def width_m(self) -> float:
         """Width on the wall, metres; 0 for what is no raster of a wall."""
         return self.frame.width * self.frame.gsd_m if self.frame is not None else 0.0
+
+    @property
+    def scale(self) -> tuple[str, float]:
+        """A round length, 1, 2 or 5 times a power of ten, and its share of the width in percent."""
+        most_m = _BAR_SHARE * self.width_m
+        power = 10.0 ** math.floor(math.log10(most_m))
+        length_m = float(f"{power * max(k for k in (1, 2, 5) if k * power <= most_m):.1g}")
+        words = f"{length_m:g} m" if length_m >= 1.0 else f"{100.0 * length_m:g} cm"
+        return words, 100.0 * length_m / self.width_m
 
     @property
     def layer(self) -> str:
@@ -137,8 +150,8 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
     places = [place for place in embedded_products(run, "orthoimages") if place[0] in addresses]
     for (address, _), payload in zip(places[-1:], run.payloads(places[-1:]), strict=True):
         for image in Orthoimages.from_payload(payload).images:
-            drawing = _orthoimage(run, address, image)
-            return data_uri(drawing.draw(longest_side_px), "image/webp")
+            draw, _ = _orthoimage(run, address, image)
+            return data_uri(draw(longest_side_px), "image/webp")
     return ""
 
 
@@ -161,19 +174,8 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         yield from _drawn(drawings, n_products=len(places) / share)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Drawing:
-    """A picture of a wall that is still to be drawn.
-
-    Attributes:
-        draw: gives the file, so many pixels long.
-        frame: of the wall.
-        picture: all but the file; its legend says what the colours mean.
-    """
-
-    draw: Callable[[int], bytes]
-    frame: WallFrame
-    picture: Picture
+# What gives the file, so many pixels long, and the picture of it, which has a frame.
+_Drawing = tuple[Callable[[int], bytes], Picture]
 
 
 def _drawn(
@@ -188,15 +190,13 @@ def _drawn(
     """
     small_px = side_px(n_products * len(drawings))
 
-    def longest_px(frame: WallFrame) -> int:
-        shorter, longer = sorted((frame.width, frame.height))
-        return max(small_px, int(math.sqrt(close_cells * longer / shorter)))
+    def content(drawing: _Drawing) -> bytes:
+        draw, picture = drawing
+        shorter, longer = sorted((frame_of(picture).width, frame_of(picture).height))
+        return draw(max(small_px, int(math.sqrt(close_cells * longer / shorter))))
 
-    contents = in_order(lambda drawing: drawing.draw(longest_px(drawing.frame)), drawings)
-    for drawing, content in zip(drawings, contents, strict=True):
-        picture = drawing.picture
-        legend = picture.legend + scale_bar(picture.width_m)
-        yield replace(picture, uri=data_uri(content, "image/webp"), legend=legend)
+    for (_, picture), data in zip(drawings, in_order(content, drawings), strict=True):
+        yield replace(picture, uri=data_uri(data, "image/webp"))
 
 
 def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
@@ -204,10 +204,9 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         return eight_bits(image.rgb[part]), is_shown(image.mask[part])
 
-    return _Drawing(
-        draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
-        frame=image.frame,
-        picture=Picture(
+    return (
+        lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
+        Picture(
             uri="",
             title=_title(image.name, address),
             caption=f"{frame_words(image.frame)}; of all cells {_states(image)}",
@@ -246,17 +245,16 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         return depth_colours(wall.depth_m[part], limit_m), wall.mask[part] != SurfaceMask.VOID
 
-    return _Drawing(
-        draw=lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
-        frame=wall.frame,
-        picture=replace(
+    return (
+        lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
+        replace(
             _raster(run, address, index, wall, "depth"),
             caption=f"{_percent(known)} of the cells known"
             + (f"; causes of the others: log of {address}" if known < 1.0 and log else ""),
             reading="Relief shows as even colours with sharp edges; stripes, or a slope over the "
             "whole wall, are scans or a plane that do not fit.",
             depths=coarse_depths(wall.depth_m),
-            legend=depth_bar(limit_m),
+            depth_limit_m=limit_m,
         ),
     )
 
@@ -264,10 +262,9 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
 def _intensity(
     run: Run, address: str, index: int, wall: Wall, intensity: NDArray[np.float32], source: str
 ) -> _Drawing:
-    return _Drawing(
-        draw=lambda side: cells_webp(intensity.shape, grey_cells(intensity), longest_side_px=side),
-        frame=wall.frame,
-        picture=replace(
+    return (
+        lambda side: cells_webp(intensity.shape, grey_cells(intensity), longest_side_px=side),
+        replace(
             _raster(run, address, index, wall, "intensity"),
             caption={
                 "laser": "laser intensity",
@@ -345,95 +342,113 @@ def _percent(share: float) -> str:
     return f"{100 * float(share):.1f} %"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Laid:
-    """A picture laid into the rectangle of another, in percent of that one's sides."""
+def coarse_depths(depth_m: NDArray[np.float32]) -> dict[str, object]:
+    """Return `columns`, `rows` and `mm` in the middle of each cell of a coarse grid."""
+    height, width = depth_m.shape
+    step = max(1.0, math.sqrt(width * height / _PLACES_MOST))
+    columns, rows = max(1, round(width / step)), max(1, round(height / step))
+    at_columns = ((np.arange(columns) + 0.5) * width / columns).astype(np.intp)
+    at_rows = ((np.arange(rows) + 0.5) * height / rows).astype(np.intp)
+    picked = np.rint(1000.0 * depth_m[np.ix_(at_rows, at_columns)].astype(np.float64)).ravel()
+    depths = [int(value) if math.isfinite(value) else None for value in picked.tolist()]
+    return {"columns": columns, "rows": rows, "mm": depths}
 
-    picture: int
-    title: str
-    left: float
-    top: float
-    width: float
-    height: float
 
+def cursor_places(
+    orthoimages: Sequence[Picture], walls: Sequence[Picture]
+) -> list[dict[str, object]]:
+    """Return where the cells of each orthoimage lie in the world, for the page's script.
 
-@dataclass(frozen=True, kw_only=True)
-class Slider:
-    """Pictures of one wall.
-
-    Attributes:
-        name: the wall.
-        ratio: width over height of the rectangle.
-        pictures: at least two, orthoimages first.
+    Args:
+        orthoimages: pictures of orthoimages.
+        walls: pictures of walls, of which those of the depth know it.
     """
+    places: list[dict[str, object]] = []
+    for picture in orthoimages:
+        if (frame := picture.frame) is not None:
+            fitting = (
+                other.depths
+                for other in walls
+                if other.depths and other.frame and frame.has_cells_of(other.frame)
+            )
+            places.append(
+                {
+                    "id": picture.id,
+                    "wall": picture.number,
+                    "name": shown(picture.name),
+                    "origin": frame.origin_world.tolist(),
+                    "u": frame.u_world.tolist(),
+                    "v": frame.v_world.tolist(),
+                    "n": frame.normal_world.tolist(),
+                    "gsd": frame.gsd_m,
+                    "width": frame.width,
+                    "height": frame.height,
+                    **next(fitting, {"columns": 0, "rows": 0, "mm": []}),
+                }
+            )
+    return places
 
-    name: str
-    ratio: float
-    pictures: tuple[Laid, ...]
 
-
-def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> tuple[Slider, ...]:
-    """Group pictures by the place that they show.
+def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
+    """Group pictures by the place that they show, for the page's script.
 
     Args:
         pictures: orthoimages first, then rasters of walls.
         n_orthoimages: how many of them are orthoimages; each of the groups has at least one.
+
+    Returns:
+        Of groups of two and more: the wall, width over height of the first picture, and of each
+        picture its id, titles, and rectangle in percent of the first one's sides.
     """
-    groups: list[list[int]] = []
+    groups: list[list[Picture]] = []
     for index, picture in enumerate(pictures):
         if picture.frame is None:
             continue
         for group in groups:
-            first = pictures[group[0]].frame
-            if first is not None and _is_same_place(first, picture.frame):
-                group.append(index)
+            if _is_same_place(frame_of(group[0]), picture.frame):
+                group.append(picture)
                 break
         else:
             if index < n_orthoimages:
-                groups.append([index])
-    return tuple(_slider(pictures, group) for group in groups if len(group) > 1)
+                groups.append([picture])
+    return [
+        {
+            "name": shown(group[0].title.partition(" (")[0]),
+            "ratio": frame_of(group[0]).width / frame_of(group[0]).height,
+            "pictures": [_laid(picture, frame_of(group[0])) for picture in group],
+        }
+        for group in groups
+        if len(group) > 1
+    ]
 
 
-def _slider(pictures: Sequence[Picture], group: Sequence[int]) -> Slider:
-    first = pictures[group[0]]
-    reference = _frame(first)
-    return Slider(
-        name=first.title.partition(" (")[0],
-        ratio=reference.width / reference.height,
-        pictures=tuple(_laid(index, pictures[index], reference) for index in group),
-    )
-
-
-def _laid(index: int, picture: Picture, reference: WallFrame) -> Laid:
-    frame = _frame(picture)
+def _laid(picture: Picture, reference: WallFrame) -> dict[str, object]:
+    frame = frame_of(picture)
     offset = frame.origin_world - reference.origin_world
     across_m, down_m = reference.width * reference.gsd_m, reference.height * reference.gsd_m
-    return Laid(
-        picture=index,
-        title=picture.title,
-        left=100 * float(offset @ reference.u_world) / across_m,
-        top=100 * float(offset @ reference.v_world) / down_m,
-        width=100 * frame.width * frame.gsd_m / across_m,
-        height=100 * frame.height * frame.gsd_m / down_m,
-    )
+    return {
+        "id": picture.id,
+        "title": shown(picture.title),
+        "layer": shown(picture.layer),
+        "left": 100 * float(offset @ reference.u_world) / across_m,
+        "top": 100 * float(offset @ reference.v_world) / down_m,
+        "width": 100 * frame.width * frame.gsd_m / across_m,
+        "height": 100 * frame.height * frame.gsd_m / down_m,
+    }
 
 
-def _frame(picture: Picture) -> WallFrame:
+def frame_of(picture: Picture) -> WallFrame:
+    """Return where a raster of a wall lies in the world."""
     if picture.frame is None:
-        raise ValueError("only rasters of walls are grouped")
+        raise ValueError(f"{picture.title} is no raster of a wall")
     return picture.frame
 
 
 def _is_same_place(one: WallFrame, other: WallFrame) -> bool:
     longest_m = max(one.width, one.height) * one.gsd_m
-    distance_m = float(np.linalg.norm(_centre(one) - _centre(other)))
+    centres = one.corners_world().mean(axis=0), other.corners_world().mean(axis=0)
     return (
         float(one.normal_world @ other.normal_world) > _SAME_NORMAL_COSINE
         and float(one.u_world @ other.u_world) > _SAME_NORMAL_COSINE
-        and distance_m < _SAME_PLACE_SHARE * longest_m
+        and float(np.linalg.norm(centres[0] - centres[1])) < _SAME_PLACE_SHARE * longest_m
     )
-
-
-def _centre(frame: WallFrame) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    middle = np.array([[0.5 * frame.width, 0.5 * frame.height]])
-    return np.asarray(frame.world_from_wall(middle)[0], dtype=np.float64)

@@ -14,8 +14,8 @@ from orthoflow.records.runs import REPORT_FILE
 from orthoflow.records.unfinished import open_run
 from orthoflow.report.browsing import RunSummary, differing_facts, key_metrics, told_apart
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.pages import environment, write_whole
 from orthoflow.report.pictures import thumbnail
+from orthoflow.report.rendering import environment, write_whole
 
 _PICTURE_PX: Final = 180
 _PICTURES_MOST: Final = 200  # about 8 kB each

@@ -16,12 +16,12 @@ from orthoflow.report.combinations import (
     baseline_cells,
     combinations_of,
     gives,
+    improved_on,
     is_check,
     unequal_walls,
 )
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.rankings import is_flag
-from orthoflow.report.ways import improved_on
 from orthoflow.workflow.expand import NOT_ASKED_FOR
 
 _MOST_ANSWERS: Final = 12

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections import Counter
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from orthoflow.records.runs import Run
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import Origins, _letter, comparison_table
 from orthoflow.report.environments import environment_words
-from orthoflow.report.overlays import (
-    Vectors,
-    _counts,
-    _Frames,
-    _spread_evenly,
-    draw_vectors,
-    magnification_for,
-    overlays,
-    residuals_on_wall,
-)
+from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders
 from orthoflow.report.rankings import Mark, Sense
 from tests.report_runs import (
@@ -40,109 +31,84 @@ from tests.report_runs import (
 )
 
 
-def vectors(*kinds: str, lengths_m: list[list[float]]) -> Vectors:
-    n = len(kinds)
-    feet = np.column_stack([10.0 * np.arange(1, n + 1), 5.0 * np.arange(1, n + 1)])
-    return Vectors(pixels_wall=feet, lengths_m=np.array(lengths_m), kinds=np.array(kinds))
-
-
-def test_each_kind_has_a_mark_and_a_line_to_its_end() -> None:
-    # Cells of 1 cm: a centimetre, ten times as long, is ten cells. The mark is 120 / 260 cells.
-    shown = vectors(
-        *("control", "check", "rejected", "shown"),
-        lengths_m=[[0.01, 0.0], [0.0, -0.02], [0.0, 0.0], [0.001, 0.002]],
-    )
-    assert draw_vectors(FRAME, shown, label="a < b", magnification=10.0) == (
-        '<svg class="over" viewBox="0 0 120 80" role="img" aria-label="a &lt; b" '
-        'stroke-width="0.231">'
-        '<circle class="control" cx="10.0" cy="5.0" r="0.462"/>'
-        '<path class="control" d="M10.0 5.0L20.0 5.0"/>'
-        '<rect class="check" x="19.5" y="9.5" width="0.923" height="0.923"/>'
-        '<path class="check" d="M20.0 10.0L20.0 -10.0"/>'
-        '<path class="rejected" d="M29.5 14.5L30.5 15.5M29.5 15.5L30.5 14.5"/>'
-        '<circle class="shown" cx="40.0" cy="20.0" r="0.462"/>'
-        '<path class="shown" d="M40.0 20.0L41.0 22.0"/></svg>'
-    )
-
-
-def test_vectors_are_counted_by_kind_with_their_errors() -> None:
-    shown = vectors(
-        *("control", "rejected", "control"), lengths_m=[[0.003, 0.0], [9.0, 9.0], [0.003, 0.002]]
-    )
-    assert _counts(shown) == ("2 control (RMS 3.00 mm along u, 1.41 mm along v), 1 rejected")
-
-
-@pytest.mark.parametrize(("most", "chosen"), [(7, range(7)), (6, (0, 1, 2, 3, 4, 6)), (2, (0, 6))])
-def test_marks_are_left_out_evenly(most: int, chosen: tuple[int, ...]) -> None:
-    shown = vectors(*"abcdefg", lengths_m=[[0.1 * k, 0.0] for k in range(7)])
-    kept = _spread_evenly(shown, most)
-    assert kept.kinds.tolist() == ["abcdefg"[k] for k in chosen]
-    np.testing.assert_array_equal(kept.pixels_wall, shown.pixels_wall[list(chosen)])
-    np.testing.assert_array_equal(kept.lengths_m, shown.lengths_m[list(chosen)])
-
-
 @pytest.mark.parametrize(
-    ("rms_m", "wanted", "found"),
-    [
-        (0.0, 1.0, 1.0),
-        (np.nan, 1.0, 1.0),
-        (1.0, 1.0, 1.0),
-        (0.001, 1.0, 1.0),
-        (0.001, 1.99, 1.0),
-        (0.001, 2.0, 2.0),
-        (0.001, 4.99, 2.0),
-        (0.001, 5.0, 5.0),
-        (0.001, 9.99, 5.0),
-        (0.001, 10.0, 10.0),
-        (0.001, 700.0, 500.0),
-    ],
+    ("rms_m", "found"),
+    [(0.0, 1.0), (np.nan, 1.0), (1.0, 1.0), (0.0149, 2.0), (0.006, 5.0), (3e-4, 100.0)],
 )
-def test_magnifications_are_one_two_or_five(rms_m: float, wanted: float, found: float) -> None:
-    from orthoflow.report.overlays import _RMS_SHARE
-
-    # As large a wall as asks for this magnification.
-    gsd_m = max(wanted * rms_m, 1e-3) / (_RMS_SHARE * 120) if np.isfinite(rms_m) else 0.01
+def test_magnifications_are_one_two_or_five(rms_m: float, found: float) -> None:
+    # Of a wall of 1.2 m a vector of RMS length is drawn 30 mm long at most.
     lengths_m = np.array([[rms_m, 0.0], [0.0, -rms_m], [np.nan, 5.0]])
-    if rms_m == 1.0:
-        gsd_m = 1e-3
-    assert magnification_for(replace(FRAME, gsd_m=gsd_m), lengths_m) == pytest.approx(found)
+    assert magnification_for(FRAME, lengths_m) == pytest.approx(found)
 
 
-def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    pictures = [
+def wall_pictures(*marks: str, walls: int = 1) -> list[Picture]:
+    return [
         Picture(
             uri="",
             title="",
             caption="",
             cell=f"wall@plane={mark}",
-            wall=0,
+            wall=wall,
             number=8,
             name="wall 8",
             frame=FRAME,
+            id=f"{mark}-{wall}",
         )
-        for mark in ("fine", "coarse")
+        for mark in marks
+        for wall in range(walls)
     ]
-    found = list(overlays(run, pictures))
-    assert [(one.cell, one.walls_cell, one.wall) for one in found] == [
-        (f"{step}@plane={mark}", f"wall@plane={mark}", 0)
+
+
+def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    found = list(overlays(run, wall_pictures("fine", "coarse")))
+    assert [(one.cell, one.ground.id) for one in found] == [
+        (f"{step}@plane={mark}", f"{mark}-0")
         for step in ("orient", "check")
         for mark in ("fine", "coarse")
     ]
-    assert found[0].title == "Ties of wall 8, orient@plane=fine"
-    assert found[2].title == "Displacements in the orthoimage of wall 8, check@plane=fine"
-    assert found[2].caption == (
+    ties, _, displacements, _ = found
+    assert ties.title == "Ties of wall 8, orient@plane=fine"
+    assert displacements.title == "Displacements in the orthoimage of wall 8, check@plane=fine"
+    assert displacements.caption == (
         "2 patch (RMS 0.71 mm along u, 0.71 mm along v), beside depth steps, too; "
         "vectors drawn 20 times as long"
     )
-    assert found[0].caption.startswith("10 control (RMS ")
-    assert found[0].caption.endswith(" times as long")
-    assert found[0].name == "wall 8"
-    assert found[0].check_rms_mm is not None
-    u, v = found[0].check_rms_mm
-    assert f"10 check (RMS {u:.2f} mm along u, {v:.2f} mm along v)" in found[0].caption
-    assert found[2].check_rms_mm is None
-    assert found[0].svg.count("<circle") == found[0].svg.count("<rect") == 10
+    assert re.fullmatch(
+        r"10 control \(RMS [\d.]+ mm along u, [\d.]+ mm along v\), 10 check \(RMS .*\), "
+        r"10 rejected; vectors drawn \d+ times as long",
+        ties.caption,
+    )
+    assert Counter(kind for kind, _ in ties.marks) == {"control": 10, "check": 10, "rejected": 10}
+    # Rejected ones have no vector; others one that is magnified, as is the reference.
+    for kind, (u, v, x, y) in ties.marks:
+        assert ((u, v) == (x, y)) is (kind == "rejected")
+    lengths = [np.hypot(x - u, y - v) for _, (u, v, x, y) in displacements.marks]
+    np.testing.assert_allclose(lengths, 20 * 1e-3 / FRAME.gsd_m, rtol=1e-6)
+    words, long = displacements.reference
+    assert long == pytest.approx(20 * 1e-3 * float(words.removesuffix(" mm")) / FRAME.gsd_m)
+    assert 0.03 * FRAME.width <= long <= 0.08 * FRAME.width
+    # Of walls that no picture shows there is no drawing.
+    assert list(overlays(run, wall_pictures("fine")[:0])) == []
+
+
+def test_marks_are_left_out_evenly_where_a_page_has_many(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    (cameras,) = (run.products[place] for place in run.products if place[0] == "orient@plane=fine")
+    ties = cameras.ties
+    many = replace(
+        ties,
+        **{
+            field.name: np.concatenate([getattr(ties, field.name)] * 10)
+            for field in fields(ties)
+            if isinstance(getattr(ties, field.name), np.ndarray)
+            and len(getattr(ties, field.name)) == len(ties.photo)
+        },
+    )
+    products = {**run.products, ("orient@plane=fine", "cameras"): replace(cameras, ties=many)}
+    found = next(overlays(replace(run, products=products), wall_pictures("fine"), share=1e-6))
+    assert len(found.marks) == 50
+    assert found.caption.endswith(", 50 of them shown")
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -172,44 +138,6 @@ def test_what_moves_a_pixel_is_as_long_on_the_wall(seed: int) -> None:
     np.testing.assert_allclose(found, moved_m, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("share", "n_walls", "most"),
-    [(1.0, 1, 600), (0.02, 1, 240), (0.02, 2, 120), (0.0025, 1, 50), (1e-6, 1, 50), (1.0, 40, 300)],
-)
-def test_marks_are_shared_out_over_the_drawings_of_a_page(
-    tmp_path: Path, share: float, n_walls: int, most: int
-) -> None:
-    run = compared_run(tmp_path)
-    told = [
-        Picture(uri="", title="", caption="", cell="wall@plane=fine", wall=wall, frame=FRAME)
-        for wall in range(n_walls)
-    ]
-    frames = _Frames.of(run, told, share=share)
-    assert frames.marks_most == most
-    walls_cell, known = frames.behind("check@plane=fine")
-    assert (walls_cell, list(known)) == ("wall@plane=fine", list(range(n_walls)))
-    assert frames.behind("check@plane=coarse") == ("", {})
-    assert frames.behind("scan") == ("", {})
-
-
-def test_orientations_and_inspections_share_the_bytes_of_a_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[float] = []
-    of = _Frames.of
-
-    def noting(run: Run, pictures: Sequence[Picture], *, share: float) -> _Frames:
-        asked.append(share)
-        return of(run, pictures, share=share)
-
-    monkeypatch.setattr(_Frames, "of", staticmethod(noting))
-    run = compared_run(tmp_path)
-    # Two orientations and two inspections, over no wall that is known.
-    assert list(overlays(run, [], share=0.5)) == []
-    assert list(overlays(run, [])) == []
-    assert asked == [0.125, 0.25]
-
-
 # --- sliders ---
 
 
@@ -226,16 +154,14 @@ def test_pictures_lie_over_the_first_of_their_place_in_shares_of_it() -> None:
         for title, frame in (("wall 0 (painted)", FRAME), ("no wall", None), ("depth", finer))
     ]
     (slider,) = sliders(told, 1)
-    assert (slider.name, slider.ratio) == ("wall 0", 1.5)
-    first, second = slider.pictures
-    assert (first.picture, first.title, second.picture, second.title) == (
-        *(0, "wall 0 (painted)", 2, "depth"),
-    )
-    shares = [(one.left, one.top, one.width, one.height) for one in slider.pictures]
+    assert (slider["name"], slider["ratio"]) == ("wall 0", 1.5)
+    first, second = slider["pictures"]  # type: ignore[misc]
+    assert (first["title"], second["title"]) == ("wall 0 (painted)", "depth")
+    shares = [[one[side] for side in ("left", "top", "width", "height")] for one in (first, second)]
     np.testing.assert_allclose(shares, [(0, 0, 100, 100), (5, 5, 100, 75)], atol=1e-6)
-    assert sliders(told[:2], 1) == ()
+    assert sliders(told[:2], 1) == []
     # A raster alone begins no group.
-    assert sliders([told[2], told[2]], 0) == ()
+    assert sliders([told[2], told[2]], 0) == []
     assert len(sliders([told[2], told[2]], 1)) == 1
 
 

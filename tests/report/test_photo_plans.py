@@ -15,8 +15,9 @@ from orthoflow.geometry.cameras import looking_at
 from orthoflow.products import Camera, Cameras
 from orthoflow.report import photo_plans as module
 from orthoflow.report.pages import write_page
-from orthoflow.report.photo_plans import PhotoRow, photo_plan
+from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import wall_pictures
+from orthoflow.report.tables import Table
 from tests import samples
 from tests.report_runs import HeldRun, camera, cell, compared_run, given
 
@@ -153,21 +154,20 @@ def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None
     run = oriented(run, residual_table=(*check, *control))
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
-    first, missing, untied = plan.rows
-    # Of 30 ties a third each is control, check and rejected.
-    assert (first.name, first.status, first.n_control, first.n_check) == ("a.jpg", "ok", 10, 10)
-    assert first.sigma_wall_mm == pytest.approx(1.2)
-    # The mean of both axes, of check ties alone, in millimetres alone.
-    assert first.check_mm == pytest.approx(2.0 * np.sqrt((3.0**2 + 4.0**2) / 2))
-    assert missing == PhotoRow(name="gone.jpg", status="too few <ties>")
-    assert untied == PhotoRow(name="untied.jpg", status="ok", n_control=0, n_check=0)
+    assert plan.table.rows == (
+        # The mean of both axes, of check ties alone, in millimetres alone. Of 30 ties a third each
+        # is control, check and rejected.
+        ("a.jpg", "1.2", f"{2.0 * np.sqrt((3.0**2 + 4.0**2) / 2):.2f}", "10", "10", "ok"),
+        ("gone.jpg", "-", "-", "-", "-", "too few <ties>"),
+        ("untied.jpg", "-", "-", "0", "0", "ok"),
+    )
 
 
 def test_photos_of_which_only_poses_are_known_have_no_rows(tmp_path: Path) -> None:
     run = oriented(compared_run(tmp_path), ties=None)
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
-    assert plan.rows == ()
+    assert plan.table.rows == ()
 
 
 def test_the_page_has_a_table_of_photos(tmp_path: Path) -> None:
@@ -199,6 +199,7 @@ def test_a_plan_of_any_number_of_photos_is_drawn(n_photos: int) -> None:
         standing(f"{k}.jpg", 20.0 * (k % 6), 10.0 * (k // 6), (0.0, 1.0)) for k in range(n_photos)
     ]
     walls, photos = module._drawn(UP, many, WALLS)
-    plan = module.PhotoPlan(walls=walls, photos=photos, caption="", cell="orient")
+    table = Table(name="", caption="", head=(), rows=(), numeric=frozenset())
+    plan = module.PhotoPlan(walls=walls, photos=photos, caption="", cell="orient", table=table)
     assert plan.file("png").startswith(b"\x89PNG")
     assert plan.picture.uri.startswith("data:image/svg+xml;base64,")

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from orthoflow.files.images import decode_image
 from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
-from orthoflow.report import pictures as module
 from orthoflow.report.pictures import (
     DIVERGING,
     Picture,
+    coarse_depths,
+    cursor_places,
     depth_colours,
     embedded_products,
-    frame_words,
     orthoimage_pictures,
     side_px,
     sliders,
@@ -101,43 +101,6 @@ def test_the_baseline_is_shown_down_to_its_cells() -> None:
     assert shown(one)[1] == shown(two)[1] == 489
 
 
-def test_a_wall_has_its_share_of_the_close_cells_by_its_form() -> None:
-    asked: list[int] = []
-
-    def drawing(width: int, height: int) -> module._Drawing:
-        frame = samples.facing_south(0.01, width, height)
-        picture = Picture(uri="", title="", caption="", frame=frame)
-        return module._Drawing(
-            draw=lambda side: asked.append(side) or b"", frame=frame, picture=picture
-        )
-
-    many = [drawing(300, 100), drawing(100, 300), drawing(100, 100)]
-    list(module._drawn(many, n_products=1000.0, close_cells=160_000.0))
-    assert sorted(asked) == [400, 692, 692]
-    asked.clear()
-    list(module._drawn(many, n_products=8.0, close_cells=160_000.0))
-    # 24 pictures: all of them full.
-    assert asked == [1000, 1000, 1000]
-
-
-def test_pictures_have_the_whole_page_unless_told_otherwise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[tuple[int, float, float]] = []
-
-    def keep(drawings: Any, *, n_products: float, close_cells: float = 0.0) -> list[Picture]:
-        asked.append((len(drawings), n_products, close_cells))
-        return []
-
-    monkeypatch.setattr(module, "_drawn", keep)
-    list(orthoimage_pictures(run(orthoimages(2), orthoimages())))
-    # Twelve million cells for the baseline's two images.
-    assert asked == [(2, 2.0, 6e6), (1, 2.0, 0.0)]
-    asked.clear()
-    list(wall_pictures(run(walls(), walls(), type_name="walls")))
-    assert asked == [(2, 2.0, 0.0), (2, 2.0, 0.0)]
-
-
 # --- what is said ---
 
 
@@ -151,22 +114,9 @@ def test_an_orthoimage_says_what_became_of_its_cells() -> None:
     assert (one.cell, one.frame, one.file) == ("mosaic@plane=fine", FRAME, "")
     assert one.width_m == pytest.approx(12.0)
     # A bar of at most three tenths of it.
-    assert ">2 m</text>" in one.legend
+    assert one.scale == ("2 m", pytest.approx(100 / 6))
     assert one.layer == "orthoimage (plane=fine)"
     assert Picture(uri="", title="error map", caption="").width_m == 0.0
-
-
-@pytest.mark.parametrize(
-    ("title", "layer"),
-    [
-        ("wall 4", "orthoimage"),
-        ("wall 4, depth", "depth"),
-        ("wall 4, depth (plane=fine)", "depth (plane=fine)"),
-        ("wall 4 (plane=fine)", "orthoimage (plane=fine)"),
-    ],
-)
-def test_layers_are_called_alike_for_all_walls(title: str, layer: str) -> None:
-    assert Picture(uri="", title=title, caption="", name="wall 4").layer == layer
 
 
 def test_what_cannot_be_seen_is_transparent() -> None:
@@ -225,10 +175,9 @@ def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
     for one in (intensity, depth):
         assert (one.wall, one.number, one.name, one.frame) == (0, 8, "wall 8", FRAME)
         assert one.cell == "mosaic@plane=fine"
-        assert ">2 m</text>" in one.legend
         assert shown(one) == (250, 1000)
     # 99 of 100 cells lie on the plane: the scale is the smallest that there is.
-    assert "-1 mm (behind)" in depth.legend
+    assert depth.depth_limit_m == 0.001
     assert depth.depths is not None
     assert intensity.depths is None
     # Only half as large where a page gives them a fiftieth of its bytes: one product is fifty.
@@ -244,17 +193,6 @@ def test_grey_of_colours_is_no_laser_intensity() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("share", "limit_m"), [(0.0, 0.001), (0.005, 0.001), (0.015, 0.05), (1.0, 0.05)]
-)
-def test_ninety_nine_of_a_hundred_depths_lie_within_the_scale(share: float, limit_m: float) -> None:
-    depth_m = np.full((100, 100), np.nan, dtype=np.float32)
-    depth_m[:50] = 0.0
-    depth_m.ravel()[: round(5000 * share)] = -0.05
-    assert module._depth_limit_m(depth_m) == pytest.approx(limit_m)
-    assert module._depth_limit_m(np.full((3, 3), np.nan, dtype=np.float32)) == 0.001
-
-
 def test_depths_take_the_colours_between_those_of_the_classes() -> None:
     depth_m = np.linspace(-0.02, 0.02, 801, dtype=np.float32)
     found = depth_colours(depth_m, 0.01).astype(float)
@@ -267,11 +205,6 @@ def test_depths_take_the_colours_between_those_of_the_classes() -> None:
     assert (
         depth_colours(np.full((2, 3), np.nan, np.float32), 0.01).tolist() == [[[247] * 3] * 3] * 2
     )
-
-
-def test_a_raster_is_told_in_metres_and_millimetres() -> None:
-    frame = samples.facing_south(0.0025, 1234, 400)
-    assert frame_words(frame) == "3.08 x 1.00 m at 2.5 mm, 1234 x 400 cells"
 
 
 # --- which products ---
@@ -348,3 +281,62 @@ def test_rasters_of_one_wall_lie_within_five_degrees_and_a_tenth(
         for title, one in (("wall 4", FRAME), ("wall 4, depth", frame))
     ]
     assert len(sliders(told, 1)) == is_same
+
+
+# --- scales and depths for the cursor ---
+
+
+@pytest.mark.parametrize("width_m", [0.013, 0.9, 5.4, 31.0, 740.0])
+def test_a_bar_is_as_long_as_it_says(width_m: float) -> None:
+    frame = samples.facing_south(width_m / 1000, 1000, 10)
+    words, percent = Picture(uri="", title="", caption="", frame=frame).scale
+    number, unit = words.split()
+    said_m = float(number) * (0.01 if unit == "cm" else 1.0)
+    assert percent / 100 * width_m == pytest.approx(said_m)
+    assert 10 <= percent <= 30
+
+
+def test_few_depths_are_all_told_in_millimetres() -> None:
+    depth_m = np.array([[0.0014, -0.0016, np.nan], [1.2344, 0.0, np.inf]], dtype=np.float32)
+    assert coarse_depths(depth_m) == {
+        "columns": 3, "rows": 2, "mm": [1, -2, None, 1234, 0, None]
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", [(400, 800), (1, 7000)])
+def test_many_depths_are_told_at_about_eight_thousand_places(shape: tuple[int, int]) -> None:
+    columns = np.arange(shape[1], dtype=np.float32)
+    # A depth tells its column, in millimetres.
+    found: Any = coarse_depths(np.broadcast_to(columns / np.float32(1000.0), shape).copy())
+    assert len(found["mm"]) == found["columns"] * found["rows"] <= 8_400
+    middles = (np.arange(found["columns"]) + 0.5) * shape[1] / found["columns"]
+    assert found["mm"][: found["columns"]] == middles.astype(int).tolist()
+
+
+def test_an_orthoimage_has_the_depths_of_the_wall_with_its_cells() -> None:
+    def picture(name: str, gsd_m: float = 0.5, depths: Any = None) -> Picture:
+        frame = samples.facing_east(gsd_m, 4, 2, (1.0, 2.0, 3.0))
+        return Picture(
+            uri="", title="", caption="", id=name, number=7, name="floor 7", frame=frame,
+            depths=depths,
+        )  # fmt: skip
+
+    depths = {"columns": 2, "rows": 1, "mm": [5, None]}
+    walls = [picture("fine", 0.25, {"columns": 1, "rows": 1, "mm": [9]}), picture("intensity")]
+    unplaced = replace(picture("unplaced"), frame=None)
+    [place] = cursor_places([picture("ortho"), unplaced], [*walls, picture("depth", 0.5, depths)])
+    assert place == {
+        **depths,
+        "id": "ortho",
+        "wall": 7,
+        "name": "floor 7",
+        "origin": [1.0, 2.0, 3.0],
+        "u": [0.0, 1.0, 0.0],
+        "v": [0.0, 0.0, -1.0],
+        "n": [1.0, 0.0, 0.0],
+        "gsd": 0.5,
+        "width": 4,
+        "height": 2,
+    }
+    [place] = cursor_places([picture("ortho")], walls)
+    assert (place["columns"], place["rows"], place["mm"]) == (0, 0, [])

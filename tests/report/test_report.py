@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +17,12 @@ from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
 from orthoflow.report.combinations import Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns, comparison_table
-from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
-from orthoflow.report.overlays import magnification_for, residuals_on_wall
-from orthoflow.report.pages import cited
-from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
+from orthoflow.report.overlays import residuals_on_wall
+from orthoflow.report.pictures import depth_colours
 from orthoflow.report.rankings import Mark, Sense, Value, rank
+from orthoflow.report.rendering import cited
 from orthoflow.report.summaries import answers, citations, limits, results
 from tests.report_runs import (
     FOCAL_PX,
@@ -178,12 +176,6 @@ def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
         "how far (the picture is damaged)",
         "a chart",
     ]
-
-
-def test_many_pictures_are_small_ones() -> None:
-    assert side_px(1) == 1000
-    # Their bytes go with their area: 200 together are not more than 24 large ones.
-    assert 200 * side_px(200) ** 2 <= 1.01 * 24 * 1000**2
 
 
 def test_what_limits_the_result_is_said_once_failures_first(compared: Run) -> None:
@@ -755,44 +747,6 @@ def test_residuals_in_a_photo_become_lengths_on_the_wall() -> None:
     residual_px = np.array([[1.0, 0.0], [0.0, -2.0]])
     lengths_m = residuals_on_wall(camera(), points_world, residual_px, FRAME)
     np.testing.assert_allclose(lengths_m, residual_px * 2.0 / FOCAL_PX, atol=1e-8)  # metres
-
-
-def test_magnifications_are_round_and_make_vectors_visible() -> None:
-    lengths_m = np.full((10, 2), 1e-4)
-    magnification = magnification_for(FRAME, lengths_m)
-    assert magnification / 10 ** math.floor(math.log10(magnification)) in (1.0, 2.0, 5.0)
-    drawn_share = magnification * np.hypot(1e-4, 1e-4) / (FRAME.width * FRAME.gsd_m)
-    assert 0.01 <= drawn_share <= 0.025
-
-
-def test_pictures_of_one_place_share_a_slider_where_they_lie() -> None:
-    moved = replace(FRAME, origin_world=FRAME.world_from_wall(np.array([[6.0, 0.0]]))[0])
-    turned = replace(FRAME, u_world=-FRAME.u_world, normal_world=-FRAME.normal_world)
-    pictures = [
-        Picture(uri="", title=title, caption="", frame=frame)
-        for title, frame in (("ortho", FRAME), ("depth", moved), ("other side", turned))
-    ]
-    (slider,) = sliders(pictures, 1)
-    assert [laid.title for laid in slider.pictures] == ["ortho", "depth"]
-    assert slider.pictures[1].left == pytest.approx(5.0)  # 6 of 120 cells
-    assert slider.pictures[1].width == pytest.approx(100.0)
-
-
-def test_the_diagram_draws_each_cell_once_and_each_hand_over(compared: Run) -> None:
-    drawing = run_diagram(compared)
-    assert drawing.count("<rect") == len(compared.cells)
-    assert drawing.count('class="arrow"') == 4
-
-
-def test_the_diagram_of_many_cells_has_a_box_per_step() -> None:
-    cells = [cell("scan")] + [
-        cell(f"plane@plane=v{index}", inputs={"cloud": given("scan.cloud", "1", "cloud")})
-        for index in range(40)
-    ]
-    drawing = run_diagram(run(*cells))
-    assert drawing.count("<rect") == 2
-    assert drawing.count('class="arrow"') == 1
-    assert "run 40 times, 40.0 s" in drawing
 
 
 def test_depths_run_from_blue_over_white_to_red() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from orthoflow.report.ways import improved_on, ways
+from orthoflow.report.combinations import improved_on, ways
 from tests.report_runs import HeldRun, cell, compared_run, given, record
 
 

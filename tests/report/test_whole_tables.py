@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from orthoflow.report.combinations import (
     combinations_of,
     wanted_metrics,
 )
-from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import Difference, ProductRow, differences
 from orthoflow.report.rankings import Sense, Value, badness, rank
 from orthoflow.report.summaries import Limit, answers, limits
@@ -26,7 +24,6 @@ from tests.report_runs import (
     cell,
     compared_resolved,
     distance,
-    given,
     metric,
     metrics,
     record,
@@ -354,95 +351,6 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
 
 
 # --- the graph ---
-
-
-def test_an_arrow_past_a_box_goes_beside_it() -> None:
-    cloud, planes = given("scan.cloud", "1", "cloud"), given("plane.p", "2", "planes")
-    told = run(
-        cell("scan"),
-        cell("plane", inputs={"cloud": cloud}),
-        cell("wall", inputs={"cloud": cloud, "planes": planes}),
-    )
-    drawn = run_diagram(told)
-    ways = re.findall(r'class="arrow" d="([^"]*)"', drawn)
-    # The boxes are 222 wide: down beside the plane's, with room in the drawing for it.
-    assert ways == [
-        "M111,47 C111,69 111,69 111,91",
-        "M111,47 C111,69 235,69 235,91 V137 C235,159 111,159 111,181",
-        "M111,137 C111,159 111,159 111,181",
-    ]
-    assert 'viewBox="0 0 237 229" width="237"' in drawn
-
-
-def test_the_graph_is_drawn_downwards_where_its_levels_are_narrow() -> None:
-    cloud = given("scan.cloud", "1", "cloud")
-    told = run(
-        cell("scan", wall_s=125.0),
-        cell("plane", inputs={"cloud": cloud}, cached_from="r0"),
-        cell("a-name-of-thirty-one-characters", inputs={"cloud": cloud}, status="failed"),
-        cell("w", inputs={"c": cloud, "p": given("plane.p", "2", "planes")}, status="skipped"),
-    )
-    assert run_diagram(told) == (
-        '<svg viewBox="0 0 461 229" width="461" role="img" aria-label="graph of the run">'
-        '<path class="arrow" d="M230,47 C230,69 111,69 111,91"/>'
-        '<path class="arrow" d="M230,47 C230,69 349,69 349,91"/>'
-        '<path class="arrow" d="M230,47 C230,114 230,114 230,181"/>'
-        '<path class="arrow" d="M111,137 C111,159 230,159 230,181"/>'
-        '<g class="cell ok"><title>scan: scan.toy, 2 min 05 s</title>'
-        '<rect x="120" y="1" width="220" height="46" rx="6"/>'
-        '<text x="130" y="20">scan</text>'
-        '<text class="small" x="130" y="37">scan.toy, 2 min 05 s</text></g>'
-        '<g class="cell cached"><title>plane: plane.toy, 1.00 s</title>'
-        '<rect x="1" y="91" width="220" height="46" rx="6"/>'
-        '<text x="11" y="110">plane</text>'
-        '<text class="small" x="11" y="127">plane.toy, 1.00 s</text></g>'
-        '<g class="cell failed"><title>a-name-of-thirty-one-characters: failed</title>'
-        '<rect x="239" y="91" width="220" height="46" rx="6"/>'
-        '<text x="249" y="110">a-name-of-thirty-one…cters</text>'
-        '<text class="small" x="249" y="127">failed</text></g>'
-        '<g class="cell skipped"><title>w: skipped</title>'
-        '<rect x="120" y="181" width="220" height="46" rx="6"/>'
-        '<text x="130" y="200">w</text>'
-        '<text class="small" x="130" y="217">skipped</text></g></svg>'
-    )
-
-
-def test_a_level_too_wide_for_a_page_is_drawn_from_left_to_right() -> None:
-    cloud = given("scan.cloud", "1", "cloud")
-    cells = [cell(f"plane{index}", inputs={"cloud": cloud}) for index in range(6)]
-    drawn = run_diagram(run(cell("scan"), *cells))
-    assert drawn.startswith('<svg viewBox="0 0 487 369" width="487"')
-    assert drawn.count('<rect x="265"') == 6
-    assert '<path class="arrow" d="M221,24 C251,24 235,24 265,24"/>' in drawn
-
-
-def test_what_was_skipped_for_want_of_an_input_stands_below_and_widens_nothing() -> None:
-    cloud = given("scan.cloud", "1", "cloud")
-    skipped = [cell(f"read{index}", status="skipped") for index in range(7)]
-    drawn = run_diagram(run(cell("scan"), *skipped, cell("plane", inputs={"cloud": cloud})))
-    # Two levels and, of seven, rows of five and two.
-    assert drawn.startswith('<svg viewBox="0 0 1175 319" width="1175"')
-    tops = [drawn.count(f'y="{top}" width="220"') for top in (1, 91, 181, 271)]
-    assert tops == [1, 1, 5, 2]
-
-
-@pytest.mark.parametrize(("n_cells", "n_boxes"), [(24, 24), (25, 1)])
-def test_more_than_two_dozen_cells_become_a_box_per_step(n_cells: int, n_boxes: int) -> None:
-    cells = [cell(f"plane@plane=v{k}", status="failed" if k < 3 else "ok") for k in range(n_cells)]
-    drawing = run_diagram(run(*cells))
-    assert drawing.count("<rect") == n_boxes
-    if n_boxes == 1:
-        assert "plane: run 25 times, 22.0 s, 3 failed<" in drawing
-
-
-def test_a_box_of_some_cached_cells_is_not_cached() -> None:
-    def state(*froms: str) -> str:
-        cells = [cell(f"p@p=v{k}", cached_from=froms[k % len(froms)]) for k in range(30)]
-        return run_diagram(run(*cells)).partition('class="cell ')[2].partition('"')[0]
-
-    assert state("r0") == "cached"
-    assert state("r0", "") == "ok"
-    assert run_diagram(run()).startswith('<svg viewBox="0 0 0 0" width="0"')
 
 
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:

@@ -1,0 +1,123 @@
+"""The templates of pages and drawings, and writing what they give."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import secrets
+import shlex
+from contextlib import suppress
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+import jinja2
+from markupsafe import Markup, escape
+
+from orthoflow.errors import StoreError
+from orthoflow.foreign_text import shown
+from orthoflow.records import COSTS
+from orthoflow.records.runs import Run
+from orthoflow.report.diagrams import BOX, run_diagram
+from orthoflow.report.environments import told_apart
+from orthoflow.report.numbers import number, number_with_unit
+from orthoflow.report.pictures import DIVERGING
+from orthoflow.version import __version__
+
+# Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
+_DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
+
+
+@cache
+def environment() -> jinja2.Environment:
+    """Return the templates, with what all pages share."""
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_shown,
+        loader=jinja2.PackageLoader("orthoflow.report"),
+    )
+    environment.filters |= {
+        "with_unit": number_with_unit,
+        "number": number,
+        "environments": told_apart,
+        "cited": cited,
+        # A long name or address may be broken behind its underscores, and before its variants.
+        "breakable": lambda name: Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name))))),
+        "urlpath": quote,
+        "shell": shlex.quote,
+    }
+    # Ours, and no template: braces in them mean nothing.
+    folder = files("orthoflow.report") / "templates"
+    css, early, script = (
+        folder.joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.css", "early.js", "page.js")
+    )
+    environment.globals |= {
+        "costs": COSTS,
+        "version": __version__,
+        "depth_colours": DIVERGING.tolist(),
+        "box": BOX,
+        "css": Markup(css),
+        "early_script": Markup(early),
+        "script": Markup(script),
+        "policy": "default-src 'none'; img-src data:; "
+        f"style-src {_hash_source(css)}; script-src {_hash_source(early)} {_hash_source(script)}; "
+        "base-uri 'none'; form-action 'none'",
+    }
+    return environment
+
+
+def _shown(value: object) -> object:
+    """Write out what turns reading round; what is markup already was made of escaped parts."""
+    is_text = isinstance(value, str) and not isinstance(value, Markup)
+    return shown(str(value), keep="\n\t") if is_text else value
+
+
+def _hash_source(text: str) -> str:
+    """Name a style or a script for the policy of the page, by its content."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def cited(citation: str) -> Markup:
+    """Escape a citation and make its DOI a link: a page that links needs no network itself."""
+    return Markup(
+        _DOI.sub(
+            lambda found: (
+                f'<a href="https://doi.org/{quote(found[1], safe="/.()-;")}">doi:{found[1]}</a>'
+            ),
+            str(escape(shown(citation))),
+        )
+    )
+
+
+def graph_file(run: Run) -> bytes:
+    """Return the graph of a run as an SVG file."""
+    template = environment().get_template("graph.svg.j2")
+    return template.render(diagram=run_diagram(run)).encode("utf-8")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a page, as a whole or not at all.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    aside = path.with_name(f".report-{secrets.token_hex(8)}")
+    try:
+        # A new file: through a link that lies there it would be another's.
+        with aside.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+        aside.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            aside.unlink()
+        raise StoreError(
+            f"the report {path} cannot be written: {error.strerror}; choose another place with -o"
+        ) from error

@@ -1,0 +1,183 @@
+"""Tables for pages and papers, and the planes that a run found as such."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from orthoflow.foreign_text import shown
+from orthoflow.geometry import omega_phi_deg
+from orthoflow.products import Planes
+from orthoflow.records.runs import Run
+from orthoflow.report.pictures import embedded_products
+
+_LATEX: Final = {
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+}
+
+
+def escaped_latex(text: str) -> str:
+    """Escape a text for LaTeX."""
+    return "".join(_LATEX.get(sign, sign) for sign in shown(text))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of texts, which pages, LaTeX and Markdown show.
+
+    Attributes:
+        name: of its files.
+        caption: what it shows, one sentence.
+        head: heading of each column.
+        rows: of texts.
+        numeric: places of the columns of numbers, which stand to the right.
+    """
+
+    name: str
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: frozenset[int]
+
+    def latex(self) -> str:
+        """Return the table as LaTeX, for the package booktabs."""
+        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+
+        cells = [[escaped_latex(text) for text in row] for row in self.rows]
+        table = pd.DataFrame(cells, columns=[escaped_latex(text) for text in self.head])
+        columns = "".join("r" if place in self.numeric else "l" for place in range(len(self.head)))
+        styled = table.style.hide(axis="index")
+        return str(
+            styled.to_latex(
+                column_format=columns,
+                caption=escaped_latex(self.caption),
+                label=f"tab:{self.name}",
+                position_float="centering",
+                hrules=True,
+            )
+        )
+
+    def markdown(self) -> str:
+        """Return the table as Markdown, numbers to the right."""
+        rule = ["---:" if place in self.numeric else "---" for place in range(len(self.head))]
+        rows = [self.head, tuple(rule), *self.rows]
+        lines = [f"| {' | '.join(map(_markdown, row))} |" for row in rows]
+        return "\n".join((*lines, "", f"{_markdown(self.caption)}", ""))
+
+
+def _markdown(text: str) -> str:
+    return shown(text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneTables:
+    """The planes of one cell.
+
+    Attributes:
+        cell: address of the cell.
+        viewpoint: where the side of the viewer comes from, in words.
+        planes: a row per plane.
+        materials: thickness of the cloud by place and material.
+        later: cells that hand the same planes on.
+        before: all cells that have a part in these planes.
+    """
+
+    cell: str
+    viewpoint: str
+    planes: Table
+    materials: Table
+    later: tuple[str, ...] = ()
+    before: frozenset[str] = frozenset()
+
+    def taken_further(self, tables: Iterable[PlaneTables]) -> bool:
+        """Whether another of the tables shows what a later step made of these planes."""
+        return any(self.cell in table.before for table in tables)
+
+
+def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
+    """The planes of every cell that found some; those that print alike once."""
+    found: list[PlaneTables] = []
+    places = embedded_products(run, "planes")
+    for (address, _), payload in zip(places, run.payloads(places), strict=True):
+        planes = Planes.from_payload(payload)
+        # Of several sources of sides, how many planes each has.
+        counts = Counter(planes.side_source(index) for index in range(len(planes)))
+        told = PlaneTables(
+            cell=address,
+            viewpoint=", ".join(
+                f"{source} ({count})" if len(counts) > 1 else source
+                for source, count in counts.items()
+            )
+            if planes.side_from
+            else planes.viewpoint.replace("_", " "),
+            planes=_plane_table(planes),
+            materials=_material_table(planes),
+            before=frozenset(cell.address for cell in run.upstream(address)) - {address},
+        )
+        for place, other in enumerate(found):
+            if (other.viewpoint, other.planes, other.materials) == (
+                *(told.viewpoint, told.planes, told.materials),
+            ):
+                found[place] = replace(other, later=(*other.later, address))
+                break
+        else:
+            found.append(told)
+    return tuple(found)
+
+
+def _plane_table(planes: Planes) -> Table:
+    rows = []
+    for index, name in enumerate(planes.names):
+        omega, phi = omega_phi_deg(planes.normal[index], planes.up)
+        first, second, _, last = planes.corners[index]
+        wide_m, high_m = np.linalg.norm(last - first), np.linalg.norm(second - first)
+        # Nothing for planes that were given.
+        thickness = planes.thickness[index] if planes.thickness else None
+        spread = (None, None) if thickness is None else (thickness.sigma_m, thickness.scan_step_m)
+        rows.append(
+            (
+                *(name, f"{omega:.3f}", f"{phi:.3f}", f"{planes.offset[index]:.4f}"),
+                *(f"{1000 * planes.sigma_offset_m(index):.2g}", f"{wide_m:.2f} x {high_m:.2f} m"),
+                *(f"{planes.n_points[index]:,}", f"{1000 * planes.rms_m[index]:.2f}"),
+                *("-" if value is None else f"{1000 * value:.2f}" for value in spread),
+            )
+        )
+    return Table(
+        name="planes",
+        caption="planes",
+        head=(
+            *("plane", "omega / deg", "phi / deg", "offset / m", "sigma at its centre / mm"),
+            *("rectangle", "points", "RMS / mm", "thickness / mm", "step there / mm"),
+        ),
+        rows=tuple(rows),
+        numeric=frozenset({1, 2, 3, 4, 6, 7, 8, 9}),
+    )
+
+
+def _material_table(planes: Planes) -> Table:
+    places = [
+        (name, thickness.material)
+        for name, thickness in zip(planes.names, planes.thickness, strict=False)
+        if thickness is not None
+    ]
+    if (row := planes.scan_row) is not None:
+        places.append((f"row {row.row} of scan {row.scan}, {planes.names[0]}", row.material))
+    return Table(
+        name="materials",
+        caption="thickness of the cloud by material",
+        head=("on", "material", "points of the sample", "thickness / mm"),
+        rows=tuple(
+            (place, str(one.name), f"{one.n_points:,}", f"{1000 * one.sigma_m:.2f}")
+            for place, spreads in places
+            for one in spreads
+        ),
+        numeric=frozenset({2, 3}),
+    )
