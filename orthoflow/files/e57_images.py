@@ -21,7 +21,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.cube_faces import FACES, PanoramaFace, faces_of
 from orthoflow.files.given_cameras import GivenCamera
 from orthoflow.files.points.e57 import FORMAT, number_of, pose_of
-from orthoflow.files.points.libraries import load_library, reading
+from orthoflow.files.points.scan_file import load_library, reading
 from orthoflow.products import Intrinsics
 
 SUFFIX: Final = ".e57"

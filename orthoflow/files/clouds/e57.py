@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.clouds.dressing import BLOCK, DressedCloud, Points
-from orthoflow.files.points.libraries import load_library
+from orthoflow.files.points.scan_file import load_library
 from orthoflow.version import __version__
 
 # Prefix -> URI of the extensions of the format.

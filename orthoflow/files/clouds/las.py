@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from orthoflow.files.clouds.dressing import DressedCloud, Points
-from orthoflow.files.points.libraries import load_library
+from orthoflow.files.points.scan_file import load_library
 from orthoflow.products import PointCloud
 
 # LAS 1.4 with colours.

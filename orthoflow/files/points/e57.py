@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from xml.parsers.expat import ExpatError, ParserCreate
@@ -21,16 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import (
+from orthoflow.files.points.fields import columns_of_names
+from orthoflow.files.points.scan_file import (
     BLOCK_POINTS,
     PointBlock,
-    PointField,
     Scan,
     ScanFile,
-    short_file_error,
+    Values,
+    cut_off,
+    load_library,
+    point_block,
+    reading,
 )
-from orthoflow.files.points.fields import columns_of_names, point_block
-from orthoflow.files.points.libraries import load_library, reading
 from orthoflow.files.points.units import (
     StatedUnit,
     unit_of_comments,
@@ -67,76 +69,46 @@ _PAYLOAD: Final = 1020
 _HEADER: Final = struct.Struct("<8sIIQQQQ")
 _ENCODING: Final = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", re.IGNORECASE)
 
-
-@dataclass(frozen=True, kw_only=True)
-class ScanHeader:
-    """The required parts of one Data3D entry.
-
-    Attributes:
-        index: position in the file's data3D.
-        n_points: stated number of points, including invalid ones.
-        names: fields of each point.
-        intensity: name of the field that is the intensity, or None.
-        rotation: (3, 3) world from scan.
-        translation: (3,) position of the scanner in the file's world.
-        scan: its own statements.
-    """
-
-    index: int
-    n_points: int
-    names: frozenset[str]
-    intensity: str | None
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    scan: Scan
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Names of the three coordinates."""
-        return _CARTESIAN if self.names.issuperset(_CARTESIAN) else _SPHERICAL
-
-    @property
-    def invalid_state(self) -> str:
-        """Name of the field that is non-zero for points without a position."""
-        return "cartesianInvalidState" if self.axes is _CARTESIAN else "sphericalInvalidState"
+# Index in the file, number of points, names of the fields that are read by meaning, its pose.
+_Part = tuple[int, int, dict[str, str], tuple[NDArray[np.float64], NDArray[np.float64]] | None]
 
 
 def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     """Open an E57 file; every scan with points is read, in the order of the file."""
     check_xml(path)
     pye57 = load_library("pye57", path)
+    parts: list[_Part] = []
+    scans: list[Scan] = []
     with reading(path, FORMAT), pye57.E57(str(path)) as file:
         unit = _unit(file.image_file.root())
-        headers = [
-            _read_header(path, file, index, intensity_field, unit)
-            for index in range(file.scan_count)
-            if file.data3d[index].isDefined("points")
-        ]
-    headers = [header for header in headers if header.n_points > 0]
+        for index in range(file.scan_count):
+            if file.data3d[index].isDefined("points"):
+                part, scan = _read_header(path, file, index, intensity_field)
+                scan.unit = unit
+                if part[1] > 0:
+                    parts.append(part)
+                    scans.append(scan)
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
-        n_most=sum(header.n_points for header in headers),
-        scans=[header.scan for header in headers],
-        read=lambda: _blocks(path, pye57, headers),
+        n_most=sum(n_points for _, n_points, *_ in parts),
+        scans=scans,
+        read=partial(_blocks, path, pye57, parts),
     )
 
 
 def _unit(root: Any) -> StatedUnit:
     """Metres, as in the standard, unless the coordinate metadata state another unit."""
-    metres = unit_of_name("m", "the E57 standard")
-    if not root.isDefined("coordinateMetadata"):
-        return metres
-    text = str(root["coordinateMetadata"].value())
+    text = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
     found = unit_of_crs(text, "coordinate metadata")
-    return found or unit_of_comments([text], "coordinate metadata") or metres
+    found = found or unit_of_comments([text], "coordinate metadata")
+    return found or unit_of_name("m", "the E57 standard")
 
 
 def _read_header(
-    path: Path, file: Any, index: int, intensity_field: str | None, unit: StatedUnit
-) -> ScanHeader:
+    path: Path, file: Any, index: int, intensity_field: str | None
+) -> tuple[_Part, Scan]:
     node = file.data3d[index]
-    points = node["points"]
     names = tuple(str(name) for name in file.get_header(index).point_fields)
     axes = next((axes for axes in (_CARTESIAN, _SPHERICAL) if set(names) >= set(axes)), None)
     if axes is None:
@@ -146,66 +118,53 @@ def _read_header(
         )
     renamed = [dict(zip(axes, _CARTESIAN, strict=True)).get(name, name) for name in names]
     columns = columns_of_names(renamed, intensity_field=intensity_field)
-    intensity = None
+    used = dict(zip("xyz", axes, strict=True))
     if columns is not None and "intensity" in columns.names:
-        intensity = names[columns.names.index("intensity")]
-    fields: list[PointField] = [] if intensity is None else ["intensity"]
-    fields += ["rgb"] if set(names) >= set(_COLOURS) else []
-    fields += ["grid"] if set(names) >= set(_GRID) else []
-    used = {*axes, intensity, *_STATES} | {
-        name for name in (*_COLOURS, *_GRID) if ("rgb" if name in _COLOURS else "grid") in fields
-    }
+        used["intensity"] = names[columns.names.index("intensity")]
+    for meanings, wanted in (("rgb", _COLOURS), (("row", "column"), _GRID)):
+        if set(names) >= set(wanted):
+            used |= dict(zip(meanings, wanted, strict=True))
+    groups = {"intensity": "intensity", "r": "rgb", "row": "grid"}
+    read = {*used.values(), *_STATES}
     rotation, translation = pose_of(node)
     is_posed = not (np.allclose(rotation, np.eye(3), atol=1e-12) and not translation.any())
+    brightest = [
+        _limits(node, "colorLimits", f"{name}Minimum", f"{name}Maximum") for name in _COLOURS
+    ]
     scan = Scan(
         name=str(node["name"].value()) if node.isDefined("name") else "",
-        fields=frozenset(fields),
-        fields_used=tuple(name for name in names if name in used),
-        fields_not_used=tuple(name for name in names if name not in used),
+        fields=frozenset(group for name, group in groups.items() if name in used),  # type: ignore[misc]
+        fields_used=tuple(name for name in names if name in read),
+        fields_not_used=tuple(name for name in names if name not in read),
         intensity_limits=_limits(node, "intensityLimits", "intensityMinimum", "intensityMaximum")
-        if intensity == "intensity"
+        if used.get("intensity") == "intensity"
         else None,
-        rgb_limit=_rgb_limit(node),
-        unit=unit,
+        rgb_limit=max(one[1] for one in brightest if one) if all(brightest) else None,
         station=translation,
         station_is_posed=is_posed,
     )
-    return ScanHeader(
-        index=index,
-        n_points=int(points.childCount()),
-        names=frozenset(names),
-        intensity=intensity,
-        rotation=rotation,
-        translation=translation,
-        scan=scan,
-    )
+    used |= {name: name for name in _STATES if name in names}
+    n_points = int(node["points"].childCount())
+    return (index, n_points, used, (rotation, translation) if is_posed else None), scan
 
 
 def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation and translation to the file's world; the identity without a pose."""
-    rotation = np.eye(3)
-    translation = np.zeros(3)
-    if not node.isDefined("pose"):
-        return rotation, translation
-    pose = node["pose"]
-    if pose.isDefined("rotation"):
-        # By name: files may store the four numbers in any order.
-        rotation = _rotation([number_of(pose["rotation"][name]) for name in "wxyz"])
-    if pose.isDefined("translation"):
-        translation = np.array([number_of(pose["translation"][name]) for name in "xyz"])
-    return rotation, translation
-
-
-def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
-    """Return world-from-scan of a quaternion w, x, y, z of any length; the identity without one."""
     from scipy.spatial.transform import Rotation
 
-    length = math.hypot(*quaternion)
-    if not (math.isfinite(length) and length > 0.0):
-        return np.eye(3)
-    # Normalised before scipy squares it: the squares of stored numbers may overflow or underflow.
-    unit = [item / length for item in quaternion]
-    return np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix(), dtype=np.float64)
+    rotation, translation = np.eye(3), np.zeros(3)
+    pose = node["pose"] if node.isDefined("pose") else None
+    if pose is not None and pose.isDefined("rotation"):
+        # By name: files may store the four numbers in any order.
+        quaternion = [number_of(pose["rotation"][name]) for name in "wxyz"]
+        length = math.hypot(*quaternion)
+        if math.isfinite(length) and length > 0.0:
+            # Normalised before scipy squares it: squares of stored numbers may over- or underflow.
+            unit = [item / length for item in quaternion]
+            rotation = np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix())
+    if pose is not None and pose.isDefined("translation"):
+        translation = np.array([number_of(pose["translation"][name]) for name in "xyz"])
+    return rotation, translation
 
 
 def number_of(node: Any) -> float:
@@ -215,107 +174,79 @@ def number_of(node: Any) -> float:
 
 
 def _limits(node: Any, group: str, low: str, high: str) -> tuple[float, float] | None:
-    if not node.isDefined(group):
-        return None
-    limits = node[group]
-    if not (limits.isDefined(low) and limits.isDefined(high)):
+    limits = node[group] if node.isDefined(group) else None
+    if limits is None or not (limits.isDefined(low) and limits.isDefined(high)):
         return None
     smallest, largest = number_of(limits[low]), number_of(limits[high])
     is_usable = math.isfinite(smallest) and math.isfinite(largest) and largest > smallest
     return (smallest, largest) if is_usable else None
 
 
-def _rgb_limit(node: Any) -> float | None:
-    """Return the largest colour value that the header states for any of the three channels."""
-    stated = [_limits(node, "colorLimits", f"{name}Minimum", f"{name}Maximum") for name in _COLOURS]
-    largest = [item[1] for item in stated if item is not None]
-    return max(largest) if len(largest) == 3 else None
-
-
-def _blocks(path: Path, pye57: Any, headers: list[ScanHeader]) -> Iterator[PointBlock]:
+def _blocks(path: Path, pye57: Any, parts: list[_Part]) -> Iterator[PointBlock]:
+    libe57 = pye57.libe57
     with reading(path, FORMAT):
         file = pye57.E57(str(path))
     try:
-        for scan, header in enumerate(headers):
-            yield from _scan_blocks(path, pye57.libe57, file, header, scan)
+        for scan, (index, n_points, used, pose) in enumerate(parts):
+            capacity, n_read = min(BLOCK_POINTS, n_points), 0
+            with reading(path, FORMAT):
+                arrays: Values = {}
+                buffers = libe57.VectorSourceDestBuffer()
+                for meaning, name in used.items():
+                    # No integers: pye57 treats numpy's 64-bit ones as 32-bit ones and returns
+                    # garbage, and its own readers' 16 bits are too few for rows and columns.
+                    kind = np.float64 if meaning in ("x", "y", "z", "row", "column") else np.float32
+                    arrays[meaning] = np.zeros(capacity, dtype=kind)
+                    buffers.append(
+                        libe57.SourceDestBuffer(
+                            file.image_file,
+                            name,
+                            arrays[meaning],
+                            capacity,
+                            doConversion=True,
+                            doScaling=True,
+                        )
+                    )
+                reader = file.data3d[index]["points"].reader(buffers)
+            while True:
+                with reading(path, FORMAT):
+                    count = int(reader.read())
+                if count == 0:
+                    break
+                n_read += count
+                values = {name: array[:count] for name, array in arrays.items()}
+                is_spherical = used["x"] == _SPHERICAL[0]
+                yield _block(values, scan, pose, is_spherical=is_spherical)
+            reader.close()
+            if n_read != n_points:
+                raise cut_off(path, f"scan {index}", f"{n_read} points", str(n_points))
     finally:
         file.close()
 
 
-def _scan_blocks(
-    path: Path, libe57: Any, file: Any, header: ScanHeader, scan: int
-) -> Iterator[PointBlock]:
-    wanted = {*header.axes, header.invalid_state, *_COLOURS, *_GRID, *_STATES} & header.names
-    if header.intensity is not None:
-        wanted.add(header.intensity)
-    capacity = min(BLOCK_POINTS, header.n_points)
-    with reading(path, FORMAT):
-        arrays, buffers = _buffers(libe57, file, sorted(wanted), capacity)
-        reader = file.data3d[header.index]["points"].reader(buffers)
-    n_read = 0
-    while True:
-        with reading(path, FORMAT):
-            count = int(reader.read())
-        if count == 0:
-            break
-        n_read += count
-        yield _block({name: array[:count] for name, array in arrays.items()}, header, scan)
-    reader.close()
-    if n_read != header.n_points:
-        raise short_file_error(
-            path, f"scan {header.index}", f"{n_read} points", str(header.n_points)
+def _block(
+    values: Values,
+    scan: int,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    *,
+    is_spherical: bool,
+) -> PointBlock:
+    axes = np.stack([values[axis] for axis in "xyz"])
+    if is_spherical:
+        # E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, radians.
+        distance, azimuth, elevation = axes
+        level = distance * np.cos(elevation)
+        axes = np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)]
         )
-
-
-def _buffers(
-    libe57: Any, file: Any, names: list[str], capacity: int
-) -> tuple[dict[str, NDArray[Any]], Any]:
-    arrays: dict[str, NDArray[Any]] = {}
-    buffers = libe57.VectorSourceDestBuffer()
-    for name in names:
-        # No integers: pye57 treats numpy's 64-bit ones as 32-bit ones and returns garbage, and its
-        # own readers' 16 bits are too few for rows and columns.
-        is_exact = name.startswith(("cartesian", "spherical", "row", "column"))
-        arrays[name] = np.zeros(capacity, dtype=np.float64 if is_exact else np.float32)
-        buffers.append(
-            libe57.SourceDestBuffer(
-                file.image_file, name, arrays[name], capacity, doConversion=True, doScaling=True
-            )
-        )
-    return arrays, buffers
-
-
-def _block(arrays: dict[str, NDArray[Any]], header: ScanHeader, scan: int) -> PointBlock:
-    axes = np.stack([arrays[name] for name in header.axes])
-    if header.axes is _SPHERICAL:
-        axes = _cartesian(axes)
-    values: dict[str, NDArray[np.generic]] = {}
-    if header.intensity is not None:
-        values["intensity"] = arrays[header.intensity]
-        if (invalid := arrays.get("isIntensityInvalid")) is not None:
-            values["intensity"] = np.where(invalid != 0, np.nan, values["intensity"])
-    if "rgb" in header.scan.fields:
-        values |= dict(zip("rgb", (arrays[name] for name in _COLOURS), strict=True))
-        if (invalid := arrays.get("isColorInvalid")) is not None:
-            values["has_rgb"] = invalid == 0
-    if "grid" in header.scan.fields:
-        values |= dict(zip(("row", "column"), (arrays[name] for name in _GRID), strict=True))
-    state = arrays.get(header.invalid_state)
-    block = point_block(
-        axes, values, causes=None if state is None else {"invalid": state != 0}, scan=scan
-    )
-    if not header.scan.station_is_posed:
-        return block
-    return replace(block, points=block.points @ header.rotation.T + header.translation)
-
-
-def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
-    """E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, radians."""
-    distance, azimuth, elevation = spherical
-    level = distance * np.cos(elevation)
-    return np.stack(
-        [level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)]
-    )
+    state = values.get(_STATES[is_spherical])
+    if "intensity" in values and "isIntensityInvalid" in values:
+        is_invalid = values["isIntensityInvalid"] != 0
+        values["intensity"] = np.where(is_invalid, np.nan, values["intensity"])
+    if "r" in values and "isColorInvalid" in values:
+        values["has_rgb"] = values["isColorInvalid"] == 0
+    causes = {} if state is None else {"invalid": state != 0}
+    return point_block(axes, values, causes=causes, scan=scan, pose=pose)
 
 
 def check_xml(path: Path) -> None:

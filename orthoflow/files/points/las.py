@@ -4,35 +4,39 @@ Header and chunk table are checked before the libraries use them: a damaged numb
 laspy busy for hours, and a damaged chunk table makes the decompressor allocate any amount of
 memory, which ends the process without an exception.
 
-lazrs decodes the chunks of a block in its own threads.
-
 For point formats 6 and up, whose fields are compressed separately, only the fields of a cloud are
-decoded. Of a COPC file only those nodes of the octree are decoded that hold requested points.
+decoded. A COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root
+holds some points of the whole cloud, each node below holds points between those, at twice the
+density. Only those nodes are decoded that hold requested points.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import struct
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import (
+from orthoflow.files.points.fields import columns_of_names
+from orthoflow.files.points.scan_file import (
     BLOCK_POINTS,
     PointBlock,
     Scan,
     ScanFile,
-    short_file_error,
+    Values,
+    Wish,
+    cut_off,
+    load_library,
+    point_block,
+    reading,
 )
-from orthoflow.files.points.copc import Node, Wish, read_octree
-from orthoflow.files.points.fields import columns_of_names, point_block
-from orthoflow.files.points.libraries import guarded, load_library, reading
 from orthoflow.files.points.units import StatedUnit, unit_of_crs, unit_of_geo_keys
 
 FORMAT: Final = "LAS/LAZ"
@@ -57,6 +61,20 @@ _GEO_KEYS: Final = 34735
 _LONGEST_WKT: Final = 100_000
 _MOST_EVLRS: Final = 1000
 _SAMPLE_POINTS: Final = 50_000
+_COPC_RECORD: Final = struct.Struct("<H16sHH32s")
+_COPC_INFO: Final = struct.Struct("<5d2Q")
+_COPC_ENTRY: Final = struct.Struct("<4iQii")
+_PAGE: Final = -1
+# Deeper trees have nodes smaller than any scanner's point spacing.
+_LEVELS_MOST: Final = 32
+
+
+class _Chunk(NamedTuple):
+    """A chunk of a file: where it begins, its size, and the number of its points."""
+
+    offset: int
+    n_bytes: int
+    n_points: int
 
 
 def open_las(
@@ -80,25 +98,26 @@ def open_las(
     # Records after the points may state any size: only that of the coordinate system is read.
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
-        n_points = _n_points(path, header, notes)
+        n_points = _count_points(path, header, notes)
         chunks = _checked_chunks(path, header) if n_points > 0 else []
         unit = _unit(path, header)
-    nodes: tuple[Node, ...] | None = None
-    octree = read_octree(path, chunks) if wish and chunks else None
-    if octree is not None and wish:
-        nodes = octree.chosen(wish)
+    nodes = _chosen_nodes(path, chunks, wish) if wish and chunks else None
+    if nodes is not None:
         n_points = sum(node.n_points for node in nodes)
     names = tuple(header.point_format.dimension_names)
     extra = tuple(header.point_format.extra_dimension_names)
     columns = columns_of_names(names, intensity_field=intensity_field)
     intensity = "intensity" if columns is None else names[columns.names.index("intensity")]
     if intensity == "intensity" and intensity_field is None and n_points:
-        intensity = _in_place_of_zeros(path, laspy, extra)
+        # If the usual field holds only zeros, an extra one stands in for it.
+        others = columns_of_names(("x", "y", "z", *extra))
+        if others is not None and "intensity" in others.names:
+            with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
+                sample = next(reader.chunk_iterator(_SAMPLE_POINTS))
+            if not np.asarray(sample.intensity).any():
+                intensity = extra[others.names.index("intensity") - 3]
     has_rgb = set(names) >= set(_COLOURS)
     used = ("X", "Y", "Z", intensity, *(_COLOURS if has_rgb else ()))
-    wanted = _Wanted(
-        n_points=n_points, classes=frozenset(classes), intensity=intensity, nodes=nodes
-    )
     scan = Scan(
         # Points of every format have an intensity.
         fields=frozenset({"intensity", "rgb"} if has_rgb else {"intensity"}),
@@ -113,121 +132,99 @@ def open_las(
         format_name=FORMAT,
         n_most=n_points,
         scans=[scan],
-        read=lambda: _blocks(path, laspy, notes, wanted),
+        read=partial(_blocks, path, laspy, notes, n_points, frozenset(classes), intensity, nodes),
         notes=notes,
         is_chosen=nodes is not None,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Wanted:
-    """The requested parts of a file.
-
-    Attributes:
-        n_points: stated by its header, or by its octree for the nodes.
-        classes: classes of the points; empty for all.
-        intensity: name of the field to use as the intensity.
-        nodes: nodes of the octree, in the order of the file; None for all points of the file.
-    """
-
-    n_points: int
-    classes: frozenset[int]
-    intensity: str
-    nodes: tuple[Node, ...] | None = None
-
-
-def _n_points(path: Path, header: Any, notes: list[str]) -> int:
+def _count_points(path: Path, header: Any, notes: list[str]) -> int:
     """Number of points; if an uncompressed file holds more than its header states, that."""
     stated = int(header.point_count)
     if header.are_points_compressed:
         return stated
-    start, n_bytes = int(header.offset_to_point_data), int(header.point_format.size)
+    start = int(header.offset_to_point_data)
     ends = [path.stat().st_size]
     if header.version.minor >= 4 and header.number_of_evlrs:
         ends.append(int(header.start_of_first_evlr))
     if header.version.minor >= 3 and header.start_of_waveform_data_packet_record > start:
         ends.append(int(header.start_of_waveform_data_packet_record))
-    present, rest = divmod(min(ends) - start, n_bytes)
-    if present > stated and rest == 0:
-        notes.append(
-            f"{path.name}: its header states {stated} points, but it holds {present}: all are read"
-        )
-        return int(present)
-    return stated
+    present, rest = divmod(min(ends) - start, int(header.point_format.size))
+    if present <= stated or rest:
+        return stated
+    notes.append(
+        f"{path.name}: its header states {stated} points, but it holds {present}: all are read"
+    )
+    return int(present)
 
 
 def _unit(path: Path, header: Any) -> StatedUnit | None:
     """Unit of the coordinate system, from WKT if the file has it, else from GeoTIFF keys."""
     texts = [getattr(vlr, "string", "") for vlr in header.vlrs if vlr.record_id == _WKT_RECORD]
-    texts += _wkt_behind_points(path)
-    for text in texts:
+    for text in [*texts, *_wkt_behind_points(path)]:
         found = unit_of_crs(str(text), "WKT")
         if found is not None:
             return found
-    keys = {}
+    keys: dict[int, int] = {}
     for vlr in header.vlrs:
         if vlr.user_id.strip("\0") == "LASF_Projection" and vlr.record_id == _GEO_KEYS:
             raw = vlr.record_data_bytes()
-            words = struct.unpack(f"<{len(raw) // 2}H", raw[: len(raw) // 2 * 2])
-            for place in range(4, len(words) - 3, 4):
-                key, location, _, value = words[place : place + 4]
-                if location == 0:
-                    keys[key] = value
+            entries = np.frombuffer(raw[: len(raw) // 8 * 8], "<u2").reshape(-1, 4)[1:]
+            keys |= {int(key): int(value) for key, place, _, value in entries if place == 0}
     return unit_of_geo_keys(keys)
 
 
-def _wkt_behind_points(path: Path) -> list[str]:
+def _wkt_behind_points(path: Path) -> Iterator[str]:
     """Yield coordinate systems in the records after the points, limited in number and size."""
-    found = []
+    n_file = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
         if header[25] < 4 or len(header) < _HEADER_BYTES:
-            return []
+            return
         start, n_records = struct.unpack_from("<QI", header, 235)
         for _ in range(min(n_records, _MOST_EVLRS)):
+            if start + _EVLR_BYTES > n_file:
+                return
             file.seek(start)
-            head = file.read(_EVLR_BYTES)
-            if len(head) < _EVLR_BYTES:
-                break
-            _, _, record, n_bytes = struct.unpack_from("<H16sHQ", head)
+            _, _, record, n_bytes = struct.unpack_from("<H16sHQ", file.read(_EVLR_BYTES))
             if record == _WKT_RECORD and n_bytes < _LONGEST_WKT:
-                found.append(file.read(n_bytes).decode("utf-8", "replace"))
+                yield file.read(n_bytes).decode("utf-8", "replace")
             start += _EVLR_BYTES + n_bytes
-            if start > path.stat().st_size:
-                break
-    return found
 
 
-def _in_place_of_zeros(path: Path, laspy: Any, extra: tuple[str, ...]) -> str:
-    """Name of the extra field to use as the intensity if the usual one holds only zeros."""
-    columns = columns_of_names(("x", "y", "z", *extra))
-    if columns is None or "intensity" not in columns.names:
-        return "intensity"
-    with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
-        sample = next(reader.chunk_iterator(_SAMPLE_POINTS))
-    if np.asarray(sample.intensity).any():
-        return "intensity"
-    return extra[columns.names.index("intensity") - 3]
-
-
-def _blocks(path: Path, laspy: Any, notes: list[str], wanted: _Wanted) -> Iterator[PointBlock]:
-    n_read = 0
+def _blocks(
+    path: Path,
+    laspy: Any,
+    notes: list[str],
+    n_points: int,
+    classes: frozenset[int],
+    intensity: str,
+    nodes: Sequence[_Chunk] | None,
+) -> Iterator[PointBlock]:
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
-    check = _BoundsCheck(path, header)
-    for chunk in guarded(_records(path, laspy, header, wanted), path, FORMAT):
+    n_read = n_outside = 0
+    records = _records(path, laspy, header, n_points, classes, intensity, nodes)
+    while True:
         with reading(path, FORMAT):
-            block = _block(chunk, wanted)
+            chunk = next(records, None)
+            if chunk is None:
+                break
+            block = _block(chunk, classes, intensity)
         n_read += block.n_read
-        check.add(block)
+        n_outside += _count_outside(path, header, block)
         yield block
-    if n_read != wanted.n_points:
-        raise short_file_error(path, "data", f"{n_read} points", f"{wanted.n_points}")
-    notes.extend(check.notes())
+    if n_read != n_points:
+        raise cut_off(path, "data", f"{n_read} points", f"{n_points}")
+    if n_outside:
+        notes.append(
+            f"{path.name}: {n_outside} points lie outside the bounds its header states; they are "
+            "kept, but check that the file is whole"
+        )
 
 
-def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
-    values: dict[str, NDArray[np.generic]] = {"intensity": np.asarray(chunk[wanted.intensity])}
+def _block(chunk: Any, classes: frozenset[int], intensity: str) -> PointBlock:
+    values: Values = {"intensity": np.asarray(chunk[intensity])}
     if set(chunk.point_format.dimension_names) >= set(_COLOURS):
         values |= {name[0]: np.asarray(chunk[name]) for name in _COLOURS}
     causes: dict[str, NDArray[np.bool_]] = {}
@@ -235,14 +232,8 @@ def _block(chunk: Any, wanted: _Wanted) -> PointBlock:
         flags = getattr(chunk, cause)
         if np.bitwise_or.reduce(flags.array) & flags.bit_mask:
             causes[cause] = np.asarray(flags, dtype=np.bool_)
-    if wanted.classes:
-        causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(wanted.classes))
-    block = point_block(_coordinates(chunk), values, causes=causes)
-    return replace(block, bounds=_bounds(block.points.T))
-
-
-def _coordinates(chunk: Any) -> NDArray[np.float64]:
-    """Return (3, n) coordinates of a record, axis by axis: later passes run along the axes."""
+    if classes:
+        causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(classes))
     axes = np.empty((3, len(chunk)))
     # In parts, so that a part stays in the processor's cache from one step to the next.
     for start in range(0, len(chunk), _PART_POINTS):
@@ -251,76 +242,41 @@ def _coordinates(chunk: Any) -> NDArray[np.float64]:
             # Scale and offset in float64: survey coordinates keep every digit.
             np.multiply(chunk[name][part], chunk.scales[place], out=axes[place, part])
             axes[place, part] += chunk.offsets[place]
-    return axes
+    return point_block(axes, values, causes=causes)
 
 
-def _bounds(axes: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return (2, 3) bounds of coordinates (3, n); None without any or if some are not finite."""
-    if not axes.size:
-        return None
-    bounds = np.stack([axes.min(axis=1), axes.max(axis=1)])
-    return bounds if np.isfinite(bounds).all() else None
-
-
-class _BoundsCheck:
-    """Compares points with the bounds that the header states.
+def _count_outside(path: Path, header: Any, block: PointBlock) -> int:
+    """Count points outside the bounds that the header states.
 
     Compressed points have no checksum, so the bounds are the only indication of a changed byte:
     some points far outside are damage. Bounds elsewhere (the points were moved, or others appended)
     are stale, and only reported.
+
+    Raises:
+        InputError: a compressed file is damaged.
     """
-
-    def __init__(self, path: Path, header: Any) -> None:
-        self._path = path
-        self._is_compressed = bool(header.are_points_compressed)
-        self._low, self._high = (np.asarray(b, np.float64) for b in (header.mins, header.maxs))
-        self._extent = float((self._high - self._low).max())
-        bounds = np.stack([self._low, self._high])
-        # Implausible bounds are ignored; NaN compares as False.
-        self._is_usable = bool(
-            np.all(np.abs(bounds) < _FARTHEST)
-            and np.all(self._high >= self._low)
-            and self._extent > 0.0
-        )
-        self._n_outside = 0
-
-    def add(self, block: PointBlock) -> None:
-        """Compare a block.
-
-        Raises:
-            InputError: a compressed file is damaged.
-        """
-        if not self._is_usable or not len(block.points):
-            return
-        # Headers are often rounded to the last digit.
-        slack = 1e-3 * max(self._extent, 1.0)
-        found = block.bounds
-        if (
-            found is not None
-            and np.all(found[0] >= self._low - slack)
-            and np.all(found[1] <= self._high + slack)
-        ):
-            return
-        beyond = np.maximum(self._low - block.points, block.points - self._high).max(axis=1)
-        is_outside = beyond > slack
-        far = float(beyond.max())
-        if self._is_compressed and far > max(self._extent, 1.0):
-            low, high = np.percentile(block.points, (5, 95), axis=0)
-            is_moved = is_outside.mean() > 0.5 and (high - low).max() < 2.0 * self._extent
-            if not is_moved:
-                raise InputError(
-                    f"{self._path.name} is damaged: points lie {far:.0f} units outside the bounds "
-                    f"its header states ({self._low.tolist()} to {self._high.tolist()}); copy or "
-                    "export it again"
-                )
-        self._n_outside += int(np.count_nonzero(is_outside))
-
-    def notes(self) -> list[str]:
-        """Return what to report."""
-        if not self._n_outside:
-            return []
-        text = f"{self._path.name}: {self._n_outside} points lie outside the bounds its header "
-        return [text + "states; they are kept, but check that the file is whole"]
+    low, high = (np.asarray(bound, np.float64) for bound in (header.mins, header.maxs))
+    extent = float((high - low).max())
+    # Implausible bounds are ignored; NaN compares as False.
+    is_usable = np.all(np.abs([low, high]) < _FARTHEST) and np.all(high >= low) and extent > 0.0
+    # Headers are often rounded to the last digit.
+    slack = 1e-3 * max(extent, 1.0)
+    if not is_usable or (
+        np.all(block.bounds[0] >= low - slack) and np.all(block.bounds[1] <= high + slack)
+    ):
+        return 0
+    beyond = np.maximum(low - block.points, block.points - high).max(axis=1)
+    is_outside, far = beyond > slack, float(beyond.max())
+    if header.are_points_compressed and far > max(extent, 1.0):
+        ends = np.percentile(block.points, (5, 95), axis=0)
+        is_moved = is_outside.mean() > 0.5 and np.ptp(ends, axis=0).max() < 2.0 * extent
+        if not is_moved:
+            raise InputError(
+                f"{path.name} is damaged: points lie {far:.0f} units outside the bounds "
+                f"its header states ({low.tolist()} to {high.tolist()}); copy or "
+                "export it again"
+            )
+    return int(np.count_nonzero(is_outside))
 
 
 def _check_header(path: Path) -> None:
@@ -345,7 +301,7 @@ def _check_header(path: Path) -> None:
             raise _damaged(path, "records at its end are missing, it is cut off")
 
 
-def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
+def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
     """Compare the chunk table with the file's size and the header's number of points.
 
     Args:
@@ -353,7 +309,7 @@ def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
         header: laspy's header of it.
 
     Returns:
-        Offset in the file, bytes and points of each chunk; none without compression by chunks.
+        The chunks; none without compression by chunks.
 
     Raises:
         InputError: the table cannot belong to this file.
@@ -367,30 +323,47 @@ def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
     compression = lazrs.LazVlr(record)
     if compression.item_size() != header.point_format.size:
         raise _damaged(path, "its points are not as large as its header states")
-    start = int(header.offset_to_point_data)
+    start, n_stated = int(header.offset_to_point_data), int(header.point_count)
+    n_file = path.stat().st_size
     with path.open("rb") as file:
-        n_bytes = _check_size(path, file, start, int(header.point_count))
+        at = _offset_at(path, file, start)
+        if at <= 0:
+            # Written at the end by programs that could not go back.
+            at = _offset_at(path, file, n_file - _OFFSET_BYTES)
+        if not start + _OFFSET_BYTES <= at <= n_file - _OFFSET_BYTES:
+            raise _damaged(path, "its chunk table lies outside the file, which is cut off")
+        n_bytes = at - start - _OFFSET_BYTES
+        n_chunks = _offset_at(path, file, at) >> 32 & 0xFFFFFFFF
+        if n_chunks > min(n_stated, n_bytes):
+            raise _damaged(path, f"its chunk table states {n_chunks} chunks")
         file.seek(start)
         table = lazrs.read_chunk_table(file, compression)
+    _check_chunks(path, header, compression, table, n_bytes)
+    if struct.unpack_from("<H", record)[0] == _LAYERED:
+        _check_layers(path, record, start + _OFFSET_BYTES, [size for _, size in table])
+    begins = itertools.accumulate((size for _, size in table), initial=start + _OFFSET_BYTES)
+    return [_Chunk(begin, size, n) for begin, (n, size) in zip(begins, table, strict=False)]
+
+
+def _offset_at(path: Path, file: BinaryIO, place: int) -> int:
+    file.seek(place)
+    raw = file.read(_OFFSET_BYTES)
+    if len(raw) < _OFFSET_BYTES:
+        raise _damaged(path, "it ends before its points begin")
+    return int(struct.unpack("<q", raw)[0])
+
+
+def _check_chunks(
+    path: Path, header: Any, compression: Any, table: list[tuple[int, int]], n_bytes: int
+) -> None:
+    n_stated, n_points = int(header.point_count), sum(count for count, _ in table)
     if sum(size for _, size in table) > n_bytes:
         raise _damaged(path, "its chunks are larger than the file")
     is_variable = compression.uses_variable_size_chunks()
-    if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * header.point_count):
+    if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * n_stated):
         raise _damaged(path, f"its header states chunks of {compression.chunk_size()} points each")
-    n_points = sum(count for count, _ in table)
-    if _is_layered(record):
-        _check_layers(path, record, start + _OFFSET_BYTES, [size for _, size in table])
-    if n_points < header.point_count or (is_variable and n_points != header.point_count):
-        raise _damaged(
-            path, f"its chunks hold {n_points} points, its header states {header.point_count}"
-        )
-    sizes = [size for _, size in table]
-    begins = itertools.accumulate(sizes, initial=start + _OFFSET_BYTES)
-    return [(begin, size, count) for begin, (count, size) in zip(begins, table, strict=False)]
-
-
-def _is_layered(record: bytes) -> bool:
-    return bool(struct.unpack_from("<H", record)[0] == _LAYERED)
+    if n_points < n_stated or (is_variable and n_points != n_stated):
+        raise _damaged(path, f"its chunks hold {n_points} points, its header states {n_stated}")
 
 
 def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
@@ -415,78 +388,52 @@ def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> N
             start += n_bytes
 
 
-def _check_size(path: Path, file: Any, start: int, n_points: int) -> int:
-    """Check position and length of the table; return the bytes of the chunks before it."""
-    n_file = path.stat().st_size
-    file.seek(start)
-    table = _read_offset(path, file)
-    if table <= 0:
-        # Written at the end by programs that could not go back.
-        file.seek(n_file - _OFFSET_BYTES)
-        table = _read_offset(path, file)
-    if not start + _OFFSET_BYTES <= table <= n_file - _OFFSET_BYTES:
-        raise _damaged(path, "its chunk table lies outside the file, which is cut off")
-    file.seek(table)
-    _, n_chunks = struct.unpack("<II", file.read(_OFFSET_BYTES))
-    n_bytes = table - start - _OFFSET_BYTES
-    if n_chunks > min(n_points, n_bytes):
-        raise _damaged(path, f"its chunk table states {n_chunks} chunks")
-    return n_bytes
-
-
-def _read_offset(path: Path, file: Any) -> int:
-    raw = file.read(_OFFSET_BYTES)
-    if len(raw) < _OFFSET_BYTES:
-        raise _damaged(path, "it ends before its points begin")
-    return int(struct.unpack("<q", raw)[0])
-
-
 def _damaged(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name} cannot be read as LAS/LAZ: {reason}; copy or export it again")
 
 
-def _records(path: Path, laspy: Any, header: Any, wanted: _Wanted) -> Iterator[Any]:
+def _records(
+    path: Path,
+    laspy: Any,
+    header: Any,
+    n_points: int,
+    classes: frozenset[int],
+    intensity: str,
+    nodes: Sequence[_Chunk] | None,
+) -> Iterator[Any]:
     """Yield laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
-
-    Args:
-        path: the file; its header and chunk table have been checked.
-        laspy: the library.
-        header: laspy's header of it.
-        wanted: what is read of it.
 
     Raises:
         BaseException: whatever the library raises for a damaged file.
     """
+
+    def record(points: NDArray[Any]) -> Any:
+        return laspy.ScaleAwarePointRecord(
+            points, header.point_format, header.scales, header.offsets
+        )
+
+    row = header.point_format.dtype()
     if not header.are_points_compressed:
         # Mapped, so that also a file can be read whose header states too few points.
-        start, dtype = int(header.offset_to_point_data), header.point_format.dtype()
-        n_present = min(wanted.n_points, (path.stat().st_size - start) // dtype.itemsize)
-        points = np.memmap(path, dtype=dtype, mode="r", offset=start, shape=(n_present,))
+        start = int(header.offset_to_point_data)
+        n_present = min(n_points, (path.stat().st_size - start) // row.itemsize)
+        mapped = np.memmap(path, dtype=row, mode="r", offset=start, shape=(n_present,))
         for first in range(0, n_present, BLOCK_POINTS):
-            part = np.asarray(points[first : first + BLOCK_POINTS])
-            yield laspy.ScaleAwarePointRecord(
-                part, header.point_format, header.scales, header.offsets
-            )
+            yield record(np.asarray(mapped[first : first + BLOCK_POINTS]))
         return
     fields = laspy.DecompressionSelection.base().decompress_z().decompress_flags()
     fields = fields.decompress_intensity().decompress_rgb()
-    if wanted.classes:
+    if classes:
         fields = fields.decompress_classification()
-    if wanted.intensity != "intensity":
+    if intensity != "intensity":
         fields = fields.decompress_all_extra_bytes()
-    if wanted.nodes is not None:
-        yield from _nodes_decoded(path, laspy, header, wanted.nodes, fields.to_lazrs())
+    if nodes is None:
+        with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
+            yield from reader.chunk_iterator(BLOCK_POINTS)
         return
-    with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
-        yield from reader.chunk_iterator(BLOCK_POINTS)
-
-
-def _nodes_decoded(
-    path: Path, laspy: Any, header: Any, nodes: Sequence[Node], fields: Any
-) -> Iterator[Any]:
-    """Decode some chunks of a file, as many at once as make a block."""
+    # As many nodes at once as make a block.
     lazrs = load_library("lazrs", path)
-    record = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    compression = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     totals = itertools.accumulate(node.n_points for node in nodes)
     by_block = zip(nodes, totals, strict=True)
     with path.open("rb") as file:
@@ -496,13 +443,93 @@ def _nodes_decoded(
             for node in group:
                 file.seek(node.offset)
                 packed += file.read(node.n_bytes)
-            n_points = sum(node.n_points for node in group)
-            points = np.zeros(n_points * int(header.point_format.size), dtype=np.uint8)
+            points = np.zeros(sum(node.n_points for node in group) * row.itemsize, dtype=np.uint8)
             table = [(node.n_points, node.n_bytes) for node in group]
-            lazrs.decompress_points_with_chunk_table(bytes(packed), record, points, table, fields)
-            yield laspy.ScaleAwarePointRecord(
-                points.view(header.point_format.dtype()),
-                header.point_format,
-                header.scales,
-                header.offsets,
+            lazrs.decompress_points_with_chunk_table(
+                bytes(packed), compression, points, table, fields.to_lazrs()
             )
+            yield record(points.view(row))
+
+
+def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], wish: Wish) -> list[_Chunk] | None:
+    """Return the nodes of a COPC file with requested points, in the order of the file.
+
+    The first level whose points are no farther apart than requested is the last one. If no node
+    meets the box, the root is returned, whose points show where the cloud is.
+
+    Returns:
+        None for a file without an octree.
+
+    Raises:
+        InputError: the octree does not fit the file.
+    """
+    n_start = _HEADER_BYTES + _COPC_RECORD.size + _COPC_INFO.size
+    with path.open("rb") as file:
+        start = file.read(n_start)
+    if len(start) < n_start:
+        return None
+    _, user, record, _, _ = _COPC_RECORD.unpack_from(start, _HEADER_BYTES)
+    if user.rstrip(b"\0") != b"copc" or record != 1:
+        return None
+    *middle, half, spacing, offset, n_bytes = _COPC_INFO.unpack_from(
+        start, _HEADER_BYTES + _COPC_RECORD.size
+    )
+    if not (np.isfinite([*middle, half, spacing]).all() and half > 0.0 and spacing > 0.0):
+        raise _bad_octree(path, "its root has no size")
+    nodes = _read_nodes(path, (offset, n_bytes))
+    if not set(nodes.values()) <= set(chunks):
+        raise _bad_octree(path, "it names chunks that the file does not have")
+    last = _LEVELS_MOST
+    if wish.spacing is not None:
+        # One by one: a damaged file's spacing may be so large that the quotient is not finite.
+        levels = math.log2(spacing) - math.log2(wish.spacing)
+        last = max(0, math.ceil(levels - 1e-9))
+    # Coordinates are rounded to steps of the file.
+    slack = 2e-6 * half
+
+    def is_wanted(level: int, *place: int) -> bool:
+        if wish.box is None or level > last:
+            return level <= last
+        side = 2.0 * half / 2.0**level
+        low = np.array(middle) - half + side * np.array(place)
+        return bool(
+            np.all(wish.box[0] <= low + side + slack) and np.all(wish.box[1] >= low - slack)
+        )
+
+    found = [chunk for key, chunk in nodes.items() if is_wanted(*key)]
+    return sorted(found or [chunk for key, chunk in nodes.items() if key[0] == 0])
+
+
+def _read_nodes(path: Path, root: tuple[int, int]) -> dict[tuple[int, ...], _Chunk]:
+    """Return the chunk of each node with points, by its level and its place there."""
+    n_file = n_left = path.stat().st_size
+    nodes: dict[tuple[int, ...], _Chunk] = {}
+    pages, seen = [root], {root}
+    with path.open("rb") as file:
+        while pages:
+            offset, n_bytes = pages.pop()
+            # Pages are adjacent, so that together they are no longer than the file.
+            n_left -= n_bytes
+            if offset + n_bytes > n_file or n_left < 0:
+                raise _bad_octree(path, "its pages lie outside the file")
+            file.seek(offset)
+            page = file.read(n_bytes // _COPC_ENTRY.size * _COPC_ENTRY.size)
+            for level, x, y, z, begin, size, count in _COPC_ENTRY.iter_unpack(page):
+                is_inside = 0 <= level < _LEVELS_MOST and min(x, y, z) >= 0
+                if not is_inside or max(x, y, z) >= 2**level or size < 0 or count < _PAGE:
+                    raise _bad_octree(path, "a node lies outside the root")
+                if count == _PAGE and (begin, size) not in seen:
+                    seen.add((begin, size))
+                    pages.append((begin, size))
+                elif count > 0:
+                    nodes[level, x, y, z] = _Chunk(begin, size, count)
+    if not nodes:
+        raise _bad_octree(path, "it has no nodes")
+    return nodes
+
+
+def _bad_octree(path: Path, reason: str) -> InputError:
+    return InputError(
+        f"{path.name} cannot be read as COPC: its octree is damaged, {reason}; copy or export it "
+        "again, or leave out box and gsd_m, without which all of its points are read"
+    )

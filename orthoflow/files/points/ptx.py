@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -16,11 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import BLOCK_POINTS, PointBlock, Scan, ScanFile
-from orthoflow.files.points.fields import Columns, axes_of, point_block
-from orthoflow.files.points.tables import Layout, find_data, read_table, take_lines
+from orthoflow.files.points.fields import Columns
+from orthoflow.files.points.scan_file import (
+    BLOCK_POINTS,
+    PointBlock,
+    Scan,
+    ScanFile,
+    axes_of,
+    point_block,
+)
+from orthoflow.files.points.text import (
+    MOST_LINE_BYTES,
+    Layout,
+    find_layout,
+    long_line,
+    read_table,
+    take_lines,
+    values_of,
+)
 
-FORMAT: Final = "PTX"
 HEADER_LINES: Final = 10
 _COLUMNS: Final = {
     3: "x y z",
@@ -29,7 +45,6 @@ _COLUMNS: Final = {
     7: "x y z intensity r g b",
 }
 _HEADER: Final = re.compile(rb"^[ \t]*\d{1,9}[ \t]*\r?\n[ \t]*\d{1,9}[ \t]*\r?\n", re.MULTILINE)
-_HEADER_NUMBER: Final = re.compile(r"\d+")
 _BLANK: Final = re.compile(rb"^[ \t]*\r?\n", re.MULTILINE)
 _SAMPLE_LINES: Final = 200
 _SEARCH_BYTES: Final = 1 << 24
@@ -39,144 +54,140 @@ _MOST_SCANS: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanHeader:
-    """The ten lines before each scan, and where its points lie.
+class _Part:
+    """A scan's place in the file, its grid and pose, and what its lines hold.
 
     Attributes:
-        n_columns: columns of the scan grid; points come column by column.
-        n_rows: rows.
-        world_from_scan: (4, 4), points as columns.
-        start: of the first line of points in the file, bytes.
-        end: of the last one.
+        start: of the first line of points, bytes; `end` is behind the last one.
         first_line: number of the first line of points.
         n_points: lines with points.
+        n_rows: rows of the grid; points come column by column.
+        n_places: rows times columns.
+        pose: rotation and translation, world from scan.
         layout: how the numbers of a line are told apart.
-        columns: what they are.
     """
 
-    n_columns: int
-    n_rows: int
-    world_from_scan: NDArray[np.float64]
     start: int
     end: int
     first_line: int
     n_points: int
+    n_rows: int
+    n_places: int
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]]
     layout: Layout
-    columns: Columns
 
     @property
     def is_whole(self) -> bool:
         """Whether there is a line for each place of the grid."""
-        return self.n_points == self.n_columns * self.n_rows
+        return self.n_points == self.n_places
+
+    @property
+    def columns(self) -> Columns:
+        """What the columns are."""
+        return Columns(names=tuple(_COLUMNS[self.layout.n_columns].split()))
+
+    def scan(self) -> Scan:
+        """Return what is known of the scan."""
+        scan = self.columns.scan(station=self.pose[1])
+        if self.is_whole:
+            scan.fields |= {"grid"}
+        # The format's own scales; data beyond them are scaled by what is there.
+        scan.intensity_limits = (0.0, 1.0) if "intensity" in scan.fields else None
+        scan.rgb_limit = 255.0 if "rgb" in scan.fields else None
+        return scan
 
 
 def open_ptx(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     """Open a PTX file; its fields have no names, so that there is no choice among them."""
-    starts = _find_headers(path)
-    if not starts or starts[0][0] > 0:
+    del intensity_field
+    places = _find_headers(path)
+    if len(places) < 2 or places[0][0] > 0:
         raise _bad_header(path, 1)
-    ends = [start for start, _ in starts[1:]] + [path.stat().st_size]
     with path.open("rb") as file:
-        headers = [
-            _read_header(path, file, start, end, line)
-            for (start, line), end in zip(starts, ends, strict=True)
-        ]
-    notes = []
-    for k, header in enumerate(headers):
-        n_places = header.n_columns * header.n_rows
-        if not header.is_whole:
-            notes.append(
-                f"{path.name}: scan {k} has {header.n_points} lines of points, its header states "
-                f"{header.n_columns} x {header.n_rows} = {n_places}: they are read without their "
-                "places in the scan's grid"
-            )
+        parts = [_read_header(path, file, *first, *behind) for first, behind in pairwise(places)]
+    notes = [
+        f"{path.name}: scan {k} has {part.n_points} lines of points, its header states "
+        f"{part.n_places // part.n_rows if part.n_rows else 0} x {part.n_rows} = {part.n_places}: "
+        "they are read without their places in the scan's grid"
+        for k, part in enumerate(parts)
+        if not part.is_whole
+    ]
     return ScanFile(
         name=path.name,
-        format_name=FORMAT,
-        n_most=sum(header.n_points for header in headers),
-        scans=[_scan(header) for header in headers],
-        read=lambda: _blocks(path, headers),
+        format_name="PTX",
+        n_most=sum(part.n_points for part in parts),
+        scans=[part.scan() for part in parts],
+        read=partial(_blocks, path, parts),
         notes=notes,
     )
 
 
-def _scan(header: ScanHeader) -> Scan:
-    fields = header.columns.fields
-    return Scan(
-        fields=fields | {"grid"} if header.is_whole else fields,
-        fields_used=header.columns.names,
-        # The format's own scale; data beyond it are scaled by what is there.
-        intensity_limits=(0.0, 1.0) if "intensity" in fields else None,
-        rgb_limit=255.0 if "rgb" in fields else None,
-        station=header.world_from_scan[:3, 3],
-    )
-
-
-def _blocks(path: Path, headers: list[ScanHeader]) -> Iterator[PointBlock]:
+def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
     with path.open("rb") as file:
-        for scan, header in enumerate(headers):
-            file.seek(header.start)
-            n_read, line = 0, header.first_line
-            while n_read < header.n_points:
-                n_lines = min(BLOCK_POINTS, header.n_points - n_read)
-                table = read_table(
-                    file,
-                    header.layout,
-                    header.columns.positions,
-                    n_lines=n_lines,
-                    first_line=line,
-                )
+        for scan, part in enumerate(parts):
+            file.seek(part.start)
+            n_read, line = 0, part.first_line
+            while n_read < part.n_points:
+                n_lines = min(BLOCK_POINTS, part.n_points - n_read)
+                places = part.columns.places.values()
+                table = read_table(file, part.layout, places, n_lines=n_lines, first_line=line)
                 line += n_lines
-                if file.tell() >= header.end and not len(table):
+                if file.tell() >= part.end and not len(table):
                     break
-                yield _placed(table, header, scan, n_read)
+                values = values_of(table, part.columns)
+                if part.is_whole:
+                    index = np.arange(n_read, n_read + len(table), dtype=np.int64)
+                    values["row"], values["column"] = index % part.n_rows, index // part.n_rows
+                yield point_block(axes_of(values), values, scan=scan, pose=part.pose)
                 n_read += len(table)
 
 
-def _placed(table: NDArray[np.float64], header: ScanHeader, scan: int, start: int) -> PointBlock:
-    rotation, translation = header.world_from_scan[:3, :3], header.world_from_scan[:3, 3]
-    values: dict[str, NDArray[np.generic]]
-    values = dict(zip(header.columns.used, table.T, strict=True))
-    if header.is_whole:
-        index = np.arange(start, start + len(table), dtype=np.int64)
-        values["row"], values["column"] = index % header.n_rows, index // header.n_rows
-    block = point_block(axes_of(values), values, scan=scan)
-    return replace(block, points=block.points @ rotation.T + translation)
-
-
-def _find_headers(path: Path) -> list[tuple[int, int]]:
-    """Offset in bytes and number of line, from 1, of each header."""
-    found: list[tuple[int, int]] = []
+def _find_headers(path: Path) -> list[tuple[int, int, int]]:
+    """Offset, number of the line from 1, and filled lines before each header, and at the end."""
+    found: list[tuple[int, int, int]] = []
+    offset, line, n_filled, kept = 0, 1, 0, b""
     with path.open("rb") as file:
-        offset = line = 0
-        kept = b""
-        while block := file.read(_SEARCH_BYTES):
+        is_last = False
+        while not is_last:
+            block = file.read(_SEARCH_BYTES)
+            is_last = len(block) < _SEARCH_BYTES
             text = kept + block
+            # Whole lines; the end, where a header may begin, is looked through with the next.
+            cut = len(text)
+            if not is_last:
+                cut = text.rfind(b"\n", 0, len(text) - _MOST_HEADER_BYTES) + 1
+            if not cut and len(text) > MOST_LINE_BYTES:
+                raise long_line(path, line)
+            begins = [match.start() for match in _HEADER.finditer(text) if match.start() < cut]
             counted = 0
-            for match in _HEADER.finditer(text):
-                # A match at the first byte of what was kept may be the end of a number.
-                if match.start() == 0 and offset > 0:
-                    continue
-                if found and found[-1][0] == offset + match.start():
-                    continue
-                n_lines = text.count(b"\n", counted, match.start())
-                line, counted = line + n_lines, match.start()
-                found.append((offset + match.start(), line + 1))
-                if len(found) > _MOST_SCANS:
-                    raise InputError(f"{path.name} has more than {_MOST_SCANS} scans")
-            # The end, where a header may begin, is looked through again.
-            cut = max(counted, len(text) - _MOST_HEADER_BYTES)
-            line += text.count(b"\n", counted, cut)
+            for place in [*begins, cut]:
+                piece = text[counted:place]
+                n_lines = piece.count(b"\n")
+                line, n_filled = line + n_lines, n_filled + n_lines - len(_BLANK.findall(piece))
+                counted = place
+                if place < cut or is_last:
+                    n_open = bool(piece.rpartition(b"\n")[2].strip())
+                    found.append((offset + place, line, n_filled + n_open))
             offset, kept = offset + cut, text[cut:]
-            if len(block) < _SEARCH_BYTES:
-                break
+            if len(found) > _MOST_SCANS:
+                raise InputError(f"{path.name} has more than {_MOST_SCANS} scans")
     return found
 
 
-def _read_header(path: Path, file: BinaryIO, start: int, end: int, line: int) -> ScanHeader:
+def _read_header(
+    path: Path,
+    file: BinaryIO,
+    start: int,
+    line: int,
+    n_before: int,
+    end: int,
+    _line_behind: int,
+    n_behind: int,
+) -> _Part:
     file.seek(start)
-    raw = take_lines(file, HEADER_LINES, first_line=line)
-    lines = [item.decode("ascii", "replace") for item in raw]
+    lines = [
+        item.decode("ascii", "replace") for item in take_lines(file, HEADER_LINES, first_line=line)
+    ]
     try:
         n_columns, n_rows = (int(item) for item in lines[:2])
         numbers = [[float(item) for item in row.split()] for row in lines[2:]]
@@ -187,56 +198,38 @@ def _read_header(path: Path, file: BinaryIO, start: int, end: int, line: int) ->
         is_whole = False
     if not is_whole or not np.isfinite(matrix).all():
         raise _bad_header(path, line)
-    begin = file.tell()
+    begin, first_line = file.tell(), line + HEADER_LINES
     layout, first = None, ""
-    for sample in take_lines(file, _SAMPLE_LINES, first_line=line + HEADER_LINES):
+    for sample in take_lines(file, _SAMPLE_LINES, first_line=first_line):
         if begin >= end:
             break
         text = sample.decode("ascii", "replace").strip()
         if not first and not text:
-            begin, line = begin + len(sample), line + 1
+            begin, first_line = begin + len(sample), first_line + 1
             continue
         first = first or text
-        found = find_data(text)
+        found = find_layout(text)
         # Points without a return may be shorter than others.
         if found and found.n_columns in _COLUMNS:
             layout = max(layout or found, found, key=lambda item: item.n_columns)
-        elif found is None and _HEADER_NUMBER.fullmatch(text):
+        elif found is None and re.fullmatch(r"\d+", text):
             break
-    n_points = _count_points(file, begin, end)
+    n_points = n_behind - n_before - HEADER_LINES
     if layout is None and n_points:
         raise InputError(
-            f"{path.name}, line {line + HEADER_LINES}: expected x y z, with intensity and r g "
+            f"{path.name}, line {first_line}: expected x y z, with intensity and r g "
             f"b where the scan has them, got {first[:60]!r}"
         )
-    layout = layout or Layout(separator=r"\s+", decimal=".", n_columns=3)
-    columns = Columns(names=tuple(_COLUMNS[layout.n_columns].split()))
-    return ScanHeader(
-        n_columns=n_columns,
-        n_rows=n_rows,
-        world_from_scan=matrix,
+    return _Part(
         start=begin,
         end=end,
-        first_line=line + HEADER_LINES,
+        first_line=first_line,
         n_points=n_points,
-        layout=layout,
-        columns=columns,
+        n_rows=n_rows,
+        n_places=n_rows * n_columns,
+        pose=(matrix[:3, :3], matrix[:3, 3]),
+        layout=layout or Layout(n_columns=3),
     )
-
-
-def _count_points(file: BinaryIO, start: int, end: int) -> int:
-    """Count the lines that are not blank."""
-    file.seek(start)
-    n_points, left, tail = 0, end - start, b""
-    while left > 0 and (block := file.read(min(_SEARCH_BYTES, left))):
-        left -= len(block)
-        text = tail + block
-        cut = text.rfind(b"\n") + 1 if left > 0 else len(text)
-        n_points += text.count(b"\n", 0, cut) - len(_BLANK.findall(text, 0, cut))
-        if left <= 0 and not text.endswith(b"\n") and text[text.rfind(b"\n") + 1 :].strip():
-            n_points += 1
-        tail = text[cut:]
-    return n_points
 
 
 def _bad_header(path: Path, line: int) -> InputError:

@@ -1,50 +1,62 @@
-"""Text scans: a point per line, with or without a header or a leading count."""
+"""Lines of numbers, read fast and in blocks, and text scans: a point per line."""
 
 from __future__ import annotations
 
 import codecs
+import io
+import math
 import re
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import (
-    BLOCK_POINTS,
-    PointBlock,
-    Scan,
-    ScanFile,
-    short_file_error,
-)
 from orthoflow.files.points.fields import (
     IGNORED,
     Columns,
-    block_of_table,
     columns_of_names,
     columns_of_values,
     meaning_of,
 )
-from orthoflow.files.points.tables import (
-    Layout,
-    count_lines,
-    find_data,
-    is_comment,
-    numbers_of,
-    read_tables,
-    split_fields,
-    take_lines,
-    unquoted,
+from orthoflow.files.points.scan_file import (
+    BLOCK_POINTS,
+    PointBlock,
+    ScanFile,
+    Values,
+    axes_of,
+    cut_off,
+    point_block,
 )
-from orthoflow.files.points.units import StatedUnit, unit_of_comments, unit_of_name
+from orthoflow.files.points.units import unit_of_comments, unit_of_name
 
-FORMAT: Final = "text"
-HEADER_LINES: Final = 200
-SAMPLE_LINES: Final = 1000
+# Lines of text scans and headers are much shorter.
+#: bytes of a line of a text scan
+MOST_LINE_BYTES: Final = 10_000
+_HEADER_LINES: Final = 200
+_SAMPLE_LINES: Final = 1000
+_SCAN_BYTES: Final = 1 << 24
+_LINES_AT_ONCE: Final = 10_000
 # Of the number of points; a number that is longer counts nothing.
 _MOST_DIGITS: Final = 20
+_NUMBER: Final = re.compile(
+    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?"
+    r"|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)|n/a|na|null|#(num!|n/a|value!|div/0!|ref!)",
+    re.IGNORECASE,
+)
+# How C libraries print what is not finite: `nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`; and
+# how spreadsheets do.
+_NOT_A_NUMBER: Final = re.compile(
+    rb"(?:[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)|(?<![^\s,;])(?:n/a|na|null))"
+    rb"(?![\w(])|#(?:num!|n/a|value!|div/0!|ref!)",
+    re.IGNORECASE,
+)
 _COMMENT: Final = "#/ \t;!%"
 # `Points:0`, `P_x`: what no sentence holds, but the names of columns may be.
 _NO_WORD: Final = re.compile(
@@ -53,22 +65,23 @@ _NO_WORD: Final = re.compile(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TextHead:
-    """What the first lines of a text scan state.
+class Layout:
+    r"""How the numbers of a line are told apart.
 
     Attributes:
-        n_header_lines: lines before the first point.
-        n_stated: number of points that a leading line states, or None.
-        layout: how numbers are told apart.
-        columns: what they are.
-        unit: of the coordinates, where comments or names of columns state it.
+        separator: pattern for pandas: a character, or `\s+` for any white space.
+        decimal: `.` or `,`.
+        n_columns: numbers in the first line.
     """
 
-    n_header_lines: int
-    n_stated: int | None
-    layout: Layout
-    columns: Columns
-    unit: StatedUnit | None
+    separator: str = r"\s+"
+    decimal: str = "."
+    n_columns: int
+
+    def fields(self, line: str) -> list[str]:
+        """Split a line, without quotes and the empty field after a closing separator."""
+        split = line.split() if self.separator == r"\s+" else _split(line, self.separator)
+        return [_unquoted(item) for item in split]
 
 
 def open_text(
@@ -84,91 +97,68 @@ def open_text(
     Raises:
         InputError: it is not known what the columns are.
     """
-    head = _read_head(path, columns, intensity_field)
-    scan = Scan(
-        fields=head.columns.fields,
-        fields_used=head.columns.labels_of(used=True),
-        fields_not_used=head.columns.labels_of(used=False),
-        unit=head.unit,
-    )
-    return ScanFile(
-        name=path.name,
-        format_name=FORMAT,
-        n_most=count_lines(path) - head.n_header_lines,
-        scans=[scan],
-        read=lambda: _blocks(path, head),
-    )
-
-
-def _blocks(path: Path, head: TextHead) -> Iterator[PointBlock]:
-    n_read = 0
-    with path.open("rb") as file:
-        take_lines(file, head.n_header_lines, first_line=1)
-        tables = read_tables(
-            file,
-            head.layout,
-            head.columns.positions,
-            block_lines=BLOCK_POINTS,
-            first_line=head.n_header_lines + 1,
-        )
-        for table in tables:
-            n_read += len(table)
-            yield block_of_table(table, head.columns)
-    if head.n_stated is not None and n_read < head.n_stated:
-        raise short_file_error(path, "list", f"{n_read} points", str(head.n_stated))
-
-
-def _read_head(path: Path, columns: Columns | None, intensity_field: str | None) -> TextHead:
     lines = _first_lines(path)
     n_stated: int | None = None
-    comments: list[str] = []
     headers: list[str] = []
-    for index, line in enumerate(lines[:HEADER_LINES]):
-        layout = None if is_comment(line.encode()) else find_data(line)
-        if layout is None:
-            if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
-                n_stated = int(line)
-            elif line:
-                comments.append(line.lstrip(_COMMENT))
-                headers.append(line)
-            continue
-        chosen = _chosen_columns(path, columns, headers, lines[index:], layout, intensity_field)
-        unit = unit_of_comments(comments)
-        if unit is None and chosen.unit is not None:
-            unit = unit_of_name(chosen.unit, "names of the columns")
-        return TextHead(
-            n_header_lines=index, n_stated=n_stated, layout=layout, columns=chosen, unit=unit
+    for index, line in enumerate(lines[:_HEADER_LINES]):
+        layout = None if is_comment(line.encode()) else find_layout(line)
+        if layout is not None:
+            n_header_lines = index
+            break
+        if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
+            n_stated = int(line)
+        elif line:
+            headers.append(line)
+    else:
+        raise InputError(
+            f"{path.name} has no line with three numbers among its first "
+            f"{min(len(lines), _HEADER_LINES)}: expected a point per line, e.g. x y z"
         )
-    raise InputError(
-        f"{path.name} has no line with three numbers among its first "
-        f"{min(len(lines), HEADER_LINES)}: expected a point per line, e.g. x y z"
+    if columns is None:
+        columns = _columns_of_header(path, headers, line, layout, intensity_field)
+    elif len(columns.names) > layout.n_columns:
+        raise InputError(
+            f"{path.name} has {layout.n_columns} columns, but cloud.columns names "
+            f"{len(columns.names)}: {' '.join(columns.names)}; its first line is {line[:80]!r}"
+        )
+    elif headers and len(labels := _labels(headers[-1])) == len(columns.names):
+        columns = replace(columns, labels=tuple(labels))
+    if columns is None:
+        sample = [_numbers(item, layout) for item in lines[n_header_lines:] if item]
+        columns = columns_of_values(
+            path.name,
+            np.array([row for row in sample if len(row) == layout.n_columns]),
+            line,
+            is_pts=path.suffix.lower() == ".pts",
+        )
+    unit = unit_of_comments(header.lstrip(_COMMENT) for header in headers)
+    if unit is None and columns.unit is not None:
+        unit = unit_of_name(columns.unit, "names of the columns")
+    return ScanFile(
+        name=path.name,
+        format_name="text",
+        n_most=_count_lines(path) - n_header_lines,
+        scans=[columns.scan(unit=unit)],
+        read=partial(_blocks, path, layout, columns, n_header_lines, n_stated),
     )
 
 
-def _chosen_columns(
-    path: Path,
-    columns: Columns | None,
-    headers: list[str],
-    lines: list[str],
-    layout: Layout,
-    intensity_field: str | None,
-) -> Columns:
-    """Columns as the user names them, else a header, else their values (in `lines`)."""
-    if columns is None:
-        found = _columns_of_header(path, headers, lines[0], layout, intensity_field)
-        if found is not None:
-            return found
-        sample = [numbers_of(item, layout) for item in lines if item]
-        whole = [item for item in sample if len(item) == layout.n_columns]
-        is_pts = path.suffix.lower() == ".pts"
-        return columns_of_values(path.name, np.array(whole), lines[0], is_pts=is_pts)
-    if len(columns.names) > layout.n_columns:
-        raise InputError(
-            f"{path.name} has {layout.n_columns} columns, but cloud.columns names "
-            f"{len(columns.names)}: {' '.join(columns.names)}; its first line is {lines[0][:80]!r}"
-        )
-    labels = _labels(headers[-1]) if headers else []
-    return replace(columns, labels=tuple(labels)) if len(labels) == len(columns.names) else columns
+def _blocks(
+    path: Path, layout: Layout, columns: Columns, n_header_lines: int, n_stated: int | None
+) -> Iterator[PointBlock]:
+    n_read, line = 0, n_header_lines + 1
+    with path.open("rb") as file:
+        take_lines(file, n_header_lines, first_line=1)
+        while file.peek(1):
+            table = read_table(
+                file, layout, columns.places.values(), n_lines=BLOCK_POINTS, first_line=line
+            )
+            line += BLOCK_POINTS
+            n_read += len(table)
+            values = values_of(table, columns)
+            yield point_block(axes_of(values), values)
+    if n_stated is not None and n_read < n_stated:
+        raise cut_off(path, "list", f"{n_read} points", str(n_stated))
 
 
 def _columns_of_header(
@@ -186,46 +176,42 @@ def _columns_of_header(
         if found is not None and fits:
             return found
         is_remark = header != header.lstrip(_COMMENT)
-        known = [label for label in labels if meaning_of(label) != IGNORED]
-        names_something = bool(known) or any(_NO_WORD.fullmatch(label) for label in labels)
-        if found is not None or (fits and (not is_remark or names_something)):
-            raise _unknown_columns(path, header, labels, line, layout)
+        names_something = any(
+            meaning_of(label) != IGNORED or _NO_WORD.fullmatch(label) for label in labels
+        )
+        if found is None and not (fits and (not is_remark or names_something)):
+            continue
+        text = (
+            f"{path.name} has the header {header[:120]!r}, which does not name x, y and z for the "
+            f"{layout.n_columns} columns below it (first line {line[:80]!r})"
+        )
+        if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
+            text += "; if these are degrees, project them to a plane system in metres first"
+        # What is known stays, and x, y, z that are missing are as like to be the last of the rest.
+        names = [meaning_of(label) for label in labels] if fits else []
+        missing = [axis for axis in "xyz" if axis not in names]
+        others = [place for place, name in enumerate(names) if name == IGNORED]
+        if len(others) >= len(missing):
+            for place, axis in zip(others[len(others) - len(missing) :], missing, strict=True):
+                names[place] = axis
+        else:
+            names = [*"xyz", *[IGNORED] * layout.n_columns][: layout.n_columns]
+        raise InputError(
+            f"{text}: name the columns with cloud.columns, e.g. --set "
+            f"'cloud.columns=[{', '.join(names)}]', with {IGNORED} for one to skip"
+        )
     return None
-
-
-def _unknown_columns(
-    path: Path, header: str, labels: list[str], line: str, layout: Layout
-) -> InputError:
-    text = (
-        f"{path.name} has the header {header[:120]!r}, which does not name x, y and z for the "
-        f"{layout.n_columns} columns below it (first line {line[:80]!r})"
-    )
-    if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
-        text += "; if these are degrees, project them to a plane system in metres first"
-    # What is known stays, and x, y, z that are missing are as like to be the last of the others.
-    names = [meaning_of(label) for label in labels] if len(labels) == layout.n_columns else []
-    missing = [axis for axis in "xyz" if axis not in names]
-    others = [place for place, name in enumerate(names) if name == IGNORED]
-    if len(others) >= len(missing):
-        for place, axis in zip(others[len(others) - len(missing) :], missing, strict=True):
-            names[place] = axis
-    else:
-        names = [*"xyz", *[IGNORED] * layout.n_columns][: layout.n_columns]
-    return InputError(
-        f"{text}: name the columns with cloud.columns, e.g. --set "
-        f"'cloud.columns=[{', '.join(names)}]', with {IGNORED} for one to skip"
-    )
 
 
 def _labels(header: str) -> list[str]:
     # A semicolon begins a comment, unless it parts columns of which the first has no name.
     stripped = header.lstrip(_COMMENT if header.count(";") == 1 else _COMMENT.replace(";", ""))
-    return [unquoted(field) for field in split_fields(stripped)[0]]
+    return _fields_of(stripped)[0]
 
 
 def _first_lines(path: Path) -> list[str]:
     with path.open("rb") as file:
-        raw = take_lines(file, HEADER_LINES + SAMPLE_LINES, first_line=1)
+        raw = take_lines(file, _HEADER_LINES + _SAMPLE_LINES, first_line=1)
     if raw and raw[0].startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path.name} is UTF-16 text: save it as UTF-8 or plain ASCII")
     if any(b"\0" in line for line in raw):
@@ -236,3 +222,200 @@ def _first_lines(path: Path) -> list[str]:
     if raw:
         raw[0] = raw[0].removeprefix(codecs.BOM_UTF8)
     return [line.decode("utf-8", "replace").strip() for line in raw]
+
+
+def _count_lines(path: Path) -> int:
+    """Count the lines of a file; a last line without an end counts too."""
+    lines, last = 0, b"\n"
+    with path.open("rb") as file:
+        while block := file.read(_SCAN_BYTES):
+            lines += block.count(b"\n")
+            last = block[-1:]
+    return lines + (last != b"\n")
+
+
+# Any: arrays of any type.
+def values_of(table: NDArray[np.float64], columns: Columns, packed: Any = np.int64) -> Values:
+    """Return the columns (n,) of a table of text by meaning, packed colours in their own type."""
+    values: Values = dict(zip(columns.places, table.T, strict=True))
+    if "rgb" in values:
+        values["rgb"] = np.nan_to_num(values["rgb"], posinf=0.0, neginf=0.0).astype(packed)
+    return values
+
+
+def is_comment(line: bytes) -> bool:
+    """Whether a line is no data: it begins with `#` or `//`, and not with `#NUM!` or the like."""
+    start = line.lstrip()
+    return start.startswith((b"#", b"//")) and not _NOT_A_NUMBER.match(start)
+
+
+def find_layout(line: str) -> Layout | None:
+    """Layout of a line with at least three numbers, and more numbers than texts; None for others.
+
+    Numbers may be quoted, as in CSV files.
+    """
+    fields, separator = _fields_of(line)
+    numbers = [field for field in fields if _NUMBER.fullmatch(field)]
+    if len(numbers) < 3 or 2 * len(numbers) < len(fields):
+        return None
+    has_comma = separator != "," and any("," in number for number in numbers)
+    return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
+
+
+def _fields_of(line: str) -> tuple[list[str], str]:
+    """Fields of a line, and the separator found: semicolon, tab, comma or white space."""
+    words = line.split()
+    tabbed = _split(line, "\t")
+    separator = r"\s+"
+    if ";" in line:
+        separator = ";"
+    elif "\t" in line and not any(_are_numbers(f.split()) for f in tabbed if " " in f):
+        separator = "\t"
+    # `1,5 2,5 3,5` is three numbers with decimal commas, `1, 2, 3` and `1,2,3` are not.
+    elif "," in line and not (len(words) >= 3 and _are_numbers(words)):
+        separator = ","
+    return Layout(separator=separator, n_columns=0).fields(line), separator
+
+
+def _split(line: str, separator: str) -> list[str]:
+    fields = [field.strip() for field in line.split(separator)]
+    while fields and not fields[-1]:
+        fields.pop()
+    return fields
+
+
+def _unquoted(field: str) -> str:
+    return field[1:-1].strip() if len(field) > 1 and field[0] == field[-1] == '"' else field
+
+
+def _are_numbers(fields: Sequence[str]) -> bool:
+    return all(_NUMBER.fullmatch(field) for field in fields)
+
+
+def _numbers(line: str, layout: Layout) -> list[float]:
+    """Numbers of a line; NaN for a field that is none."""
+    texts = [field.replace(layout.decimal, ".") for field in layout.fields(line)]
+    is_number = [
+        _NUMBER.fullmatch(text) and "," not in text and not _NOT_A_NUMBER.fullmatch(text.encode())
+        for text in texts
+    ]
+    return [float(t) if is_so else math.nan for t, is_so in zip(texts, is_number, strict=True)]
+
+
+def take_lines(file: BinaryIO, n_lines: int, *, first_line: int) -> list[bytes]:
+    """Read the next lines of a file, at most so many; never more of a line than it may have.
+
+    Raises:
+        InputError: a line is longer than `MOST_LINE_BYTES`.
+    """
+    lines: list[bytes] = []
+    pieces = iter(partial(file.readline, MOST_LINE_BYTES + 1), b"")
+    # Some at a time: what is one line of gigabytes is noticed before it is all in memory.
+    while part := list(islice(pieces, min(_LINES_AT_ONCE, n_lines - len(lines)))):
+        if max(map(len, part)) > MOST_LINE_BYTES:
+            place = next(place for place, line in enumerate(part) if len(line) > MOST_LINE_BYTES)
+            raise long_line(Path(file.name), first_line + len(lines) + place)
+        lines += part
+    return lines
+
+
+def long_line(path: Path, line: int) -> InputError:
+    """Return the error for a line that no list of points has."""
+    return InputError(
+        f"{path.name}, line {line}: the line has more than {MOST_LINE_BYTES} bytes, so this is not "
+        "a list of points; export the file again"
+    )
+
+
+def read_table(
+    file: BinaryIO, layout: Layout, columns: Iterable[int], *, n_lines: int, first_line: int
+) -> NDArray[np.float64]:
+    """Read the next lines of a file as numbers.
+
+    Args:
+        file: open at the start of a line.
+        layout: how numbers are told apart.
+        columns: which columns are wanted, counted from 0.
+        n_lines: at most so many lines are read.
+        first_line: number of the next line, counted from 1, for messages.
+
+    Returns:
+        (n, columns) float64; fewer rows at the end of the file and where lines are blank or
+        comments; NaN where a line is too short.
+
+    Raises:
+        InputError: a line holds something else than numbers.
+    """
+    lines, wanted = take_lines(file, n_lines, first_line=first_line), list(columns)
+    try:
+        return _parse(lines, layout, wanted)
+    except ValueError as error:
+        kept = [_NOT_A_NUMBER.sub(b"nan", line) for line in lines if not is_comment(line)]
+        try:
+            return _parse(kept, layout, wanted)
+        except ValueError:
+            where, got = f"from line {first_line}", ""
+            for number, line in enumerate(lines, start=first_line):
+                text = line.decode("utf-8", "replace").strip()
+                fields = layout.fields(text)
+                cells = [fields[k] for k in wanted if k < len(fields) and fields[k]]
+                fits = len(fields) <= layout.n_columns and _are_numbers(cells)
+                if not fits and not is_comment(line):
+                    where, got = f"line {number}", f" as in the lines before, got {text[:60]!r}"
+                    break
+            raise InputError(
+                f"{Path(file.name).name}, {where}: expected {layout.n_columns} numbers"
+                f"{got or ' per line'}; correct the line or export the file again"
+            ) from error
+
+
+def read_stated(
+    file: BinaryIO,
+    layout: Layout,
+    columns: Iterable[int],
+    *,
+    n_points: int,
+    first_line: int,
+    what: str,
+) -> Iterator[NDArray[np.float64]]:
+    """Read as many points as a header states, a line each, in blocks.
+
+    Raises:
+        InputError: a line holds something else than numbers, or there are fewer; `what` holds them.
+    """
+    for start in range(0, n_points, BLOCK_POINTS):
+        count = min(BLOCK_POINTS, n_points - start)
+        table = read_table(file, layout, columns, n_lines=count, first_line=first_line + start)
+        if len(table) != count:
+            raise cut_off(Path(file.name), what, f"{start + len(table)} points", str(n_points))
+        yield table
+
+
+def _parse(lines: list[bytes], layout: Layout, columns: list[int]) -> NDArray[np.float64]:
+    import pandas as pd
+
+    content = b"".join(lines)
+    if not content.strip():
+        return np.empty((0, len(columns)))
+    with warnings.catch_warnings():
+        # A longer first line is only warned about and would lose numbers.
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        try:
+            frame = pd.read_csv(
+                io.BytesIO(content),
+                sep=layout.separator,
+                decimal=layout.decimal,
+                header=None,
+                # All columns, wanted or not: only so does pandas notice a line with too many.
+                names=list(range(layout.n_columns)),
+                index_col=False,
+                engine="c",
+                low_memory=False,
+                dtype=dict.fromkeys(columns, np.float64),
+                skipinitialspace=True,
+                encoding_errors="replace",
+                quoting=0 if b'"' in lines[0] else 3,
+            )
+        except pd.errors.ParserWarning as warning:
+            raise ValueError(str(warning)) from warning
+    return np.asarray(frame[columns].to_numpy(dtype=np.float64))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from orthoflow.errors import InputError
 
@@ -46,14 +46,10 @@ _WKT: Final = re.compile(
     re.DOTALL,
 )
 # GeoTIFF 1.0, 6.2 and 6.3.1.3: keys, and codes of units of length.
-_MODEL_TYPE: Final = 1024
-_GEOGRAPHIC: Final = 2
-_GEOGRAPHIC_TYPE: Final = 2048
-_PROJECTED: Final = 3072
-_LINEAR_UNITS: Final = 3076
-_VERTICAL: Final = 4096
-_VERTICAL_UNITS: Final = 4099
-_GEO_UNITS: Final[dict[int, float]] = {
+_MODEL_TYPE, _GEOGRAPHIC = 1024, 2
+_GEOGRAPHIC_TYPE, _PROJECTED, _LINEAR_UNITS = 2048, 3072, 3076
+_VERTICAL, _VERTICAL_UNITS = 4096, 4099
+_GEO_UNITS: Final = {
     9001: 1.0,
     9002: 0.3048,
     9003: US_SURVEY_FOOT_M,
@@ -99,13 +95,11 @@ def unit_of_comments(comments: Iterable[str], what: str = "comment") -> StatedUn
         if len(comment) > _LONGEST_CRS:
             continue
         text = " ".join(comment.split())
-        wkt = _WKT.search(text)
-        epsg = _EPSG.search(text)
-        if wkt or epsg:
-            code = "" if epsg is None else "EPSG:" + "+".join(filter(None, epsg.groups()))
-            found = unit_of_crs(wkt[0] if wkt else code, what)
-            if found is not None:
-                return found
+        wkt, epsg = _WKT.search(text), _EPSG.search(text)
+        crs = "" if epsg is None else "EPSG:" + "+".join(filter(None, epsg.groups()))
+        found = unit_of_crs(wkt[0] if wkt else crs, what)
+        if found is not None:
+            return found
         word = unit_of_word(text)
         for context in _CONTEXT.finditer(text):
             match = _ANY.match(text, context.end())
@@ -125,14 +119,8 @@ def unit_of_crs(text: str, what: str) -> StatedUnit | None:
         crs = pyproj.CRS.from_user_input(text.strip(" \0\t\r\n"))
     except (pyproj.exceptions.CRSError, ValueError, UnicodeError):
         return None
-    return unit_of_axes(crs, what)
-
-
-# Any: pyproj has no types that strict checks accept.
-def unit_of_axes(crs: Any, what: str) -> StatedUnit | None:
-    """Unit along x, y and z of a pyproj coordinate system."""
-    parts = crs.sub_crs_list if crs.is_compound else [crs]
     source = f"{what} {crs.name[:80]}"
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
     axes = [axis for part in parts for axis in part.axis_info]
     level = [axis for axis in axes if axis.direction not in ("up", "down")]
     heights = [axis for axis in axes if axis.direction in ("up", "down")]
@@ -140,49 +128,39 @@ def unit_of_axes(crs: Any, what: str) -> StatedUnit | None:
         return None
     if crs.is_geographic or any("deg" in axis.unit_name.lower() for axis in level):
         return unit_of_name("deg", source)
-    metres = float(level[0].unit_conversion_factor)
-    height = float(heights[0].unit_conversion_factor) if heights else metres
-    return unit_of_factors(metres, height, source)
-
-
-def unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit | None:
-    """Build the unit of two factors to metres; None where they are no lengths."""
-    if not (level_m > 0.0 and height_m > 0.0):
-        return None
-    names = dict.fromkeys(_name_of_factor(factor) for factor in (level_m, height_m))
-    return StatedUnit(name="/".join(names), metres=(level_m, level_m, height_m), source=source)
+    metres = level[0].unit_conversion_factor
+    return _unit_of_factors(
+        metres, heights[0].unit_conversion_factor if heights else metres, source
+    )
 
 
 def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
     """Unit that GeoTIFF keys state: their own unit keys win over those of the coded systems."""
     import pyproj
 
-    level_m = height_m = None
+    factors: dict[str, float] = {}
     names, is_degrees = [], keys.get(_MODEL_TYPE) == _GEOGRAPHIC
-    for key in (_PROJECTED, _GEOGRAPHIC_TYPE, _VERTICAL):
-        code = keys.get(key, 0)
-        if not 1024 < code < 32767 or (key == _GEOGRAPHIC_TYPE and _PROJECTED in keys):
-            continue
+    level = _PROJECTED if _PROJECTED in keys else _GEOGRAPHIC_TYPE
+    for part, key in (("level", level), ("height", _VERTICAL)):
         try:
-            crs = pyproj.CRS.from_epsg(code)
+            crs = pyproj.CRS.from_epsg(code if 1024 < (code := keys.get(key, 0)) < 32767 else 0)
         except pyproj.exceptions.CRSError:
             continue
-        unit = crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
         names.append(crs.name)
         is_degrees = is_degrees or crs.is_geographic
-        if key == _VERTICAL:
-            height_m = unit
-        elif not crs.is_geographic:
-            level_m = unit
-            height_m = crs.axis_info[-1].unit_conversion_factor if crs.is_compound else None
-    level_m = _GEO_UNITS.get(keys.get(_LINEAR_UNITS, 0), level_m)
-    height_m = _GEO_UNITS.get(keys.get(_VERTICAL_UNITS, 0), height_m)
-    if _GEO_UNITS.get(keys.get(_LINEAR_UNITS, 0)) and _PROJECTED in keys:
-        is_degrees = False
+        if crs.axis_info and not crs.is_geographic:
+            factors[part] = crs.axis_info[0].unit_conversion_factor
+            if crs.is_compound:
+                factors["height"] = crs.axis_info[-1].unit_conversion_factor
+    for part, key in (("level", _LINEAR_UNITS), ("height", _VERTICAL_UNITS)):
+        if keys.get(key) in _GEO_UNITS:
+            factors[part] = _GEO_UNITS[keys[key]]
     source = " + ".join(["GeoTIFF keys", *names])
-    if is_degrees:
+    if is_degrees and not (keys.get(_LINEAR_UNITS) in _GEO_UNITS and _PROJECTED in keys):
         return unit_of_name("deg", source)
-    return None if level_m is None else unit_of_factors(level_m, height_m or level_m, source)
+    if "level" not in factors:
+        return None
+    return _unit_of_factors(factors["level"], factors.get("height", factors["level"]), source)
 
 
 def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
@@ -200,14 +178,19 @@ def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
         )
 
 
+def _unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit | None:
+    """Build the unit of two factors to metres; None where they are no lengths."""
+    if not (level_m > 0.0 and height_m > 0.0):
+        return None
+    # Feet differ in the sixth digit.
+    names = [
+        next((n for n, unit_m in UNITS_M.items() if abs(m / unit_m - 1.0) < 1e-7), f"{m:.10g} m")
+        for m in (level_m, height_m)
+    ]
+    return StatedUnit(
+        name="/".join(dict.fromkeys(names)), metres=(level_m, level_m, height_m), source=source
+    )
+
+
 def _name(match: re.Match[str]) -> str:
-    names = list(_WORDS.values())
-    return names[int(str(match.lastgroup)[1:])]
-
-
-def _name_of_factor(metres: float) -> str:
-    """Name of a unit; feet differ in the sixth digit."""
-    for name, factor in UNITS_M.items():
-        if abs(metres / factor - 1.0) < 1e-7:
-            return name
-    return f"{metres:.10g} m"
+    return list(_WORDS.values())[int(str(match.lastgroup)[1:])]

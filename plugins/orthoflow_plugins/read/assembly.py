@@ -218,9 +218,7 @@ class CloudAssembly:
         points, bounds = block.points, block.bounds
         if np.any(count.unit_m != 1.0):
             points = points * count.unit_m
-            bounds = None if bounds is None else bounds * count.unit_m
-        if bounds is None:
-            bounds = _bounds(points)
+            bounds = bounds * count.unit_m
         kept = self._kept(points, bounds, count)
         usable = points[kept]
         n_kept = len(usable)

@@ -27,8 +27,7 @@ from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.ply import write_ply
 from orthoflow.files.geotiff import epsg_of, epsg_wkt
 from orthoflow.files.images import encode_png
-from orthoflow.files.points import open_scan
-from orthoflow.files.points.copc import Wish
+from orthoflow.files.points import Wish, open_scan
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels

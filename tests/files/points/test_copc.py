@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import las, open_scan
-from orthoflow.files.points.copc import Wish
+from orthoflow.files.points import Wish, las, open_scan
 from tests import scan_files
 
 # Root, its eight children, and two children of the last of these.

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import blocks as blocks_module
 from orthoflow.files.points import open_scan
+from orthoflow.files.points import scan_file as blocks_module
 from tests import scan_files
 from tests.scan_files import read_all
 

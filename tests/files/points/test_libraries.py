@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
-from orthoflow.files.points.libraries import guarded, load_library, reading
+from orthoflow.files.points.scan_file import load_library, reading
 
 
 class Panic(BaseException):
@@ -29,17 +29,6 @@ def test_whatever_a_library_throws_becomes_one_sentence(error: BaseException) ->
 def test_interrupts_and_own_errors_pass_the_fence(error: BaseException) -> None:
     with pytest.raises(type(error)), reading(Path("a.laz"), "LAZ"):
         raise error
-
-
-def test_errors_between_items_pass_the_fence_too() -> None:
-    def items() -> object:
-        yield 1
-        raise Panic("index 5")
-
-    found = guarded(items(), Path("a.laz"), "LAZ")  # type: ignore[arg-type]
-    assert next(found) == 1
-    with pytest.raises(InputError, match="index 5"):
-        next(found)
 
 
 def test_a_missing_library_is_named() -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import PointBlock, PointField, Scan, ScanFile
+from orthoflow.files.points.scan_file import PointBlock, PointField, Scan, ScanFile
 from orthoflow.sdk import StepContext
 
 FIELDS: tuple[PointField, ...] = ("intensity", "rgb", "grid")
@@ -92,9 +92,6 @@ def test_what_comes_in_blocks_is_what_there_is(
 ) -> None:
     first, second, third = block(1, 40), dirtied(block(2, 30, scan=1)), block(3, 20)
     blocks = [replace(one, points=one.points / unit_m) for one in (first, second, third)]
-    # The points of the bounds that a reader has already are not looked at again.
-    known = np.stack([blocks[0].points.min(axis=0), blocks[0].points.max(axis=0)])
-    blocks[0] = replace(blocks[0], bounds=known)
     box_m = np.array([HERE - 2.0, HERE + 4.0]) if has_box else None
     found = assembled(
         tmp_path, file("a", *blocks[:2]), file("b", blocks[2]), unit_m=unit_m, box_m=box_m

@@ -1,0 +1,409 @@
+"""Point files: choice of the reader, and what every reader returns.
+
+A reader opens a file up to its header, states what each of its scans has, and yields blocks of
+points. `point_block` makes a block of the columns of any format, so that points without return,
+flagged points and poses are treated once, for all of them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, OrthoflowError, PluginError
+
+if TYPE_CHECKING:
+    from orthoflow.files.points.fields import Columns
+    from orthoflow.files.points.units import StatedUnit
+
+# 12 MB of float64 coordinates: large enough for memory speed, small enough to hold several copies.
+BLOCK_POINTS: Final = 500_000
+# Half of the programs that read our products count positions in 32 bits.
+#: points of a scan file (one less is read)
+MOST_POINTS: Final = 2**32
+# The densest encodings take a byte for eight points; a small file that states more is refused
+# before memory is allocated for them.
+#: points that a file states, per byte that it has
+MOST_POINTS_PER_BYTE: Final = 8
+
+PointField = Literal["intensity", "rgb", "grid"]
+# Any: arrays of any type.
+Values = dict[str, NDArray[Any]]
+
+
+@dataclass(kw_only=True)
+class Scan:
+    """One scan of a file, with its own metadata.
+
+    Attributes:
+        name: as the file calls it, or empty.
+        fields: what each of its points has besides coordinates.
+        fields_used: names of the file's fields that are read.
+        fields_not_used: names of those that are not.
+        intensity_limits: smallest and largest intensity stated in the file, or None.
+        rgb_limit: stated value of full brightness, or None.
+        unit: unit of its coordinates, if the file states one.
+        station: (3,) position of the scanner, in the file's unit, or None.
+        station_is_posed: the file states a pose other than the identity.
+    """
+
+    name: str = ""
+    fields: frozenset[PointField] = frozenset()
+    fields_used: tuple[str, ...] = ()
+    fields_not_used: tuple[str, ...] = ()
+    intensity_limits: tuple[float, float] | None = None
+    rgb_limit: float | None = None
+    unit: StatedUnit | None = None
+    station: NDArray[np.float64] | None = None
+    station_is_posed: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointBlock:
+    """Some points of one scan, as in the file, with poses applied.
+
+    Attributes:
+        points: (n, 3) float64 in the file's unit; may contain NaN and infinities.
+        scan: position of the scan in its file.
+        n_read: points of the file that this block accounts for, including those left out.
+        left_out: number of points left out, by cause: `invalid`, `no_return`, `withheld`,
+            `synthetic`, `other_class`.
+        intensity: (n,) float32 in the file's own scale, NaN if invalid; None without.
+        rgb: (n, 3) in the file's own scale and type, or None.
+        has_rgb: (n,) which points have a valid colour; None if all have.
+        row: (n,) int64 position in the scan's grid, or None; column likewise.
+    """
+
+    points: NDArray[np.float64]
+    n_read: int
+    scan: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
+    intensity: NDArray[np.float32] | None = None
+    rgb: NDArray[np.generic] | None = None
+    has_rgb: NDArray[np.bool_] | None = None
+    row: NDArray[np.int64] | None = None
+    column: NDArray[np.int64] | None = None
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Smallest and largest coordinates (2, 3); NaN shows, no points give infinities."""
+        if not len(self.points):
+            return np.array([[np.inf] * 3, [-np.inf] * 3])
+        return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanFile:
+    """One point file, opened up to its header.
+
+    Attributes:
+        name: file name without folder, for messages and the record.
+        format_name: e.g. `E57`.
+        n_most: maximum number of points.
+        scans: its scans, in the order of their blocks.
+        read: yields the points; can be called once.
+        notes: notes of the reader, as sentences for the user; complete after reading.
+        is_chosen: only the requested parts of the file are read.
+    """
+
+    name: str
+    format_name: str
+    n_most: int
+    scans: list[Scan]
+    read: Callable[[], Iterator[PointBlock]]
+    notes: list[str] = field(default_factory=list)
+    is_chosen: bool = False
+
+    def __post_init__(self) -> None:
+        if self.n_most <= 0:
+            raise InputError(
+                f"{self.name} holds no points: expected a scan; export it again from the program "
+                "that wrote it"
+            )
+        if self.n_most >= MOST_POINTS:
+            raise InputError(
+                f"{self.name} states {self.n_most} points, at most {MOST_POINTS - 1} can be read: "
+                "thin it or split it, or export it again if that number is wrong"
+            )
+
+    @property
+    def fields(self) -> frozenset[PointField]:
+        """What the points of at least one scan have besides coordinates."""
+        return frozenset().union(*(scan.fields for scan in self.scans))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wish:
+    """The requested points of a file; a reader may return more.
+
+    Attributes:
+        box: (2, 3) lowest and highest coordinates in the file's unit, or None for all.
+        spacing: minimum spacing of points, in the file's unit; None for all.
+    """
+
+    box: NDArray[np.float64] | None = None
+    spacing: float | None = None
+
+    def __bool__(self) -> bool:
+        return self.box is not None or self.spacing is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """One family of point files.
+
+    Attributes:
+        name: its usual name.
+        suffixes: lower case, with the dot.
+        signature: first bytes of its files, matched; None for plain text.
+        beginning: what its files begin with, for messages.
+        reader: module and function that open its files.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    signature: re.Pattern[bytes] | None = None
+    beginning: str = ""
+    reader: tuple[str, str]
+
+
+E57: Final = Format(
+    name="E57",
+    suffixes=(".e57",),
+    signature=re.compile(b"ASTM-E57"),
+    beginning="ASTM-E57",
+    reader=("e57", "open_e57"),
+)
+LAS: Final = Format(
+    name="LAS/LAZ",
+    suffixes=(".las", ".laz"),
+    signature=re.compile(b"LASF"),
+    beginning="LASF",
+    reader=("las", "open_las"),
+)
+PLY: Final = Format(
+    name="PLY",
+    suffixes=(".ply",),
+    signature=re.compile(rb"ply[\n\r ]", re.IGNORECASE),
+    beginning="ply",
+    reader=("records", "open_ply"),
+)
+# Programs write first lines of their own, or none.
+PCD: Final = Format(
+    name="PCD",
+    suffixes=(".pcd",),
+    signature=re.compile(
+        rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]",
+        re.IGNORECASE,
+    ),
+    reader=("records", "open_pcd"),
+)
+PTX: Final = Format(name="PTX", suffixes=(".ptx",), reader=("ptx", "open_ptx"))
+TEXT: Final = Format(
+    name="text",
+    suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb", ".tsv"),
+    reader=("text", "open_text"),
+)
+FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)
+_SNIFFED_BYTES: Final = 4096
+
+
+def find_format(path: Path) -> Format:
+    """Return the format of a point file: by its content if that is certain, else by its suffix.
+
+    Raises:
+        InputError: the file is missing, empty, not what its suffix says, or of an unknown format.
+    """
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path.name} must be a point file, but there is {found} at that place")
+    try:
+        with path.open("rb") as file:
+            start = file.read(_SNIFFED_BYTES)
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be opened: {error.strerror}") from error
+    if not start:
+        raise InputError(f"{path.name} is empty (0 bytes): expected a scan; copy it again")
+    for item in FORMATS:
+        if item.signature is not None and item.signature.match(start):
+            return item
+    named = next((item for item in FORMATS if path.suffix.lower() in item.suffixes), None)
+    if named is None:
+        known = " ".join(suffix for item in FORMATS for suffix in item.suffixes)
+        raise InputError(
+            f"{path.name} is not a point file that orthoflow reads: expected one of {known}"
+        )
+    if named.beginning or (named is PCD and b"\0" in start[:64]):
+        raise InputError(
+            f"{path.name} is named as {named.name} but does not begin with "
+            f"{named.beginning or '# .PCD'!r}: the file is damaged or of another format; export it "
+            "again or give it its right suffix"
+        )
+    return named
+
+
+def open_scan(
+    path: Path,
+    columns: Columns | None = None,
+    *,
+    classes: Collection[int] = (),
+    wish: Wish | None = None,
+    intensity_field: str | None = None,
+) -> ScanFile:
+    """Open a point file up to its header.
+
+    Args:
+        path: the file.
+        columns: meaning of the columns of a text file, if the user states it.
+        classes: of a LAS or LAZ file only points of these classes are read; all if empty.
+        wish: of a COPC file only parts with such points are read; others are read completely.
+        intensity_field: name of the field to use as the intensity; None for the usual one.
+
+    Raises:
+        InputError: the file cannot be read, with the reason in one sentence.
+        PluginError: the library for this format is missing.
+    """
+    found = find_format(path)
+    choice: dict[str, object] = {"intensity_field": intensity_field}
+    if found is TEXT:
+        choice["columns"] = columns
+    if found is LAS:
+        choice |= {"classes": classes, "wish": wish}
+    module, function = found.reader
+    scan: ScanFile = getattr(import_module(f"{__package__}.{module}"), function)(path, **choice)
+    n_bytes = path.stat().st_size
+    if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
+        raise InputError(
+            f"{path.name} states {scan.n_most} points but has {n_bytes} bytes, which cannot hold "
+            "them: the file is damaged or cut off, copy or export it again"
+        )
+    return scan
+
+
+def point_block(
+    axes: NDArray[np.float64],
+    values: Mapping[str, NDArray[Any]],
+    *,
+    causes: Mapping[str, NDArray[np.bool_]] | None = None,
+    scan: int = 0,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> PointBlock:
+    """Make a block of points from the values in a file.
+
+    Args:
+        axes: (3, n) x, y, z; points with all three exactly zero have no return.
+        values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
+            `column`; in the file's own types.
+        causes: (n,) points that are left out, by cause; each counts for the first one.
+        scan: index of the scan.
+        pose: (3, 3) rotation and (3,) translation to the file's world; None for the identity.
+    """
+    n_read = axes.shape[1]
+    is_void = axes[0] == 0.0
+    if is_void.any():
+        is_void &= (axes[1] == 0.0) & (axes[2] == 0.0)
+    left_out: dict[str, int] = {}
+    kept = np.ones(n_read, dtype=np.bool_)
+    for cause, is_out in {**(causes or {}), "no_return": is_void}.items():
+        if n_out := int(np.count_nonzero(kept & is_out)):
+            left_out[cause] = n_out
+            kept &= ~is_out
+    if left_out:
+        axes = axes[:, kept]
+        values = {name: array[kept] for name, array in values.items()}
+    if pose is not None:
+        axes = pose[0] @ axes + pose[1][:, None]
+    rgb: NDArray[Any] | None = None
+    if "r" in values:
+        rgb = np.stack([values[name] for name in "rgb"]).T
+    elif "rgb" in values:
+        rgb = _unpacked(values["rgb"])
+
+    def cast(name: str, dtype: Any) -> Any:
+        array = values.get(name)
+        if array is not None and dtype is np.int64 and array.dtype.kind == "f":
+            array = np.nan_to_num(array, posinf=0.0, neginf=0.0)
+        return None if array is None else array.astype(dtype)
+
+    return PointBlock(
+        points=axes.T,
+        scan=scan,
+        n_read=n_read,
+        left_out=left_out,
+        intensity=cast("intensity", np.float32),
+        rgb=rgb,
+        has_rgb=cast("has_rgb", np.bool_),
+        row=cast("row", np.int64),
+        column=cast("column", np.int64),
+    )
+
+
+def axes_of(values: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return (3, n) coordinates, axis by axis in memory: later passes run along the axes."""
+    return np.stack([values[axis].astype(np.float64, copy=False) for axis in "xyz"])
+
+
+def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return colours (n, 3) from 0x00RRGGBB, stored in an integer or in the bits of a float."""
+    if packed.dtype.kind == "f":
+        bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
+    else:
+        bits = packed.astype(np.int64).astype(np.uint32)
+    return np.column_stack([(bits >> shift) & 255 for shift in (16, 8, 0)]).astype(np.uint8)
+
+
+def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
+    """Return the error for a file that ends before its header says it does."""
+    return InputError(
+        f"{path.name} is cut off: its {what} holds {found}, its header states {expected}; copy or "
+        "export it again"
+    )
+
+
+@contextmanager
+def reading(path: Path, format_name: str) -> Iterator[None]:
+    """Turn whatever a library raises while it reads a file into one sentence about the file.
+
+    Raises:
+        InputError: the library failed.
+    """
+    try:
+        yield
+    except (OrthoflowError, KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:
+        # BaseException: a panic in a library written in Rust is not an Exception.
+        raise InputError(
+            f"{path.name} cannot be read as {format_name}: {_first_line(error)}; the file is "
+            "damaged or cut off, copy or export it again"
+        ) from error
+
+
+# Any: the libraries have no types.
+def load_library(name: str, path: Path) -> Any:
+    """Import a reading library when a file needs it.
+
+    Raises:
+        PluginError: it is not installed or does not load.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise PluginError(
+            f"{path.name} needs the library {name}, which does not load ({_first_line(error)}): "
+            f"install it with `python -m pip install {name}`"
+        ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    text = str(error).strip() or type(error).__name__
+    return " ".join(text.splitlines()[0].split())[:200].rstrip(".:;, ")
