@@ -23,7 +23,7 @@ from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, read_exif, unreadable
 from orthoflow.files.points import FORMATS, ScanFile, open_scan
-from orthoflow.files.points.scan_file import TEXT
+from orthoflow.files.points.formats import TEXT
 from orthoflow.files.points.units import refuse_degrees
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.foreign_text import first_few

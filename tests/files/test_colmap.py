@@ -34,19 +34,6 @@ def oriented() -> Cameras:
     return Cameras(cameras=tuple(cameras), ties=replace(ties, residual_px=residuals, role=role))
 
 
-@pytest.mark.parametrize("has_ties", [True, False], ids=["all-rejected", "none"])
-def test_photos_without_ties_are_a_model_of_cameras_alone(tmp_path: Path, has_ties: bool) -> None:
-    cameras = oriented()
-    assert cameras.ties is not None
-    rejected = np.full_like(cameras.ties.role, TieRole.REJECTED)
-    ties = replace(cameras.ties, role=rejected) if has_ties else None
-    written = write_colmap_model(tmp_path, replace(cameras, ties=ties))
-    assert (written.n_images, written.n_points) == (3, 0)
-    scene = pycolmap.Reconstruction(str(tmp_path))
-    assert (scene.num_images(), scene.num_points3D()) == (3, 0)
-    assert all(len(image.points2D) == 0 for image in scene.images.values())
-
-
 def test_colmap_opens_the_model_and_sees_the_same_residuals(tmp_path: Path) -> None:
     cameras = oriented()
     ties = cameras.ties
@@ -130,12 +117,6 @@ def test_without_ties_the_cameras_are_written(tmp_path: Path) -> None:
 def test_a_name_that_colmap_would_cut_is_refused(tmp_path: Path) -> None:
     camera = replace(oriented().cameras[0], photo="north wall 1.jpg")
     with pytest.raises(ArgumentError, match=r'first space, but one is "north wall 1\.jpg"'):
-        write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
-
-
-def test_an_oriented_photo_without_a_lens_is_refused(tmp_path: Path) -> None:
-    camera = replace(oriented().cameras[0], intrinsics=None)
-    with pytest.raises(ArgumentError, match="is oriented, but its lens is not known"):
         write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
 
 

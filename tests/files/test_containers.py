@@ -27,7 +27,6 @@ from orthoflow.files.photo_files import (
     photo_format,
     read_exif,
     shifted_row,
-    stated_bits,
     stated_size,
 )
 from tests import photo_files as made
@@ -102,21 +101,6 @@ def test_size_profile_and_exif_are_read_of_every_format(kind: str) -> None:
     assert decode_image(encoded).shape == (96, 128, 3)
 
 
-@pytest.mark.parametrize(
-    ("encoded", "bits"),
-    [
-        (saved("PNG"), 8),
-        (saved("TIFF"), 8),
-        (cv2.imencode(".png", PICTURE.astype(np.uint16) * 257)[1].tobytes(), 16),
-        (cv2.imencode(".tif", PICTURE.astype(np.uint16) * 257)[1].tobytes(), 16),
-        (saved("JPEG"), None),
-        (b"", None),
-    ],
-)
-def test_bits_per_channel_are_what_the_file_states(encoded: bytes, bits: int | None) -> None:
-    assert stated_bits(encoded) == bits
-
-
 @pytest.mark.parametrize("big", [False, True], ids=["TIFF", "BigTIFF"])
 @pytest.mark.parametrize(
     "order", [(1, 0), (0, 1), (1, 0, 1)], ids=["preview-first", "last", "both"]
@@ -142,19 +126,6 @@ def test_a_page_of_a_tiff_that_is_a_mask_is_its_alpha(order: tuple[int, ...]) ->
     np.testing.assert_array_equal(opaque_pixels(encoded), mask > 0)
 
 
-def test_the_internal_mask_that_gdal_writes_is_the_alpha() -> None:
-    shown = np.zeros(PICTURE.shape[:2], dtype=np.bool_)
-    shown[10:60, 20:90] = True
-    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.MemoryFile() as memory:
-        size = {"height": 96, "width": 128, "count": 3, "dtype": "uint8"}
-        with memory.open(driver="GTiff", transform=Affine.scale(2, -2), **size) as out:
-            out.write(np.moveaxis(PICTURE, -1, 0))
-            out.write_mask(shown)
-        encoded = bytes(memory.getbuffer())
-    np.testing.assert_array_equal(opaque_pixels(encoded), shown)
-    assert count_pages(encoded) == 1
-
-
 @pytest.mark.parametrize("mode", ["1", "L", "P", "CMYK"])
 def test_the_colours_of_a_tiff_are_those_that_pillow_sees(mode: str) -> None:
     picture = Image.fromarray(PICTURE).convert(mode)
@@ -162,12 +133,6 @@ def test_the_colours_of_a_tiff_are_those_that_pillow_sees(mode: str) -> None:
     picture.save(stream, "TIFF")
     expected = np.asarray(picture.convert("RGB")).astype(int)
     assert np.abs(decode_image(stream.getvalue()) - expected).max() <= 1
-
-
-def test_whole_pages_of_a_tiff_are_counted() -> None:
-    encoded = pages(PICTURE, PICTURE, subfiles=(0, 0))
-    assert count_pages(encoded) == 2
-    assert count_pages(saved("JPEG")) == 1
 
 
 def transparent(kind: str) -> bytes:
@@ -212,11 +177,6 @@ def test_a_fourth_sample_of_a_tiff_that_is_off_or_full_is_its_alpha(
     assert (opaque is not None) is is_alpha
     if opaque is not None:
         np.testing.assert_array_equal(opaque, fourth > 0)
-
-
-@pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG", "WEBP"])
-def test_a_photo_without_transparency_is_opaque(kind: str) -> None:
-    assert opaque_pixels(saved(kind)) is None
 
 
 PHOTO: NDArray[np.uint8] = np.asarray(
@@ -339,12 +299,6 @@ def test_photos_with_bytes_changed_anywhere_are_decoded_or_refused(kind: str) ->
         opaque_pixels(bytes(encoded))
         with suppress(InputError):
             assert decode_image(bytes(encoded)).dtype == np.uint8
-
-
-def test_a_flipped_bit_in_a_png_is_found() -> None:
-    encoded = bytearray(saved("PNG", PHOTO))
-    encoded[len(encoded) // 2] ^= 16
-    assert damage(bytes(encoded))[1]
 
 
 @skip_unless(find_spec("pillow_heif") is not None, "program", "pillow_heif")

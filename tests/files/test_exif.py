@@ -65,27 +65,6 @@ def test_a_photo_without_exif_says_nothing_and_stands_upright() -> None:
     assert read_exif(b"no image") == Exif()
 
 
-@pytest.mark.parametrize(
-    "written",
-    [{made.ORIENTATION: 0}, {made.ORIENTATION: 9}, {made.ORIENTATION: "6"}],
-    ids=["zero", "nine", "text"],
-)
-def test_an_orientation_that_means_nothing_is_upright(written: dict[int, made.Value]) -> None:
-    assert read_exif(made.jpeg(made.picture(), made.exif_block(written))).orientation == 1
-
-
-def test_zeros_stand_for_what_the_camera_did_not_know() -> None:
-    inner: dict[int, made.Value] = {
-        made.FOCAL: (0, 1),
-        made.FOCAL_35MM: 0,
-        made.RESOLUTION_X: (1, 0),
-        made.WIDTH: 0,
-    }
-    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
-    assert exif == Exif()
-    assert focal_length(exif, 64, 48).reason == "no EXIF focal length"
-
-
 def test_a_damaged_block_gives_what_is_left_of_it() -> None:
     block = made.exif_block(MAIN, INNER)
     exif = read_exif(made.jpeg(made.picture(), block[:-30]))
@@ -102,14 +81,6 @@ def test_notes_of_the_maker_that_lie_outside_the_block_hide_nothing_else() -> No
     assert exif.is_damaged
     whole = read_exif(made.jpeg(made.picture(), made.exif_block(MAIN, INNER)))
     assert dataclasses.replace(exif, is_damaged=False) == whole
-
-
-def test_a_tag_of_one_byte_is_a_number_and_one_of_no_type_is_none() -> None:
-    block = made.exif_block(MAIN, INNER)
-    entry = struct.pack("<HHI", made.ORIENTATION, 3, 1)
-    for kind, orientation in ((1, 6), (4, 6), (99, 1)):
-        changed = block.replace(entry, struct.pack("<HHI", made.ORIENTATION, kind, 1))
-        assert read_exif(made.jpeg(made.picture(), changed)).orientation == orientation
 
 
 @pytest.mark.parametrize(
@@ -218,24 +189,6 @@ def test_the_unit_of_the_focal_plane_counts(unit: int | None, per_unit: int) -> 
     assert focal_length(exif, 6000, 4000).value_px == pytest.approx(8000.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("said_mm", [1, 65535])
-def test_a_35_mm_equivalent_that_no_lens_has_is_told_and_not_used(said_mm: int) -> None:
-    focal = focal_length(exif_of(focal_mm=4.5, focal_35mm=said_mm), 4000, 3000)
-    assert focal.value_px is None
-    assert focal.doubt == (
-        f"EXIF says a 35 mm equivalent of {said_mm} mm, which no lens has (4 to 3000 mm)"
-    )
-    assert focal.doubt in focal.reason
-
-
-@pytest.mark.parametrize("said_mm", [1, 65535])
-def test_an_impossible_equivalent_does_not_contradict_the_pixel_pitch(said_mm: int) -> None:
-    exif = exif_of(focal_mm=50, focal_35mm=said_mm, resolution_px_per_mm=160)
-    focal = focal_length(exif, 6000, 4000)
-    assert focal.value_px == pytest.approx(8000.0, rel=1e-12)
-    assert f"{said_mm} mm, which no lens has" in focal.doubt
-
-
 @pytest.mark.parametrize("said_mm", [0.01, 65535])
 def test_a_focal_length_that_no_lens_has_is_not_multiplied_by_the_pitch(said_mm: float) -> None:
     focal = focal_length(exif_of(focal_mm=said_mm, resolution_px_per_mm=160), 6000, 4000)
@@ -243,26 +196,6 @@ def test_a_focal_length_that_no_lens_has_is_not_multiplied_by_the_pitch(said_mm:
     assert f"EXIF says a focal length of {said_mm:g} mm, which no lens has" in focal.doubt
     both = exif_of(focal_mm=said_mm, focal_35mm=28, resolution_px_per_mm=160)
     assert focal_length(both, 1500, 1000).value_px == pytest.approx(28 / 36 * 1500, rel=1e-12)
-
-
-@pytest.mark.parametrize("equivalent_mm", [4, 3000])
-def test_the_shortest_and_longest_lenses_that_there_are_are_believed(equivalent_mm: int) -> None:
-    focal = focal_length(exif_of(focal_35mm=equivalent_mm), 1500, 1000)
-    assert focal.value_px == pytest.approx(equivalent_mm / 36 * 1500, rel=1e-12)
-    assert focal.doubt == ""
-
-
-def test_a_photo_that_was_cut_has_no_focal_length_from_exif() -> None:
-    exif = exif_of(focal_mm=28, focal_35mm=28, width=6000, height=4000)
-    focal = focal_length(exif, 3000, 3000)
-    assert focal.value_px is None
-    assert "the photo was cut after it was taken (6000 x 4000 became 3000 x 3000)" in focal.reason
-
-
-def test_millimetres_without_a_sensor_say_nothing() -> None:
-    focal = focal_length(exif_of(focal_mm=4.5), 4000, 3000)
-    assert focal.value_px is None
-    assert focal.reason == ("EXIF says 4.5 mm but neither the pixel pitch nor the 35 mm equivalent")
 
 
 def test_real_photos_give_their_cameras(shared_data: Path) -> None:
@@ -288,13 +221,6 @@ def test_no_format_is_turned_by_its_orientation(orientation: int) -> None:
     decoded = decode_image(made.jpeg(image, block)).astype(int)
     assert decoded.shape == image.shape
     assert np.abs(decoded - decode_image(encode_jpeg(image, quality=95)).astype(int)).max() == 0
-
-
-def test_a_picture_that_was_taken_less_than_a_pixel_wide_says_nothing_of_its_size() -> None:
-    block = made.exif_block({}, {made.FOCAL_35MM: 36, made.WIDTH: (1, 3), made.HEIGHT: 48})
-    exif = read_exif(made.jpeg(made.picture(), block))
-    assert (exif.width, exif.height) == (None, 48)
-    assert focal_length(exif, 64, 48).value_px == pytest.approx(36 / math.hypot(36, 24) * 80)
 
 
 TAKEN = Exif(focal_mm=30.0, focal_35mm=43.3, resolution_px_per_mm=200.0, width=4000, height=3000)
@@ -353,39 +279,4 @@ def test_a_pitch_belongs_to_a_sensor_that_there_is(px_per_mm: float, is_sensor: 
         )
 
 
-@pytest.mark.parametrize(
-    ("make", "model", "camera"),
-    [
-        ("NIKON CORPORATION", "Nikon D3X", "Nikon D3X"),
-        ("Apple", "iPhone 12", "Apple iPhone 12"),
-        ("", "iPhone 12", "iPhone 12"),
-        ("Apple", "", "Apple"),
-        ("", "", ""),
-    ],
-)
-def test_a_maker_is_not_said_twice(make: str, model: str, camera: str) -> None:
-    assert Exif(make=make, model=model).camera == camera
-
-
 # Sensors, lenses and cameras that there are
-
-
-def test_a_pitch_may_be_told_per_micrometre() -> None:
-    inner: dict[int, made.Value] = {
-        made.FOCAL: (50, 1),
-        made.RESOLUTION_X: (16, 100),
-        made.RESOLUTION_Y: (16, 100),
-        made.RESOLUTION_UNIT: 5,
-    }
-    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
-    assert exif.resolution_px_per_mm == pytest.approx(160.0)
-
-
-def test_the_pitch_is_the_mean_of_both_axes() -> None:
-    inner: dict[int, made.Value] = {
-        made.RESOLUTION_X: (100, 1),
-        made.RESOLUTION_Y: (300, 1),
-        made.RESOLUTION_UNIT: 4,
-    }
-    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
-    assert exif.resolution_px_per_mm == pytest.approx(200.0)

@@ -13,7 +13,6 @@ from orthoflow.errors import InputError
 from orthoflow.files.cube_faces import (
     FACE_FROM_CAMERA,
     FACES,
-    FisheyeFace,
     FisheyeLens,
     PanoramaFace,
     face_lenses,
@@ -175,11 +174,6 @@ def test_a_face_is_as_fine_as_the_photo_in_its_middle() -> None:
     assert faces["up"].height == pytest.approx(faces["up"].width / 2, rel=0.06)
 
 
-def test_faces_that_show_hardly_anything_are_left_out() -> None:
-    assert set(face_lenses(replace(LENS, field_of_view_deg=60.0))) == {"front"}
-    assert set(face_lenses(replace(LENS, field_of_view_deg=92.0))) == {"front"}
-
-
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
@@ -200,54 +194,3 @@ def test_a_lens_that_is_none_says_why(change: dict[str, float], problem: str) ->
     assert problem in problem_of(lens)
     with pytest.raises(InputError, match="the fisheye lens of photo a is none: "):
         fisheye_faces(b"", "a", lens)
-
-
-@pytest.mark.parametrize("field_of_view_deg", [92.0, 95.0, 98.0, 101.0, 105.0, 112.0])
-def test_faces_that_show_a_fiftieth_of_the_largest_are_shown(field_of_view_deg: float) -> None:
-    wide = replace(LENS, width=2_000, height=2_000, cx=1_000.0, cy=1_000.0)
-    lens = replace(wide, field_of_view_deg=field_of_view_deg)
-    steps = np.linspace(-1.0, 1.0, 65)
-    down, right = np.meshgrid(steps, steps, indexing="ij")
-    # Of a face beside, what is `off` before its middle plane: the axis is where `down` is.
-    limit = np.cos(np.radians(0.5 * field_of_view_deg))
-    beside = (right / np.sqrt(1.0 + right**2 + down**2) >= limit).mean()
-    front = (1.0 / np.sqrt(1.0 + right**2 + down**2) >= limit).mean()
-    expected = {"front"}
-    if beside >= 0.02 * front:
-        expected |= {"left", "right", "up", "down"}
-    assert set(face_lenses(lens)) == expected
-
-
-def test_a_fold_outside_the_image_or_beyond_the_field_does_no_harm() -> None:
-    folding = replace(LENS, radial=(-0.3, 0.0, 0.0, 0.0))
-    assert problem_of(replace(folding, field_of_view_deg=110.0)) == ""
-    assert problem_of(replace(folding, width=140, height=140, cx=70.0, cy=70.0)) == ""
-
-
-def test_faces_say_what_their_photo_was() -> None:
-    (face, *_) = fisheye_faces(b"bytes", "a", LENS)
-    assert isinstance(face, FisheyeFace)
-    assert (face.photo, face.face, face.fisheye) == (b"bytes", "front", LENS)
-
-
-@pytest.mark.parametrize(
-    ("focal_px", "height", "problem"),
-    [
-        (8_000.0, 30_000, ""),
-        (8_500.0, 30_000, "its faces would have 17000 x 17000 pixels"),
-        # Of few pixels, but with more columns than a picture may have.
-        (16_300.0, 1_000, ""),
-        (16_500.0, 1_000, "its faces would have 33000 x 2064 pixels"),
-    ],
-)
-def test_faces_are_as_large_as_pictures_may_be(focal_px: float, height: int, problem: str) -> None:
-    lens = FisheyeLens(
-        width=30_000,
-        height=height,
-        fx=focal_px,
-        fy=focal_px,
-        cx=15_000.0,
-        cy=0.5 * height,
-        field_of_view_deg=90.0,
-    )
-    assert problem_of(lens) == problem

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,9 +17,7 @@ from orthoflow.files.geotiff import (
     epsg_of,
     epsg_wkt,
     require_map_crs,
-    world_file_text,
 )
-from orthoflow.geometry.frames import frame_over
 
 PATH = Path("wall.tif")
 
@@ -58,22 +54,6 @@ def test_a_larger_one_states_eleven_hundred_values_a_byte(tmp_path: Path) -> Non
 def test_a_file_that_names_another_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^wall\.tif names another file for its overviews"):
         check_header(stored(tmp_path, 100), stated(4, OVERVIEW_FILE="http://a/b.ovr"))
-
-
-@pytest.mark.parametrize(
-    ("side_m", "is_side"), [(0.9e-6, False), (1.1e-6, True), (0.9e6, True), (1.1e6, False)]
-)
-def test_cells_are_of_a_micrometre_to_a_thousand_kilometres(
-    side_m: float, *, is_side: bool
-) -> None:
-    transform = Affine(side_m, 0.0, 7.0, 0.0, -side_m, 9.0)
-    if is_side:
-        assert module._gsd_m(PATH, transform) == side_m
-    else:
-        with pytest.raises(
-            InputError, match=re.escape(f"cells of {side_m:g} m, expected 1e-06 to 1e+06 m")
-        ):
-            module._gsd_m(PATH, transform)
 
 
 @pytest.mark.parametrize(
@@ -120,16 +100,6 @@ def test_codes_of_maps_have_four_to_six_digits(text: str | None, code: int | Non
     assert epsg_of(text) == code
 
 
-def test_a_world_file_says_the_sides_and_the_middle_of_the_first_pixel() -> None:
-    text = world_file_text(
-        module.GridPlace(gsd_m=0.02, corner_m=(100.0, 40.0)), rows=3.5, columns=2.5
-    )
-    found = [float(line) for line in text.splitlines()]
-    assert found == pytest.approx([0.05, 0.0, 0.0, -0.07, 100.025, 39.965])
-    plain = [float(line) for line in world_file_text(module.GridPlace(gsd_m=0.02)).splitlines()]
-    assert plain == pytest.approx([0.02, 0.0, 0.0, -0.02, 0.01, -0.01])
-
-
 def test_maps_are_in_metres() -> None:
     for crs in ("EPSG:25832", "EPSG:2100", "site"):
         require_map_crs(crs)
@@ -141,25 +111,6 @@ def test_maps_are_in_metres() -> None:
     assert epsg_wkt(999_999) == ""
 
 
-def test_a_system_that_there_is_not_is_named_in_a_hundred_letters() -> None:
-    for crs, named in (
-        ("EPSG:999999", "EPSG:999999"),
-        ("x" * 100, "x" * 100),
-        ("y" * 101, "y" * 100),
-    ):
-        with pytest.raises(InputError) as caught:
-            require_map_crs(crs)
-        assert str(caught.value).startswith(f"there is no coordinate system {named}: expected")
-
-
-def test_a_raster_lies_in_a_map_where_its_frame_says_so() -> None:
-    square = np.array([[5.0, 1.0, 0.0], [5.0, 0.0, 0.0], [6.0, 0.0, 0.0], [6.0, 1.0, 0.0]])
-    frame = frame_over(square, np.array([0.0, 0.0, 1.0]), gsd_m=0.25)
-    assert module.GridPlace.of(frame).corner_m == (0.0, 0.0)
-    place = module.GridPlace.of(replace(frame, map_crs="EPSG:25832"))
-    assert place == module.GridPlace(gsd_m=0.25, corner_m=(5.0, 1.0), crs="EPSG:25832")
-
-
 def test_a_part_of_a_raster_is_read_where_it_lies(tmp_path: Path) -> None:
     values = np.arange(48, dtype=np.float32).reshape(6, 8)
     module.write_raster(tmp_path / "a.tif", values, place=module.GridPlace(gsd_m=0.5), tags={})
@@ -169,14 +120,3 @@ def test_a_part_of_a_raster_is_read_where_it_lies(tmp_path: Path) -> None:
     np.testing.assert_array_equal(part, values[1:4, 2:7])
     assert shown.all()
     np.testing.assert_allclose(halved, values[:4, 2:6].reshape(2, 2, 2, 2).mean(axis=(1, 3)))
-
-
-def test_a_raster_of_no_system_is_read_without_one(tmp_path: Path) -> None:
-    import rasterio
-
-    path, sides = tmp_path / "a.tif", Affine(0.5, 0.0, 10.0, 0.0, -0.5, 20.0)
-    options = {"driver": "GTiff", "width": 3, "height": 2, "count": 1, "dtype": "float32"}
-    with rasterio.open(path, "w", transform=sides, **options) as stream:
-        stream.write(np.ones((1, 2, 3), np.float32))
-    found = module.read_raster(path)
-    assert (found.crs_wkt, found.gsd_m, found.corner_m) == ("", 0.5, (10.0, 20.0))

@@ -13,7 +13,6 @@ from PIL import Image
 
 from orthoflow.errors import InputError, ProductError
 from orthoflow.files import images
-from orthoflow.files.photo_files import photo_format
 
 
 def blocks(rows: int, columns: int, side: int = 8) -> NDArray[np.uint8]:
@@ -38,17 +37,6 @@ def test_colours_keep_their_order_in_a_png(channels: int) -> None:
     np.testing.assert_array_equal(images.decode_image(encoded), rgb)
 
 
-def test_red_is_red_in_every_format() -> None:
-    red = np.zeros((16, 16, 3), dtype=np.uint8)
-    red[..., 0] = 200
-    for encode in (images.encode_png, images.encode_jpeg, images.encode_webp):
-        encoded = encode(red)
-        np.testing.assert_allclose(images.decode_image(encoded), red, atol=4)
-        np.testing.assert_allclose(opened(encoded), red, atol=4)
-    grey = images.encode_webp(red[..., 0])
-    np.testing.assert_allclose(images.decode_image(grey), 200, atol=4)
-
-
 @pytest.mark.parametrize(
     "image",
     [
@@ -64,14 +52,6 @@ def test_what_is_no_picture_is_not_encoded(image: NDArray[np.uint8]) -> None:
         images.encode_png(image)
 
 
-def test_sixteen_bits_are_kept_in_a_png_and_in_no_other_format() -> None:
-    deep = np.array([[0, 1, 256], [257, 40_000, 65_535]], dtype=np.uint16)
-    np.testing.assert_array_equal(opened(images.encode_png(deep)), deep)
-    for encode in (images.encode_jpeg, images.encode_webp):
-        with pytest.raises(ProductError, match="an image to encode must be uint8 of shape"):
-            encode(deep)  # type: ignore[arg-type]
-
-
 def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None:
     plain = images.encode_png(blocks(8, 8))
 
@@ -83,14 +63,6 @@ def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None
     # As many as are decoded, but they are not in the file.
     with pytest.raises(InputError, match=r"a\.png cannot be decoded as an image \(\d+ bytes\)"):
         images.decode_image(stating(16_384, 16_384), "a.png")
-
-
-@pytest.mark.parametrize("encoded", [b"", b"<html>" + bytes(40), b"\x89PNG\r\n\x1a\n"])
-def test_what_is_no_image_is_told_with_its_size(encoded: bytes) -> None:
-    with pytest.raises(
-        InputError, match=rf"image (is not a JPEG|cannot be decod).* \({len(encoded)} "
-    ):
-        images.decode_image(encoded)
 
 
 def test_no_room_is_made_for_what_a_png_only_says_that_it_has(
@@ -111,30 +83,6 @@ def test_the_first_percentile_is_black_and_the_last_one_white() -> None:
     assert grey[[0, 1, 50, 99, 100, 101]].tolist() == [0, 0, 128, 255, 255, 0]
     # Straight in between: 255 steps over 98.
     np.testing.assert_allclose(grey[1:100], 255.0 * np.arange(99) / 98.0, atol=0.51)
-
-
-@pytest.mark.parametrize("values", [np.full((3, 4), np.nan), np.full((3, 4), 7.0)])
-def test_a_raster_of_nothing_or_of_one_value_is_black(values: NDArray[np.float64]) -> None:
-    grey = images.stretch_to_grey(values)
-    assert grey.shape == (3, 4)
-    assert not grey.any()
-
-
-def test_cells_are_grey_where_they_are_known() -> None:
-    values = np.array([[0.0, np.nan], [1.0, np.inf]])
-    grey, shown = images.grey_cells(values)((slice(0, 2), slice(0, 2)))
-    assert shown.tolist() == [[True, False], [True, False]]
-    assert grey.tolist() == [[0, 0], [255, 0]]
-    one, seen = images.grey_cells(values)((slice(1, 2), slice(0, 1)))
-    assert (one.tolist(), seen.tolist()) == ([[255]], [[True]])
-
-
-def test_rows_are_sampled_evenly_and_only_of_large_rasters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 100)
-    values = np.arange(310).reshape(31, 10)
-    np.testing.assert_array_equal(images.sampled_rows(values[:10]), values[:10])
-    np.testing.assert_array_equal(images.sampled_rows(values), values[::4])
-    np.testing.assert_array_equal(images.sampled_rows(values[:30]), values[:30:3])
 
 
 def test_a_small_picture_is_its_own_preview_and_transparent_where_nothing_is_shown() -> None:
@@ -164,11 +112,6 @@ def check_halves(preview: NDArray[np.uint8]) -> None:
     assert np.isin(preview[..., 3], (127, 128)).all()
 
 
-def test_a_large_picture_is_averaged_over_what_is_shown() -> None:
-    image, shown = halves()
-    check_halves(opened(images.preview_png(image, shown, longest_side_px=16)))
-
-
 @pytest.mark.parametrize("band_px", [1, 5, 1000])
 def test_a_very_large_one_is_averaged_band_by_band(
     monkeypatch: pytest.MonkeyPatch, band_px: int
@@ -186,43 +129,6 @@ def test_a_very_large_one_is_averaged_band_by_band(
     check_halves(images._preview(shown.shape, cells, 16))
     assert len(asked) == math.ceil(32 / band_px)
     assert asked[0] == (slice(0, 2 * min(32, band_px)), slice(0, 48))
-
-
-def test_what_is_left_over_beyond_whole_squares_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 100)
-    image = np.full((41, 21), 90, dtype=np.uint8)
-    image[40:], image[:, 20:] = 0, 0
-    preview = images._preview(
-        image.shape, lambda part: (image[part], np.ones(image[part].shape, dtype=np.bool_)), 10
-    )
-    assert preview.shape == (10, 5, 4)
-    assert np.unique(preview[..., :3]).tolist() == [90]
-
-
-def test_a_pixel_of_a_preview_covers_what_it_is_averaged_over(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert images.cells_per_preview_px((1600, 1200)) == (1.0, 1.0)
-    assert images.cells_per_preview_px((3200, 1000)) == (2.0, 2.0)
-    assert images.cells_per_preview_px((100, 4800)) == (100 / 33, 3.0)
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
-    # Squares of two first: 3500 x 1500, which become 1600 x 686.
-    assert images.cells_per_preview_px((7000, 3001)) == (4.375, 2 * 1500 / 686)
-    # The thinnest picture has a pixel.
-    assert images.cells_per_preview_px((16_000, 2))[0] == 10.0
-
-
-def test_an_encoded_image_is_shrunk_to_a_longest_side_and_never_enlarged() -> None:
-    image = blocks(40, 80)
-    encoded = images.encode_png(image)
-    small = images.decode_image(images.shrunk_webp(encoded, "a.png", longest_side_px=20))
-    assert small.shape == (10, 20, 3)
-    for longest_side_px in (80, 200):
-        same = images.shrunk_webp(encoded, "a.png", longest_side_px=longest_side_px)
-        assert images.decode_image(same).shape == image.shape
-    assert photo_format(same) == "WebP"
-    with pytest.raises(InputError, match=r"a\.png is not a JPEG"):
-        images.shrunk_webp(b"", "a.png", longest_side_px=20)
 
 
 @pytest.mark.parametrize(

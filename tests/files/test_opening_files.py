@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from orthoflow.files.publishing import publish_openings
-from orthoflow.products import Opening, Openings
 from tests.drawing_runs import WALL, box_openings
 
 
@@ -60,18 +59,6 @@ def test_outlines_are_closed_rings_in_the_coordinates_of_the_wall(folder: Path) 
     assert about["side_sigma_mm"] == [3.0, 1.5, None, 3.0]
 
 
-def test_the_room_has_all_of_them_in_space(folder: Path) -> None:
-    (opening,) = box_openings().openings
-    first, second = features(folder / "openings.geojson")
-    geometry = first["geometry"]
-    assert isinstance(geometry, dict)
-    ring = np.array(geometry["coordinates"][0])
-    np.testing.assert_allclose(ring[:4], opening.outline_world, atol=1e-6)
-    about = second["properties"]
-    assert isinstance(about, dict)
-    assert (about["wall"], about["depth_m"], about["edge_sigma_m"]) == (WALL + 1, None, None)
-
-
 def test_the_schedule_has_a_row_each(folder: Path) -> None:
     with (folder / "openings.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -96,10 +83,3 @@ def test_a_map_names_its_coordinate_system(tmp_path: Path) -> None:
     publish_openings(box_openings(), tmp_path, "sha256:0")
     content = json.loads((tmp_path / "openings.geojson").read_text())
     assert content["crs"]["properties"]["name"].startswith('LOCAL_CS["coordinates of the scan')
-
-
-def test_no_openings_are_an_empty_collection(tmp_path: Path) -> None:
-    none: tuple[Opening, ...] = ()
-    publish_openings(Openings(openings=none, walls=(1,)), tmp_path, "sha256:0")
-    assert json.loads((tmp_path / "openings.geojson").read_text())["features"] == []
-    assert len((tmp_path / "openings.csv").read_text().splitlines()) == 1

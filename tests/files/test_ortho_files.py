@@ -74,11 +74,6 @@ def test_pictures_are_averaged_to_their_longest_side(
             np.testing.assert_allclose(rgb[0, 0], mean, atol=1.0)
 
 
-def test_a_strip_has_a_row_however_small_it_is_shown(tmp_path: Path) -> None:
-    rgb, _ = ortho(tmp_path, RGB[:1]).shrunk(3)
-    assert rgb.shape == (1, 3, 3)
-
-
 @pytest.mark.parametrize(("n_rows", "heights"), [(4, [4, 2]), (3, [3, 3]), (7, [6])])
 def test_bands_are_the_picture_from_the_top(
     tmp_path: Path, n_rows: int, heights: list[int]
@@ -88,11 +83,6 @@ def test_bands_are_the_picture_from_the_top(
     shown = np.concatenate([shown for _, shown in bands])
     np.testing.assert_array_equal(shown, SHOWN)
     np.testing.assert_array_equal(np.concatenate([rgb for rgb, _ in bands])[shown], RGB[shown])
-
-
-def test_pictures_of_sixteen_bits_have_eight_of_them(tmp_path: Path) -> None:
-    rgb, shown = ortho(tmp_path, RGB.astype(np.uint16) * np.uint16(257)).shrunk(9)
-    np.testing.assert_array_equal(rgb[shown], RGB[shown])
 
 
 def test_depths_are_no_colours(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from orthoflow.files.cube_faces import (
     face_rays,
     faces_of,
 )
-from orthoflow.files.images import decode_image, encode_png
 
 WIDTH, HEIGHT = 512, 256
 
@@ -50,50 +49,11 @@ def test_a_face_shows_each_direction_where_it_is(face: str) -> None:
         np.testing.assert_allclose(middle, 128.0 + 120.0 * FACES[face][2], atol=2.0)
 
 
-def test_faces_look_to_all_sides_and_stand_upright() -> None:
-    for axes in FACES.values():
-        np.testing.assert_array_equal(np.cross(axes[0], axes[1]), axes[2])
-    level = ("front", "left", "back", "right")
-    assert all(FACES[face][1].tolist() == [0, 0, -1] for face in level)
-    forwards = {face: axes[2].tolist() for face, axes in FACES.items()}
-    assert forwards == {
-        "front": [1, 0, 0], "left": [0, 1, 0], "back": [-1, 0, 0], "right": [0, -1, 0],
-        "up": [0, 0, 1], "down": [0, 0, -1],
-    }  # fmt: skip
-
-
-def test_the_first_row_is_the_nearest_of_all_above_it() -> None:
-    """The last as well: nothing of the other end of the panorama is mixed in."""
-    panorama = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    panorama[0], panorama[-1] = 250, 90
-    for face, grey in (("up", 250), ("down", 90)):
-        found = face_picture(panorama, face)
-        # The pole itself, half a row beyond.
-        assert found[len(found) // 2, len(found) // 2] == grey
-
-
 def test_left_of_the_first_column_is_the_last() -> None:
     panorama = np.full((HEIGHT, WIDTH), 100, dtype=np.uint8)
     panorama[:, 0] = panorama[:, -1] = 200
     back = face_picture(panorama, "back")
     assert back[len(back) // 2, len(back) // 2] == 200
-
-
-@pytest.mark.parametrize(("width", "side"), [(1, 1), (3, 1), (512, 163), (10_000, 3_183)])
-def test_a_face_is_as_fine_in_its_middle_as_the_panorama(width: int, side: int) -> None:
-    lens = face_lens(width)
-    assert (lens.width, lens.height) == (side, side)
-    # Half a side at 45 degrees.
-    assert lens.fx == lens.fy == lens.cx == lens.cy == 0.5 * side
-
-
-def test_rays_go_through_the_middles_of_pixels() -> None:
-    lens = face_lens(13)
-    assert lens.width == 4
-    rays = face_rays(lens)
-    np.testing.assert_allclose(rays[0, :, 0], [-0.75, -0.25, 0.25, 0.75])
-    np.testing.assert_allclose(rays[:, 2, 1], [-0.75, -0.25, 0.25, 0.75])
-    assert (rays[..., 2] == 1.0).all()
 
 
 @pytest.mark.parametrize(
@@ -125,13 +85,3 @@ def test_a_panorama_has_as_many_columns_as_can_be_looked_up(width: int, is_read:
         return
     with pytest.raises(InputError, match=f"panorama hall has {width} columns, at most 32766"):
         faces_of(b"", "hall", width)
-
-
-def test_a_face_is_a_photo_of_its_own() -> None:
-    panorama = encode_png(coloured(directions()))
-    (front, *_) = faces_of(panorama, "hall", WIDTH)
-    np.testing.assert_array_equal(
-        decode_image(front.encoded()), face_picture(coloured(directions()), "front")
-    )
-    assert front.mask() is None
-    assert front.lens == face_lens(WIDTH)

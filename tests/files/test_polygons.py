@@ -78,14 +78,6 @@ def test_what_is_no_polygon_with_a_name_is_refused_with_its_number(
     assert len(read(tmp_path, feature([SQUARE[:3]]))) == 1
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"features": {}}'])
-def test_what_is_no_collection_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "m.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"^m\.json is not a mask: expected a GeoJSON Feature"):
-        read_polygons(path, name="photo", what="a mask")
-
-
 def test_cells_are_filled_whose_centres_lie_inside_and_in_no_hole() -> None:
     outer = np.array([[0.4, 0.4], [4.6, 0.4], [4.6, 3.4], [0.4, 3.4]])
     hole = np.array([[1.4, 1.4], [2.6, 1.4], [2.6, 2.6], [1.4, 2.6]])
@@ -136,27 +128,3 @@ def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str) -> Non
     raster = CRS.from_wkt(read_raster(tmp_path / "a.tif").crs_wkt)
     assert CRS.from_user_input(name).to_wkt() == raster.to_wkt()
     assert read_polygons(tmp_path / "a.geojson", "photo", what="areas")[0].name == "a.jpg"
-
-
-def test_features_are_written_in_one_line_on_request(tmp_path: Path) -> None:
-    write_features(tmp_path / "a.geojson", [], "EPSG:25832", indent=None)
-    text = (tmp_path / "a.geojson").read_text()
-    assert text.count("\n") == 1
-    assert "urn:ogc:def:crs:EPSG::25832" in text
-    assert "product_digest" not in text
-
-
-@pytest.mark.parametrize("dtype", [np.int16, np.int32])
-def test_labels_are_outlined_and_written_alike(tmp_path: Path, dtype: type) -> None:
-    labels = np.full((3, 4), -1, dtype)
-    labels[1, 1:3], labels[2, 0] = 300, 0
-    write_raster(tmp_path / "a.tif", labels, place=GridPlace(gsd_m=0.5), tags={})
-    raster = read_raster(tmp_path / "a.tif")
-    assert raster.values.dtype == dtype
-    np.testing.assert_array_equal(raster.values, labels)
-    np.testing.assert_array_equal(raster.shown, labels >= 0)
-    assert raster.nodata == -1
-    found = {label: filled(rings, labels.shape) for label, rings in outlines(labels)}
-    assert sorted(found) == [0, 300]
-    for label, cells in found.items():
-        np.testing.assert_array_equal(cells, labels == label)

@@ -191,33 +191,6 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
     np.testing.assert_array_equal(shown[:, :, 3], [[255, 255, 255], [0, 255, 255]])
 
 
-def test_each_raster_of_a_wall_says_what_it_holds(tmp_path: Path) -> None:
-    intensity = np.linspace(0.0, 1.0, 6, dtype=np.float32).reshape(2, 3)
-    layered = np.stack([DEPTH, DEPTH + 1.0], axis=2)
-    full = replace(wall(), intensity=intensity, percentiles_m=layered)
-    both = (full, replace(wall(), plane_index=3, percentiles_m=layered))
-    product = replace(walls(), walls=both, percentiles=(5.0, 50.0))
-    publishing.publish_walls(product, tmp_path, DIGEST)
-    stems = {"wall_2_depth", "wall_2_depth_p5_0", "wall_2_depth_p50_0", "wall_2_intensity"}
-    stems |= {"wall_3_depth", "wall_3_depth_p5_0", "wall_3_depth_p50_0"}
-    suffixes = (".tif", ".json", ".png", ".pgw")
-    assert names_in(tmp_path) == {f"{stem}{suffix}" for stem in stems for suffix in suffixes}
-    depth = "depth in metres along the normal, positive towards the viewer; NaN = no data"
-    contents = {
-        "wall_2_depth": (DEPTH, depth),
-        "wall_2_depth_p5_0": (DEPTH, f"percentile 5.0 of the cell's points: {depth}"),
-        "wall_2_depth_p50_0": (DEPTH + 1.0, f"percentile 50.0 of the cell's points: {depth}"),
-        "wall_2_intensity": (intensity, "intensity 0..1 (laser); NaN = no data"),
-        "wall_3_depth": (DEPTH, depth),
-    }
-    for stem, (values, content) in contents.items():
-        read = geotiff.read_raster(tmp_path / f"{stem}.tif")
-        np.testing.assert_array_equal(read.values, values)
-        assert read.tags["content"] == json_of(tmp_path / f"{stem}.json")["content"] == content
-    told = geotiff.read_raster(tmp_path / "wall_2_intensity.tif").tags
-    assert (told["unit"], told["intensity_source"]) == ("1", "laser")
-
-
 MASK = np.array([[0, 1, 2], [3, 4, 1]], np.uint8)
 RGB = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.errors import InputError, ProductError, StoreError
+from orthoflow.errors import InputError, StoreError
 from orthoflow.files import geotiff, images, publishing
 from orthoflow.files.calibration import read_calibration
 from orthoflow.geometry import WallFrame
@@ -117,27 +117,6 @@ def test_no_traceback_is_printed_for_text_in_a_file_that_is_not_utf_8(
     assert capfd.readouterr() == ("", "")
 
 
-def test_geotiffs_lie_in_metres_with_rows_downwards(tmp_path: Path, frame: WallFrame) -> None:
-    import rasterio
-
-    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
-    with rasterio.open(tmp_path / "wall_3_ortho.tif") as dataset:
-        assert tuple(dataset.transform)[:6] == (0.01, 0.0, 0.0, 0.0, -0.01, 0.0)
-        assert dataset.tags()["AREA_OR_POINT"] == "Area"
-        assert [item.name for item in dataset.colorinterp] == ["red", "green", "blue"]
-        assert dataset.count == 3
-
-
-def test_the_world_file_says_what_the_geotiff_says(tmp_path: Path, frame: WallFrame) -> None:
-    import rasterio
-    from affine import loadsw
-
-    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
-    placed = loadsw((tmp_path / "wall_3_ortho.tfw").read_text())
-    with rasterio.open(tmp_path / "wall_3_ortho.tif") as dataset:
-        assert placed.almost_equals(dataset.transform, 1e-12)
-
-
 @pytest.mark.parametrize("whole_px", [1 << 26, 1000], ids=["small", "averaged first"])
 def test_previews_open_where_their_rasters_lie(
     tmp_path: Path, frame: WallFrame, monkeypatch: pytest.MonkeyPatch, whole_px: int
@@ -195,21 +174,6 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(
         publishing.publish_ties(ties(), tmp_path / "missing", DIGEST)
 
 
-def test_rasters_of_a_wrong_type_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ProductError, match=r"a\.tif takes a flat raster of float32, int16"):
-        geotiff.write_raster(
-            tmp_path / "a.tif", np.zeros((2, 2)), place=geotiff.GridPlace(gsd_m=1.0), tags={}
-        )
-    with pytest.raises(ProductError, match=r"a\.tif takes RGB of 8 or 16 bits and a mask of"):
-        geotiff.write_orthoimage(
-            tmp_path / "a.tif",
-            np.zeros((2, 2, 3), np.uint8),
-            np.zeros((3, 2), np.bool_),
-            place=geotiff.GridPlace(gsd_m=1.0),
-            tags={},
-        )
-
-
 def test_reading_something_else_as_a_geotiff_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "text.tif"
     path.write_text("no picture")
@@ -240,12 +204,6 @@ def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) ->
     found = read_calibration(tmp_path / "calibration.yaml")
     assert found.patterns == ("a[1].jpg",)
     assert found.lenses == (replace(lens, source="calibration"),)
-
-
-def test_calibrated_lenses_are_not_published_again(tmp_path: Path) -> None:
-    refused = Camera(photo="b.jpg", status="only 3 ties, 6 are needed")
-    publishing.publish_cameras(Cameras(cameras=(refused,)), tmp_path, DIGEST)
-    assert [path.name for path in tmp_path.iterdir()] == ["cameras.json"]
 
 
 def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:

@@ -141,30 +141,6 @@ def test_a_floor_and_the_ceiling_over_it_lie_upon_each_other(tmp_path: Path) -> 
     np.testing.assert_allclose(bounds[0], bounds[1])
 
 
-def test_a_part_of_a_wall_keeps_the_coordinates_of_the_whole(tmp_path: Path) -> None:
-    whole = frame("wall", UPS[0])
-    corner = whole.world_from_wall(np.array([[12.0, 5.0]]))[0]
-    part = replace(whole, origin_world=corner, width=8, height=6, left_m=1.2)
-    assert part.crs == whole.crs
-    path = published(part, tmp_path)
-    about = json.loads(path.with_suffix(".json").read_text())
-    assert (about["x_of_left_m"], about["height_of_top_m"]) == pytest.approx((1.2, 186.625))
-    assert placed_raster(path)[0].has_cells_of(part)
-
-
-def test_no_two_walls_have_one_coordinate_system() -> None:
-    wall = frame("wall", UPS[0])
-    others = [
-        frame("wall", UPS[0], name="wall 1"),
-        replace(wall, origin_world=wall.origin_world + 0.5 * UPS[2]),
-        frame("leaning", UPS[0]),
-        frame("floor", UPS[0]),
-    ]
-    assert len({wall.crs, *(other.crs for other in others)}) == 5
-    # Finer cells of the same wall, and its other rasters, share it.
-    assert replace(wall, gsd_m=0.05, width=60, height=40).crs == wall.crs
-
-
 def test_what_neither_stands_nor_lies_counts_from_its_corner() -> None:
     turn = scenes.random_rotation(np.random.default_rng(4))
     wall = frame("wall", UPS[0])

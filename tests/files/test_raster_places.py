@@ -5,12 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
-from orthoflow.errors import InputError
 from orthoflow.files.geotiff import GridPlace, place_of, write_orthoimage, write_raster
-from tests import photo_files
 
 
 def test_a_raster_in_a_map_lies_on_earth(tmp_path: Path) -> None:
@@ -45,16 +42,3 @@ def test_a_raster_in_the_plane_of_its_wall_is_no_place_on_earth(tmp_path: Path) 
     assert found.wkt2.startswith('ENGCRS["run 00000000-000000-000000 plane, metres"')
     assert (found.shape, found.bands) == ((2, 3), ("float32",))
     assert found.bounds == (0.0, -1.0, 1.5, 0.0)
-
-
-def test_a_raster_of_no_system_at_all_says_none(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    path.write_bytes(photo_files.tiff(np.zeros((2, 3, 3), np.uint8), 1))
-    assert (place_of(path).epsg, place_of(path).wkt2) == (None, "")
-
-
-def test_what_is_no_geotiff_has_no_place(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    path.write_bytes(b"II*\0 and no more")
-    with pytest.raises(InputError, match=r"a\.tif cannot be read as a GeoTIFF: "):
-        place_of(path)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.errors import InputError
 from orthoflow.files import gltf as module
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.files.gltf import WallMesh, flat_mesh, relief_mesh
@@ -39,12 +38,6 @@ def area_m2(mesh: WallMesh) -> float:
     first, second, third = (mesh.vertices[mesh.triangles[:, k], :2].astype(float) for k in range(3))
     one, other = second - first, third - first
     return float(0.5 * (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum())
-
-
-def test_a_flat_wall_is_its_rectangle() -> None:
-    mesh = flat_mesh(frame())
-    assert area_m2(mesh) == pytest.approx(0.4 * 0.6)
-    np.testing.assert_allclose(mesh.vertices[2], [0.6, -0.4, 0.0])
 
 
 def test_a_slope_is_where_the_depths_are(tmp_path: Path) -> None:
@@ -86,8 +79,3 @@ def test_without_any_depth_or_width_it_is_flat(tmp_path: Path, shape: tuple[int,
     depths_m = np.full(shape, np.nan if shape == SHAPE else 0.3, dtype=np.float32)
     mesh = relief(tmp_path, depths_m)
     np.testing.assert_array_equal(mesh.vertices, flat_mesh(frame(*shape)).vertices)
-
-
-def test_depths_of_other_cells_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="60 x 40 cells, expected the 60 x 41 of the orthoimage"):
-        relief(tmp_path, slope(), frame(41, 60))

@@ -11,7 +11,6 @@ from orthoflow.files.yaml_positions import (
     Table,
     Text,
     Value,
-    describe,
     plain,
     read_yaml,
 )
@@ -165,20 +164,6 @@ def test_a_dialect_bounds_its_documents_and_words_their_mistakes() -> None:
     assert problems_of("a: 1\na: 2", small) == [(2, 1, "a", "a again, as in line 1")]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[1]", "a list"),
-        ("{a: 1}", "a mapping"),
-        ("a", 'the text "a"'),
-        ("true", "true"),
-        ("5", "5"),
-    ],
-)
-def test_values_are_described_for_messages(text: str, words: str) -> None:
-    assert describe(read(text)) == words
-
-
 @pytest.mark.parametrize("marks", ["[]", "{}"], ids=["lists", "mappings"])
 @pytest.mark.parametrize(("depth", "is_read"), [(60, True), (61, False)])
 def test_sixty_levels_are_the_most(marks: str, depth: int, is_read: bool) -> None:
@@ -191,17 +176,6 @@ def test_sixty_levels_are_the_most(marks: str, depth: int, is_read: bool) -> Non
         return
     (problem,) = problems_of(text, TOLERANT)
     assert problem[3] == "the document is nested deeper than 60 levels"
-
-
-@pytest.mark.parametrize(
-    ("text", "n_values"),
-    [("a", 1), ("[a, b]", 3), ("a: b", 3), ("{a: [b, c], d: {}}", 7)],
-)
-def test_keys_and_values_are_counted(text: str, n_values: int) -> None:
-    read(text, Dialect(is_strict=False, most_values=n_values))
-    dialect = Dialect(is_strict=False, most_values=n_values - 1)
-    (problem,) = problems_of(text, dialect)
-    assert problem[3] == f"the document has more than {n_values - 1} values"
 
 
 @pytest.mark.parametrize(
@@ -245,12 +219,6 @@ def test_a_strange_value_is_told_in_whole(
     text: str, place: tuple[int, int, str], words: str
 ) -> None:
     assert problems_of(text) == [(*place, words)]
-
-
-def test_reading_goes_on_with_the_number_that_was_meant() -> None:
-    document = read_yaml("{a: 0,003, b: [1, 0,05, 2], c: 10,5}", Problems())
-    assert document is not None
-    assert plain(document) == {"a": 0.003, "b": [1, 0.05, 2], "c": 10.5}
 
 
 @pytest.mark.parametrize(
@@ -298,13 +266,6 @@ def test_what_is_no_yaml_is_told_where_it_was_written(
     assert problems_of(text) == [(*place, "", f"this is not YAML: {words}")]
 
 
-def test_what_is_just_short_enough_is_read() -> None:
-    assert plain(read("k" * 1024 + ": 1", Dialect())) == {"k" * 1024: 1}
-    assert plain(read(f"0x{'1' * 998}", Dialect())) == int("1" * 998, 16)
-    assert describe(read("a" * 100)) == f'the text "{"a" * 100}"'
-    assert describe(read("a" * 101)) == f'the text "{"a" * 100}..."'
-
-
 def test_aliases_lead_no_deeper_than_brackets() -> None:
     def nested(n_around: int) -> str:
         return f"[&a {'[' * 30}1{']' * 30}, {'[' * n_around}*a{']' * n_around}]"
@@ -312,12 +273,3 @@ def test_aliases_lead_no_deeper_than_brackets() -> None:
     read(nested(29))
     (problem,) = problems_of(nested(30), TOLERANT)
     assert problem[3] == "the document is nested deeper than 60 levels"
-
-
-def test_a_key_that_is_no_word_is_told_once_and_stands_as_one() -> None:
-    problems = Problems()
-    document = read_yaml("? [x]\n: 1", problems, TOLERANT)
-    assert isinstance(document, Table)
-    (entry,) = document
-    assert (entry.key, entry.is_text) == ("?", True)
-    assert [words for *_, words in problems.found] == ["a key must be text, got a list or mapping"]

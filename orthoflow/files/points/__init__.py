@@ -1,5 +1,6 @@
 """Scans as files of other programs, read block by block: `open_scan` chooses the reader."""
 
-from orthoflow.files.points.scan_file import FORMATS, PointBlock, Scan, ScanFile, Wish, open_scan
+from orthoflow.files.points.formats import FORMATS, open_scan
+from orthoflow.files.points.scan_file import PointBlock, Scan, ScanFile, Wish
 
 __all__ = ["FORMATS", "PointBlock", "Scan", "ScanFile", "Wish", "open_scan"]

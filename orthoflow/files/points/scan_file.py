@@ -1,4 +1,4 @@
-"""Point files: choice of the reader, and what every reader returns.
+"""What every reader of point files returns: scans with their metadata, then blocks of points.
 
 A reader opens a file up to its header, states what each of its scans has, and yields blocks of
 points. `point_block` makes a block of the columns of any format, so that points without return,
@@ -7,33 +7,25 @@ flagged points and poses are treated once, for all of them.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
-
-if TYPE_CHECKING:
-    from orthoflow.files.points.fields import Columns
-    from orthoflow.files.points.units import StatedUnit
+from orthoflow.files.points.units import StatedUnit
 
 # 12 MB of float64 coordinates: large enough for memory speed, small enough to hold several copies.
 BLOCK_POINTS: Final = 500_000
 # Half of the programs that read our products count positions in 32 bits.
 #: points of a scan file (one less is read)
 MOST_POINTS: Final = 2**32
-# The densest encodings take a byte for eight points; a small file that states more is refused
-# before memory is allocated for them.
-#: points that a file states, per byte that it has
-MOST_POINTS_PER_BYTE: Final = 8
 
 PointField = Literal["intensity", "rgb", "grid"]
 # Any: arrays of any type.
@@ -155,138 +147,6 @@ class Wish:
 
     def __bool__(self) -> bool:
         return self.box is not None or self.spacing is not None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Format:
-    """One family of point files.
-
-    Attributes:
-        name: its usual name.
-        suffixes: lower case, with the dot.
-        signature: first bytes of its files, matched; None for plain text.
-        beginning: what its files begin with, for messages.
-        reader: module and function that open its files.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    signature: re.Pattern[bytes] | None = None
-    beginning: str = ""
-    reader: tuple[str, str]
-
-
-E57: Final = Format(
-    name="E57",
-    suffixes=(".e57",),
-    signature=re.compile(b"ASTM-E57"),
-    beginning="ASTM-E57",
-    reader=("e57", "open_e57"),
-)
-LAS: Final = Format(
-    name="LAS/LAZ",
-    suffixes=(".las", ".laz"),
-    signature=re.compile(b"LASF"),
-    beginning="LASF",
-    reader=("las", "open_las"),
-)
-PLY: Final = Format(
-    name="PLY",
-    suffixes=(".ply",),
-    signature=re.compile(rb"ply[\n\r ]", re.IGNORECASE),
-    beginning="ply",
-    reader=("records", "open_ply"),
-)
-# Programs write first lines of their own, or none.
-PCD: Final = Format(
-    name="PCD",
-    suffixes=(".pcd",),
-    signature=re.compile(
-        rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]",
-        re.IGNORECASE,
-    ),
-    reader=("records", "open_pcd"),
-)
-PTX: Final = Format(name="PTX", suffixes=(".ptx",), reader=("ptx", "open_ptx"))
-TEXT: Final = Format(
-    name="text",
-    suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb", ".tsv"),
-    reader=("text", "open_text"),
-)
-FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)
-_SNIFFED_BYTES: Final = 4096
-
-
-def find_format(path: Path) -> Format:
-    """Return the format of a point file: by its content if that is certain, else by its suffix.
-
-    Raises:
-        InputError: the file is missing, empty, not what its suffix says, or of an unknown format.
-    """
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path.name} must be a point file, but there is {found} at that place")
-    try:
-        with path.open("rb") as file:
-            start = file.read(_SNIFFED_BYTES)
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be opened: {error.strerror}") from error
-    if not start:
-        raise InputError(f"{path.name} is empty (0 bytes): expected a scan; copy it again")
-    for item in FORMATS:
-        if item.signature is not None and item.signature.match(start):
-            return item
-    named = next((item for item in FORMATS if path.suffix.lower() in item.suffixes), None)
-    if named is None:
-        known = " ".join(suffix for item in FORMATS for suffix in item.suffixes)
-        raise InputError(
-            f"{path.name} is not a point file that orthoflow reads: expected one of {known}"
-        )
-    if named.beginning or (named is PCD and b"\0" in start[:64]):
-        raise InputError(
-            f"{path.name} is named as {named.name} but does not begin with "
-            f"{named.beginning or '# .PCD'!r}: the file is damaged or of another format; export it "
-            "again or give it its right suffix"
-        )
-    return named
-
-
-def open_scan(
-    path: Path,
-    columns: Columns | None = None,
-    *,
-    classes: Collection[int] = (),
-    wish: Wish | None = None,
-    intensity_field: str | None = None,
-) -> ScanFile:
-    """Open a point file up to its header.
-
-    Args:
-        path: the file.
-        columns: meaning of the columns of a text file, if the user states it.
-        classes: of a LAS or LAZ file only points of these classes are read; all if empty.
-        wish: of a COPC file only parts with such points are read; others are read completely.
-        intensity_field: name of the field to use as the intensity; None for the usual one.
-
-    Raises:
-        InputError: the file cannot be read, with the reason in one sentence.
-        PluginError: the library for this format is missing.
-    """
-    found = find_format(path)
-    choice: dict[str, object] = {"intensity_field": intensity_field}
-    if found is TEXT:
-        choice["columns"] = columns
-    if found is LAS:
-        choice |= {"classes": classes, "wish": wish}
-    module, function = found.reader
-    scan: ScanFile = getattr(import_module(f"{__package__}.{module}"), function)(path, **choice)
-    n_bytes = path.stat().st_size
-    if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
-        raise InputError(
-            f"{path.name} states {scan.n_most} points but has {n_bytes} bytes, which cannot hold "
-            "them: the file is damaged or cut off, copy or export it again"
-        )
-    return scan
 
 
 def point_block(

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from orthoflow.errors import InputError
 from orthoflow.files.points import Scan, ScanFile, Wish, open_scan
 from orthoflow.files.points.fields import Columns, columns_of_user, plain_name
-from orthoflow.files.points.scan_file import LAS, TEXT
+from orthoflow.files.points.formats import LAS, TEXT
 from orthoflow.files.points.units import UNITS_M, refuse_degrees
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.geometry.cloud_quality import judge_quality

@@ -3,7 +3,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pye57
 import pytest
 from laspy.copc import CopcReader
 from plyfile import PlyData
-from rasterio.crs import CRS
 
 from orthoflow.files.clouds import copc, dressing
 from orthoflow.files.clouds.colours import plane_colour
@@ -25,7 +23,6 @@ from orthoflow.files.clouds.las import write_laz
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.ply import write_ply
-from orthoflow.files.geotiff import epsg_of, epsg_wkt
 from orthoflow.files.images import encode_png
 from orthoflow.files.points import Wish, open_scan
 from orthoflow.geometry.frames import frame_over
@@ -142,7 +139,6 @@ FORMATS = {
     "ply": (write_ply, read_ply),
     "e57": (write_e57, read_e57),
 }
-Write = Callable[[Path, DressedCloud], int]
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -305,22 +301,6 @@ def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
             assert (intensity.minimum(), intensity.maximum()) == (0.0, 1.0)
 
 
-def test_a_scan_without_chosen_points_is_not_written(tmp_path: Path) -> None:
-    cloud = corner()
-    first = cloud.points_world()[0]
-    box = np.array([first - 1e-3, first + 1e-3])
-    dress = dressed(cloud=dataclasses.replace(cloud, stations=None, stations_source=None))
-    assert not dress.is_empty
-    alone = dataclasses.replace(dress, box_world=box)
-    assert write_e57(tmp_path / "a.e57", alone) == 1
-    with pye57.E57(str(tmp_path / "a.e57")) as file:
-        assert file.scan_count == 1
-        assert file.image_file.root()["data3D"][0]["name"].value() == "scan 0, station not known"
-    nothing = dataclasses.replace(dress, box_world=box + 100.0)
-    assert nothing.is_empty
-    assert write_e57(tmp_path / "b.e57", nothing) == 0
-
-
 def test_what_a_file_holds_is_told_beside_it(tmp_path: Path) -> None:
     def told(dress: DressedCloud) -> Any:
         describe_cloud(tmp_path / "a.json", dress, "a.ply", 7)
@@ -371,18 +351,6 @@ def test_what_a_file_holds_is_told_beside_it(tmp_path: Path) -> None:
     assert rich["points_of_the_cloud_unseen"] == 2
     unknown = told(dressed(cloud=dataclasses.replace(cloud, stations=None, stations_source=None)))
     assert unknown["scans"][1] == {"scan": 1, "station_world": None}
-
-
-def test_a_known_coordinate_system_is_in_the_file(tmp_path: Path) -> None:
-    wkt = epsg_wkt(25832)
-    write_laz(tmp_path / "a.laz", dressed(crs_wkt=wkt))
-    with laspy.open(tmp_path / "a.laz") as file:
-        (vlr,) = [v for v in file.header.vlrs if v.record_id == 2112]
-        assert CRS.from_wkt(vlr.string).to_epsg() == 25832
-        np.testing.assert_array_equal(file.header.offsets, ORIGIN)
-    write_ply(tmp_path / "a.ply", dressed(crs_wkt=wkt))
-    assert any("25832" in line for line in PlyData.read(tmp_path / "a.ply").comments)
-    assert [epsg_of(name) for name in ("site", "http://a/b", "EPSG:1", None)] == [None] * 4
 
 
 def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, neighbourhoods_of
-from orthoflow.files.clouds.photo_colours import PointColours
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, PointLabels
@@ -72,13 +71,6 @@ def test_normals_look_at_the_scanner_of_their_scan() -> None:
     np.testing.assert_allclose(one, np.abs(expected), atol=1e-5)
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_normals_look_at_the_only_place_that_somebody_looked_from(side: float) -> None:
-    cloud = corner(stations=ORIGIN + side * np.ones((1, 3)), stations_source="view_from")
-    expected = side * NORMALS[IS_FLOOR.astype(int)]
-    np.testing.assert_allclose(normals(dressed(cloud, planes=planes(-side))), expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> None:
     # Two places, and nobody knows which points are of which.
@@ -104,25 +96,6 @@ def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
     single = dressed(corner(scan=None, stations=stations[:1], stations_source="file"))
     assert single.scans == (0,)
     np.testing.assert_array_equal(single.station(0), stations[0])
-
-
-def test_points_on_the_sides_of_a_box_are_in_it_scan_by_scan() -> None:
-    points = CORNER.points_world()
-    # Its sides go through points, as float32 has them.
-    box = np.array([points.min(axis=0), points[N_SIDE**2 + 5 * N_SIDE + 5]])
-    dress = dressed(box_world=box)
-    chosen = np.all((points >= box[0]) & (points <= box[1]), axis=1)
-    assert 0 < chosen.sum() < len(points)
-    for scan in (None, 0, 1):
-        own = chosen if scan is None else chosen & (CORNER.scan == scan)
-        (block,) = dress.blocks(scan)
-        np.testing.assert_array_equal(block.world, points[own])
-        assert len(block) == own.sum()
-        found = dress.bounds_world(scan)
-        np.testing.assert_array_equal(found, [points[own].min(axis=0), points[own].max(axis=0)])
-    far = dressed(box_world=box + 100.0)
-    assert far.bounds_world() is None
-    assert list(far.blocks()) == []
 
 
 @pytest.mark.parametrize(
@@ -158,48 +131,6 @@ def test_a_wall_has_the_points_over_it_as_far_before_and_behind_it_as_it_reaches
     assert len(found) == is_inside
     if is_inside:
         np.testing.assert_allclose(found[0], [corner_m[0]], atol=1e-6)
-
-
-def test_deviations_are_of_points_whose_plane_is_there() -> None:
-    index = np.full(len(CORNER), -1, dtype=np.int16)
-    index[[3, 4, 5, N_SIDE**2]] = [0, 1, 2, 1]
-    (block,) = dressed(planes=planes(), labels=PointLabels(plane_index=index)).blocks()
-    assert block.deviation_m is not None
-    assert np.flatnonzero(np.isfinite(block.deviation_m)).tolist() == [3, 4, N_SIDE**2]
-    # A point of the wall lies as far from the floor as it is high.
-    np.testing.assert_allclose(block.deviation_m[[3, 4]], [0.0, CORNER.z[4]], atol=1e-6)
-    for bare in (dressed(planes=planes()), dressed(labels=PointLabels(plane_index=index))):
-        assert [one.deviation_m for one in bare.blocks()] == [None]
-        assert bare.scale_m == 0.001
-
-
-@pytest.mark.parametrize(("n_far", "scale_m"), [(5, 0.05), (8, 1.0)])
-def test_ninety_nine_of_a_hundred_points_set_the_scale(n_far: int, scale_m: float) -> None:
-    # Of the 576 points of the wall; those of the floor are on no plane.
-    x = np.full(len(CORNER), 0.04, dtype=np.float32)
-    x[5 : 5 + 50 * n_far : 50] = -0.9
-    labels = PointLabels(plane_index=np.where(IS_FLOOR, -1, 0).astype(np.int16))
-    dress = dressed(replace(CORNER, x=x), planes=planes(), labels=labels)
-    assert dress.scale_m == scale_m
-
-
-def test_a_field_is_written_where_it_is_known() -> None:
-    intensity = np.linspace(-0.5, 1.5, len(CORNER), dtype=np.float32)
-    photo = (np.arange(len(CORNER)) % 3 - 1).astype(np.int16)
-    colours = PointColours(
-        rgb=np.full((len(CORNER), 3), 7, np.uint8), best=np.ones(len(CORNER), np.float32)
-    )
-    (bare,) = dressed(corner(scan=None)).blocks()
-    assert bare.fields() == {}
-    (full,) = dressed(
-        corner(intensity=intensity), photo_colours=replace(colours, photo=photo)
-    ).blocks()
-    assert sorted(full.fields()) == ["intensity", "photo", "scan"]
-    np.testing.assert_array_equal(full.fields()["intensity"], np.clip(intensity, 0.0, 1.0))
-    np.testing.assert_array_equal(full.fields()["photo"], photo)
-    assert (full.rgb == 7).all()
-    (unnumbered,) = dressed(photo_colours=colours).blocks()
-    assert "photo" not in unnumbered.fields()
 
 
 def test_what_no_colour_is_known_for_is_grey() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,18 +71,6 @@ def test_extra_bytes_are_of_what_is_known(tmp_path: Path) -> None:
         found = written(tmp_path / "a.laz", replace(plain, **more))  # type: ignore[arg-type]
         assert list(found.point_format.extra_dimension_names) == [*NORMALS, *names]
     np.testing.assert_array_equal(found["photo"], colours.photo)
-
-
-def test_every_point_is_the_only_return_of_its_pulse_in_a_file_of_no_day(tmp_path: Path) -> None:
-    found = written(tmp_path / "a.laz", dressed(floor()))
-    assert (found.header.version.major, found.header.version.minor) == (1, 4)
-    assert found.header.point_format.id == 7
-    assert set(np.asarray(found.return_number)) == {1}
-    assert set(np.asarray(found.number_of_returns)) == {1}
-    assert found.header.creation_date == dt.date(1970, 1, 1)
-    assert found.header.generating_software == "orthoflow"
-    # Of a whole metre, so that steps of coordinates are round.
-    assert found.header.offsets.tolist() == [1e5, 2e5, 50.0]
 
 
 @pytest.mark.parametrize("crs_wkt", ["", epsg_wkt(25832)], ids=["unknown", "known"])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
+from orthoflow_plugins.read.assembly import CloudAssembly, rounding_m
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.scan_file import PointBlock, PointField, Scan, ScanFile
@@ -129,22 +129,6 @@ def test_what_comes_in_blocks_is_what_there_is(
     assert found.counts[1].first_far_m == pytest.approx(tuple(points[47]))
 
 
-def test_what_a_reader_left_out_is_counted_scan_by_scan(tmp_path: Path) -> None:
-    left_out = block(1, 10, n_read=16, left_out={"invalid": 1, "withheld": 2, "other_class": 3})
-    found = assembled(tmp_path, file("a", left_out, left_out), file("b", block(2, 5)))
-    first, second = found.counts
-    assert (first.file, first.n_read, first.n_kept) == ("a", 32, 20)
-    assert +first.left_out == {"invalid": 2, "withheld": 4, "other_class": 6}
-    assert (second.file, second.n_read, second.n_kept, +second.left_out) == ("b", 5, 5, {})
-
-
-def test_scans_are_numbered_through_all_files(tmp_path: Path) -> None:
-    blocks = [block(1, 4), block(2, 4, scan=1), block(3, 4, scan=1)]
-    found = assembled(tmp_path, file("a", *blocks), file("b", block(4, 4)), unit_m=0.001)
-    assert [(count.file, count.index) for count in found.counts] == [("a", 0), ("a", 1), ("b", 0)]
-    np.testing.assert_array_equal(found.array("scan"), np.repeat([0, 1, 1, 2], 4))
-
-
 def test_one_scan_needs_no_numbers_and_missing_fields_are_missing(tmp_path: Path) -> None:
     found = assembled(tmp_path, file("a", block(1, 6)), fields_only())
     # Colours have a mask of those that there are; of rows and columns there are all or none.
@@ -158,19 +142,6 @@ def test_one_scan_needs_no_numbers_and_missing_fields_are_missing(tmp_path: Path
 
 def fields_only() -> ScanFile:
     return file("b", block(2, 6, rgb=None), fields=("intensity",))
-
-
-def test_progress_is_the_share_of_the_points_that_may_come(tmp_path: Path) -> None:
-    told: list[tuple[float, str]] = []
-    files = [file("a", block(1, 30), block(2, 10)), file("b", block(3, 40))]
-    growing = CloudAssembly(context(tmp_path, told), files, metres())
-    for one in files:
-        growing.add_file(one)
-    assert told == [
-        (30 / 80, "a: 30 points"),
-        (40 / 80, "a: 40 points"),
-        (1.0, "b: 40 points"),
-    ]
 
 
 def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_path: Path) -> None:
@@ -212,13 +183,6 @@ def test_more_points_than_a_header_states_are_refused(tmp_path: Path) -> None:
     assert assembled(tmp_path / "exact", exact).n_points == 20
 
 
-def test_rows_and_columns_beyond_32_bits_are_cut(tmp_path: Path) -> None:
-    odd = block(1, 3, row=np.array([-1, 7, 2**32 + 5]), column=np.array([2**32 - 1, 0, 1]))
-    found = assembled(tmp_path, file("a", odd))
-    assert found.array("row").tolist() == [0, 7, 2**32 - 1]  # type: ignore[union-attr]
-    assert found.array("column").tolist() == [2**32 - 1, 0, 1]  # type: ignore[union-attr]
-
-
 # --- how coordinates are rounded ---
 
 
@@ -232,13 +196,6 @@ def test_a_coarse_step_is_found(step: float) -> None:
         assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
 
 
-def test_what_is_finer_than_five_millimetres_is_not_told() -> None:
-    rng = np.random.default_rng(8)
-    assert rounding_m(0.002 * rng.integers(0, 5000, (3000, 3)), 1.0) == 0.0
-    # 2 mm are five of a file in units of 0.4 mm.
-    assert rounding_m(rng.uniform(0.0, 5.0, (3000, 3)), 1.0) == 0.0
-
-
 def test_the_finest_axis_counts_and_ten_values_are_needed() -> None:
     steps = np.array([0.5, 0.1, 0.02]) * np.arange(10)[:, None]
     assert rounding_m(steps, 1.0) == pytest.approx(0.02)
@@ -247,18 +204,3 @@ def test_the_finest_axis_counts_and_ten_values_are_needed() -> None:
     few[0, 2] = np.nan
     assert rounding_m(few, 1.0) == pytest.approx(0.1)
     assert rounding_m(steps[:9], 1.0) == 0.0
-
-
-def test_values_need_not_lie_exactly_on_their_step() -> None:
-    steps = 0.1 * np.tile(np.arange(20.0)[:, None], 3)
-    for off, found in ((0.0009, 0.1), (0.0011, 0.0)):
-        moved = steps.copy()
-        moved[7] += off
-        assert rounding_m(moved, 1.0) == pytest.approx(found)
-
-
-@pytest.mark.parametrize(
-    ("farthest_m", "apart_m"), [(1.5, 2.0**-23), (500.0, 2.0**-15), (513.0, 2.0**-14)]
-)
-def test_float32_is_coarser_far_away(farthest_m: float, apart_m: float) -> None:
-    assert resolution_m(farthest_m) == apart_m

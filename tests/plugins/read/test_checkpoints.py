@@ -55,25 +55,6 @@ def test_all_columns_come_out_whatever_separates_them(read: Reader, mark: str) -
     assert points.wall.dtype == np.int32
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)],
-)
-def test_points_come_out_in_metres(read: Reader, unit: str, factor: float) -> None:
-    points = read("P1,1000,2000,3000\n", unit=unit)
-    np.testing.assert_allclose(
-        points.points_world, [[1000 * factor, 2000 * factor, 3000 * factor]], rtol=1e-15
-    )
-
-
-def test_what_is_shown_is_in_metres_whatever_the_survey_is_in(read: Reader) -> None:
-    points = read("name,x,y,z,shown_x,shown_y,shown_z\nA,1000,2,3,4,5,6\nB,1,2,3,,,\n", unit="mm")
-    np.testing.assert_array_equal(points.points_world[0], [1.0, 0.002, 0.003])
-    assert points.shown_world is not None
-    np.testing.assert_array_equal(points.shown_world, [[4, 5, 6], [np.nan] * 3])
-    assert {metric.name: metric.value for metric in read.ctx.metrics}["n_measured"] == 1
-
-
 def test_files_are_joined_in_order(read: Reader) -> None:
     points = read("P1,1,2,3\n", "name,x,y,z,class\nP2,4,5,7,edge\n")
     assert points.names == ("P1", "P2")

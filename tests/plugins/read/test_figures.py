@@ -50,16 +50,6 @@ def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
     assert int(single) in crowded
 
 
-def test_a_plan_follows_up_and_bears_a_single_place() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform((0.0, 0.0, 0.0), (1.0, 0.01, 4.0), (30_000, 3))
-    # Seen along y: what lies along z is across the view.
-    shown = pixels(plan_view_png(cloud_of(points, up=(0.0, 1.0, 0.0))))
-    assert sorted(shown.shape) == [pytest.approx(160, abs=3), 640]
-    for n_points, grey in ((1, 177), (2, 255), (5, 255)):
-        assert pixels(plan_view_png(cloud_of(np.ones((n_points, 3))))).tolist() == [[grey]]
-
-
 # --- as its scanner saw it ---
 
 
@@ -75,11 +65,6 @@ def scanned(rows: int = 20, columns: int = 30) -> PointCloud:
         column=column.astype(np.uint32),
         intensity=(row / (rows - 1.0)).astype(np.float32),
     )
-
-
-def some_of(cloud: PointCloud, kept: NDArray[np.intp]) -> PointCloud:
-    names = ("x", "y", "z", "row", "column", "intensity")
-    return replace(cloud, **{name: getattr(cloud, name)[kept] for name in names})
 
 
 def expected_grey(cloud: PointCloud, rows: int, columns: int) -> NDArray[np.uint8]:
@@ -112,20 +97,6 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
     assert shown[16, 25] == 0
 
 
-def test_a_scan_without_a_station_is_shown_with_its_rows_upwards() -> None:
-    cloud = scanned()
-    # Glints and what swallows light are as bright and as dark as the next.
-    intensity = cloud.intensity.copy()  # type: ignore[union-attr]
-    intensity[[100, 300, 500]], intensity[[200, 400]] = 9.0, -9.0
-    cloud = replace(cloud, intensity=intensity)
-    truth = expected_grey(cloud, 20, 30)[::-1]
-    for blind in (
-        replace(cloud, stations=None, stations_source=None),
-        replace(cloud, stations_source="view_from"),
-    ):
-        assert np.abs(pixels(polar_view_png(blind)).astype(int) - truth).max() <= 1
-
-
 def test_the_scan_with_most_points_is_shown() -> None:
     cloud = scanned()
     scan = np.where(cloud.column < 10, 0, 1).astype(np.uint16)
@@ -136,23 +107,6 @@ def test_the_scan_with_most_points_is_shown() -> None:
     # A station that is not known tells no side.
     one = replace(both, stations=np.zeros((1, 3)))
     np.testing.assert_array_equal(pixels(polar_view_png(one)), shown[:, ::-1])
-
-
-def test_thin_scans_are_shown_with_wider_pixels() -> None:
-    cloud = scanned(20, 30)
-    every = replace(cloud, row=4 * cloud.row, column=4 * cloud.column)
-    shown = pixels(polar_view_png(every))
-    # 600 points on 77 x 117 places: one in fifteen.
-    assert shown.shape == (20, 30)
-    assert (shown > 0).all()
-
-
-def test_clouds_without_rows_or_intensity_have_no_such_view() -> None:
-    cloud = scanned()
-    for name in ("row", "column", "intensity"):
-        names = ("row", "column") if name != "intensity" else ("intensity",)
-        assert polar_view_png(replace(cloud, **dict.fromkeys(names))) is None
-    assert polar_view_png(some_of(cloud, np.empty(0, dtype=np.intp))) is None
 
 
 # --- rows and columns in rectangular coordinates ---
@@ -187,33 +141,6 @@ def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
     assert set(np.diff(np.flatnonzero(full_rows))) <= {22, 23}
 
 
-def test_the_wall_is_seen_from_the_station() -> None:
-    for station_y, sense in ((-2.0, 1), (2.0, -1)):
-        shown = pixels(scan_lines_png(wall_scan(station_y=station_y)))
-        is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
-        assert np.unique(shown[is_point]).tolist() == [40, 160]
-        columns = np.nonzero(is_point)[1]
-        bright = columns[shown[is_point][:, 0] > 100].mean()
-        assert np.sign(bright - 600) == sense
-
-
-def test_broken_lines_are_not_joined_over_gaps() -> None:
-    cloud = wall_scan()
-    kept = np.flatnonzero((cloud.column < 60) | (cloud.column > 90))
-    shown = pixels(scan_lines_png(some_of(cloud, kept)))[..., ::-1]
-    hole = shown[:, 470:660]
-    assert not (hole == figures._ROW_RGB).all(axis=2).any()
-
-
-def test_lines_that_bend_end_where_their_points_end() -> None:
-    cloud = wall_scan()
-    z = cloud.z + 0.3 * np.sin(np.pi * cloud.column / 199.0).astype(np.float32)
-    shown = pixels(scan_lines_png(replace(cloud, z=z)))[..., ::-1]
-    n_rows = (shown == figures._ROW_RGB).all(axis=2).sum(axis=0)
-    # Of 27 lines across a column of the picture, no more lead back to where they began.
-    assert 20 < np.median(n_rows) < 34
-
-
 def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
     cloud = wall_scan()
     x = cloud.x.copy()
@@ -223,27 +150,6 @@ def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
     # Nothing but such points: a picture of some of them, and an end.
     far = np.where(np.arange(len(x)) % 2 == 0, 1e9, -1e9).astype(np.float32)
     assert pixels(scan_lines_png(replace(cloud, x=far))).size
-
-
-def test_clouds_without_a_grid_have_no_lines() -> None:
-    cloud = wall_scan()
-    assert scan_lines_png(replace(cloud, row=None, column=None)) is None
-    bare = pixels(scan_lines_png(replace(cloud, intensity=None)))
-    assert bare.shape[1] == 1200
-
-
-@pytest.mark.parametrize(("before_m", "is_drawn"), [(0.1, True), (0.2, False)])
-def test_what_lies_fifteen_centimetres_beside_the_wall_is_drawn(
-    before_m: float, is_drawn: bool
-) -> None:
-    cloud = wall_scan()
-    above = np.flatnonzero((cloud.row >= 40) & (cloud.column < 60))
-    y = cloud.y.copy()
-    y[above] -= before_m
-    shown = pixels(scan_lines_png(replace(cloud, y=y)))
-    is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
-    assert is_point[:280, 50:400].any() == is_drawn
-    assert is_point[320:, 50:400].any()
 
 
 # --- the sheet ---
@@ -276,17 +182,6 @@ def test_photos_stand_in_rows_above_their_names() -> None:
         below = shown[top + height : top + height + 18, left : left + 200]
         assert (below < 100).any()
     assert (shown[top_of_second:, 300:] == 245).all()
-
-
-@pytest.mark.usefixtures("_exact_sheets")
-def test_sheets_hold_no_more_than_a_hundred_photos_and_twelve_hundred_pixels() -> None:
-    sheet = ContactSheet(130)
-    assert (sheet.n_shown, sheet.n_photos) == (100, 130)
-    assert sheet.caption.startswith("The first 100 of 130 photos, as they are stored: ")
-    for k in range(130):
-        sheet.add(f"{k}", np.zeros((50, 50, 3), dtype=np.uint8))
-    shown: Any = np.array(sheet.encoded())
-    assert shown.shape[:2] == (10 * (90 + 18 + 12), 1200)
 
 
 @pytest.mark.usefixtures("_exact_sheets")

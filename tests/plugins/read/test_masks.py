@@ -85,13 +85,6 @@ def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
     assert [item.name for item in alone] == ["white_mask.png"]
 
 
-@pytest.mark.parametrize("name", ["a.png", "a_mask.png", "a.jpg.png", "a.jpg_mask.png"])
-def test_masks_are_found_by_the_name_of_the_photo(tmp_path: Path, name: str) -> None:
-    mask = file_in(tmp_path / "masks", name, picture())
-    (photo,), _ = read(tmp_path, [photo_in(tmp_path)], [mask])
-    np.testing.assert_array_equal(masked(photo), expected())
-
-
 def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     files = [photo_in(tmp_path, "a.jpg"), photo_in(tmp_path, "b.jpg")]
     one = file_in(tmp_path, "one.geojson", polygons("a.jpg", RING))
@@ -164,9 +157,3 @@ def test_a_file_among_masks_that_is_none_is_left_out_and_named(tmp_path: Path) -
     assert (
         "left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt"
     ) in said
-
-
-def test_two_masks_of_one_photo_are_refused(tmp_path: Path) -> None:
-    masks = [file_in(tmp_path / "masks", name, picture()) for name in ("a.png", "a_mask.png")]
-    with pytest.raises(InputError, match=r"a_mask\.png and a\.png are masks of one photo"):
-        read(tmp_path, [photo_in(tmp_path)], masks)

@@ -101,39 +101,6 @@ def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Re
     }
 
 
-def test_the_same_pixels_come_out_of_every_format_for_the_steps_behind(
-    tmp_path: Path, read: Reader
-) -> None:
-    image = made.picture(30, 20)
-    files = {"a.png": encode_png(image), "b.tif": made.tiff(image, 6)}
-    for photo in read(*made.write(tmp_path, files)):
-        np.testing.assert_array_equal(decode_image(photo.encoded), image)
-
-
-def test_photos_without_focal_length_are_taken_with_a_warning(tmp_path: Path, read: Reader) -> None:
-    files = {f"{index}.jpg": encode_jpeg(made.picture()) for index in range(5)}
-    photos = read(*made.write(tmp_path, files))
-    assert all(photo.exif_focal_px is None and photo.intrinsics is None for photo in photos)
-    assert read.warnings == (
-        "the focal length of 5 photos (0.jpg, 1.jpg, 2.jpg ...) is unknown (no EXIF focal length, "
-        "and no calibration): the orientation has to find it, needs more ties for that and may "
-        "refuse: a calibration file helps"
-    )
-    # Of three each is named.
-    read(*(tmp_path / name for name in list(files)[:3]))
-    assert "of 3 photos (0.jpg, 1.jpg, 2.jpg) is unknown" in read.warnings
-
-
-def test_a_cut_photo_does_not_keep_the_focal_length_of_the_whole(
-    tmp_path: Path, read: Reader
-) -> None:
-    inner: dict[int, made.Value] = {made.FOCAL_35MM: 28, made.WIDTH: 600, made.HEIGHT: 400}
-    content = made.jpeg(made.picture(), made.exif_block({}, inner))
-    (photo,) = read(*made.write(tmp_path, {"a.jpg": content}))
-    assert photo.exif_focal_px is None
-    assert "the focal length of photo a.jpg is unknown (the photo was cut" in read.warnings
-
-
 def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
     tmp_path: Path, read: Reader
 ) -> None:
@@ -164,18 +131,6 @@ def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: R
     # A right angle: half the side is the focal length, and the side a quarter of the circle.
     assert (photos[0].width, lens.fx, lens.cx) == (41, 20.5, 20.5)
     assert photos[-1].intrinsics is None
-
-
-def test_a_panorama_of_another_shape_is_refused(tmp_path: Path, read: Reader) -> None:
-    files = {"a.jpg": encode_jpeg(made.picture(64, 48))}
-    with pytest.raises(InputError, match="has 64 x 48 pixels: a panorama over the whole sphere is"):
-        read(*made.write(tmp_path, files), panoramas=("a.jpg",))
-
-
-def test_a_panorama_that_is_cut_off_is_refused(tmp_path: Path, read: Reader) -> None:
-    files = {"a.jpg": encode_jpeg(made.picture(128, 64))[:-40]}
-    with pytest.raises(InputError, match=r"photo a\.jpg is damaged or cut off"):
-        read(*made.write(tmp_path, files), panoramas=("*",))
 
 
 FISHEYE = (
@@ -251,12 +206,6 @@ def test_a_mask_of_a_fisheye_or_a_panorama_holds_for_its_faces(
     assert ctx.warnings == []
 
 
-def test_a_fisheye_of_another_size_is_refused(tmp_path: Path, read: Reader) -> None:
-    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture(48, 64))})
-    with pytest.raises(InputError, match=r"a\.jpg has 48 x 64 pixels, but its fisheye lens is for"):
-        read(*paths, calibration=f"cameras: {{'*': {FISHEYE}}}")
-
-
 def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) -> None:
     (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     model = made.write(
@@ -285,12 +234,6 @@ def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) ->
     # Whoever wires the poses only is told what is missing.
     with pytest.raises(InputError, match="its lens is a fisheye: wire the same files to read"):
         run(None)
-
-
-def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:
-    block = made.exif_block({made.MODEL: "a long name of a camera"})[:-9]
-    read(*made.write(tmp_path, {"a.jpg": made.jpeg(made.picture(), block)}))
-    assert "the EXIF data of photo a.jpg are damaged; the readable part was used" in read.warnings
 
 
 def test_a_line_of_the_log_tells_what_is_known_of_each_photo(tmp_path: Path) -> None:
@@ -361,23 +304,6 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     )
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_photos_of_sixteen_bits_are_kept_and_not_warned_of(
-    tmp_path: Path, read: Reader, suffix: str
-) -> None:
-    picture = made.picture()
-    for name, values in (("deep", picture.astype(np.uint16) * 257), ("plain", picture)):
-        done, encoded = cv2.imencode(suffix, values)
-        assert done
-        (tmp_path / f"{name}{suffix}").write_bytes(encoded.tobytes())
-    deep, plain = read(tmp_path / f"deep{suffix}", tmp_path / f"plain{suffix}")
-    assert not any("bits" in warning for warning in read.warnings)
-    np.testing.assert_array_equal(
-        decode_levels(deep.encoded), decode_levels(plain.encoded).astype(np.uint16) * 257
-    )
-    assert decode_levels(plain.encoded).dtype == np.uint8
-
-
 @pytest.mark.parametrize("layout", ["pixel", "band", "alpha", "tiles"])
 def test_sixteen_bits_are_read_in_every_layout(tmp_path: Path, read: Reader, layout: str) -> None:
     deep = np.random.default_rng(1).integers(0, 65536, (3, 40, 60)).astype(np.uint16)
@@ -403,12 +329,6 @@ def test_sixteen_bits_are_read_in_every_layout(tmp_path: Path, read: Reader, lay
     np.testing.assert_array_equal(decode_levels(photo.encoded), np.moveaxis(deep, 0, 2))
 
 
-def test_samples_that_are_no_colours_are_named(tmp_path: Path, read: Reader) -> None:
-    Image.fromarray(np.ones((20, 30), dtype=np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(InputError, match=r"photo a\.tif .* samples are float32: save it with 8"):
-        read(tmp_path / "a.tif")
-
-
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
     paths = made.write(tmp_path, {"a.doc": b"x", "b.txt": b"x"})
     with pytest.raises(InputError, match=r"holds no photo, only 2 other files: a\.doc, b\.txt"):
@@ -430,17 +350,6 @@ def test_photos_of_one_name_live_together_under_their_paths(tmp_path: Path, read
     assert [photo.folder for photo in photos] == ["two", "", "one", "two"]
 
 
-def test_a_calibration_names_photos_with_and_without_their_folders(
-    tmp_path: Path, read: Reader
-) -> None:
-    names = ("one/a.jpg", "two/a.jpg")
-    paths = made.write(tmp_path, dict.fromkeys(names, encode_jpeg(made.picture())))
-    other = CAMERA.replace("fx: 60", "fx: 70")
-    text = f"cameras: {{two/*.jpg: {other}, a.jpg: {CAMERA}}}"
-    photos = read(*paths, calibration=text)
-    assert [photo.intrinsics.fx for photo in photos if photo.intrinsics] == [60.0, 70.0]
-
-
 # Transparency and pages
 
 
@@ -457,12 +366,6 @@ def test_what_is_transparent_is_masked(tmp_path: Path, read: Reader, kind: str) 
     np.testing.assert_array_equal(used_pixels(photo), alpha > 0)
     (photo,) = read(*made.write(tmp_path, files | {"a_mask.png": encode_png(mask)}))
     np.testing.assert_array_equal(used_pixels(photo), (alpha > 0) & (mask > 0))
-
-
-def test_a_photo_of_which_nothing_is_opaque_is_refused(tmp_path: Path, read: Reader) -> None:
-    clear = encode_png(np.dstack([made.picture(), np.zeros((48, 64), dtype=np.uint8)]))
-    with pytest.raises(InputError, match=r"nothing of photo a\.png is opaque"):
-        read(*made.write(tmp_path, {"a.png": clear}))
 
 
 # Damage and other formats
@@ -530,17 +433,6 @@ def test_all_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, read: 
     assert named == ["b.jpg", "c.jpg", "d.tif"]
 
 
-def test_webp_under_the_name_of_a_jpeg_is_read(tmp_path: Path, read: Reader) -> None:
-    image = made.picture(64, 48)
-    (photo,) = read(*made.write(tmp_path, {"a.jpg": encode_webp(image)}))
-    assert np.abs(decode_image(photo.encoded).astype(int) - image).mean() < 8.0
-
-
-def test_a_photo_that_vanished_is_named(tmp_path: Path, read: Reader) -> None:
-    with pytest.raises(InputError, match=r"photo gone\.jpg cannot be read: No such file"):
-        read(tmp_path / "gone.jpg")
-
-
 # Calibration
 
 
@@ -564,17 +456,6 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
     )
     assert "calibration entries that match no photo: B.jpg: upper and lower" in read.warnings
     assert "the focal length of photo c.jpg is unknown" in read.warnings
-
-
-def test_several_calibration_files_are_refused(tmp_path: Path, read: Reader) -> None:
-    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
-    inputs = ReadPhotos.In(
-        files=InputFiles(name="photos", paths=paths),
-        calibration=InputFiles(name="calibration", paths=paths * 2),
-    )
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    with pytest.raises(InputError, match="calibration names 2 files: expected one calibration"):
-        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
 
 
 # The rest
@@ -618,17 +499,3 @@ def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
         *paths, calibration=f'cameras: {{DSC_6471.JPG: {portrait}, "*": {landscape}}}'
     )
     assert [p.intrinsics and p.intrinsics.width for p in calibrated] == [1500, 1000, 1500]
-
-
-def test_real_photos_without_exif_are_read_beside_their_poses(
-    shared_data: Path, read: Reader
-) -> None:
-    folder = shared_data / "fountain-p11/images"
-    camera = "width: 3072, height: 2048, fx: 2759.48, fy: 2764.16, cx: 1520.69, cy: 1006.81"
-    photos = read(
-        *(folder / name for name in ("0003.jpg", "0000.jpg", "0000.jpg.camera", "K.txt")),
-        calibration=f'cameras: {{"*": {{{camera}}}}}',
-    )
-    assert [photo.name for photo in photos] == ["0000.jpg", "0003.jpg"]
-    assert all(p.intrinsics is not None and p.intrinsics.cx == 1521.19 for p in photos)
-    assert "focal length" not in read.warnings

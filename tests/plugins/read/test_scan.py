@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read import assembly
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import CancelledStepError, InputError, StoreError
@@ -122,14 +121,6 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(
     assert scan_of(cloud)["left_out"] == {"outside_box": 400 - len(kept)}
 
 
-def test_points_on_the_faces_of_a_box_are_kept(tmp_path: Path, read: Reader) -> None:
-    steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
-    cloud = read(write_text(tmp_path / "a.xyz", steps), box=[[1, 1, 1], [3, 4, 2]])
-    assert len(cloud) == 3 * 4 * 2
-    np.testing.assert_array_equal(cloud.points_world().min(axis=0), [1, 1, 1])
-    np.testing.assert_array_equal(cloud.points_world().max(axis=0), [3, 4, 2])
-
-
 def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Reader) -> None:
     steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) + 1.0
     path = write_text(tmp_path / "a.xyz", steps)
@@ -183,17 +174,6 @@ def test_classes_choose_points_of_las_files(
     assert "classes has no effect: it only concerns LAS and LAZ files" in read.warnings
 
 
-def test_a_shift_by_whole_metres_changes_the_origin_only(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    near = read(scan_files.write_las(tmp_path / "a.las", points))
-    far = read(
-        scan_files.write_las(tmp_path / "b.las", points + np.array([634512.0, 486215.0, 112.0]))
-    )
-    np.testing.assert_array_equal(far.origin - near.origin, [634512.0, 486215.0, 112.0])
-    np.testing.assert_allclose(far.x, near.x, atol=1e-6)
-
-
 def test_stray_points_do_not_cost_the_scan_its_precision(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -202,16 +182,6 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
     cloud = read(write_text(tmp_path / "a.xyz", world))
     np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
     assert "coordinates are kept to 62.50 mm only" in read.warnings
-
-
-@pytest.mark.parametrize(("wide_m", "is_coarse"), [(1000.0, False), (1030.0, True)])
-def test_beyond_five_hundred_metres_offsets_are_coarser_than_half_a_tenth_of_a_millimetre(
-    tmp_path: Path, read: Reader, wide_m: float, is_coarse: bool
-) -> None:
-    steps = np.linspace(0.0, wide_m, 21)[:, None] * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.0]
-    read(write_text(tmp_path / "a.xyz", steps))
-    said = f"reach {wide_m / 2:.0f} m from the origin of the cloud, where coordinates are kept to "
-    assert (f"{said}0.06 mm only" in read.warnings) == is_coarse
 
 
 @pytest.mark.parametrize("up", ["z", "x", "-x", "y", "-y", "-z"])
@@ -223,25 +193,6 @@ def test_up_is_told_and_nothing_is_turned(
     expected["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     np.testing.assert_array_equal(cloud.up, expected)
     np.testing.assert_allclose(cloud.points_world(), points, atol=1e-6)
-
-
-def test_points_that_are_not_finite_are_dropped_and_counted(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    dirty = points.copy()
-    dirty[7, 1] = np.nan
-    dirty[9, 2] = np.inf
-    dirty[11, 0] = -np.inf
-    dirty[13, 0] = 1e300
-    table = np.column_stack([dirty, np.arange(400.0)])
-    cloud = read(write_text(tmp_path / "a.xyz", table))
-    kept = np.setdiff1d(np.arange(400), [7, 9, 11, 13])
-    np.testing.assert_allclose(cloud.points_world(), points[kept], atol=1e-6)
-    np.testing.assert_allclose(cloud.intensity, kept / 399.0, atol=1e-6)
-    assert read.metrics["n_not_finite"] == 4
-    assert read.metrics["n_points"] == 396
-    assert scan_of(cloud)["left_out"] == {"not_finite": 3, "too_far": 1}
-    assert "1 points lie farther than 1e+09 m" in read.warnings
 
 
 def test_finite_points_beyond_any_survey_are_named(
@@ -256,13 +207,6 @@ def test_finite_points_beyond_any_survey_are_named(
         "a.xyz, scan 0: 2 points lie farther than 1e+09 m from the origin, the first at 0.5 1e+30 "
         "-2, and were left out"
     ) in read.warnings
-
-
-def test_one_point_is_a_cloud(tmp_path: Path, read: Reader) -> None:
-    cloud = read(write_text(tmp_path / "a.xyz", [[1.5, 2.5, 3.5, 0.5]]))
-    np.testing.assert_array_equal(cloud.points_world(), [[1.5, 2.5, 3.5]])
-    assert cloud.intensity is not None
-    assert cloud.intensity.tolist() == [1.0]
 
 
 def test_rounded_coordinates_are_warned_of_and_others_are_not(
@@ -281,14 +225,6 @@ def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
     assert "is that right?" not in read.warnings
     read(write_text(tmp_path / "b.xyz", points), unit="mm")
     assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
-
-
-def test_rounding_is_told_in_metres_whatever_the_unit(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    cloud = read(write_text(tmp_path / "a.xyz", np.rint(points * 100) * 10), unit="mm")
-    assert "the coordinates of a.xyz are rounded to 10 mm" in read.warnings
-    assert cloud.source["rounding_m"] == pytest.approx(0.01, rel=1e-12)
 
 
 # Several files and scans
@@ -343,19 +279,6 @@ def test_stations_belong_to_scans_in_their_order(
     assert read.metrics["n_stations"] == 2
 
 
-def test_fields_that_only_some_files_have_are_kept_with_a_word(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    first = write_text(tmp_path / "a.xyz", points)
-    second = write_text(tmp_path / "b.xyz", np.column_stack([points, np.arange(400)]))
-    cloud = read(first, second)
-    assert cloud.intensity is not None
-    assert np.isnan(cloud.intensity[:400]).all()
-    np.testing.assert_allclose(cloud.intensity[400:], np.arange(400) / 399, atol=1e-6)
-    assert "a.xyz, scan 0 has no intensity: its 400 points have a position only" in read.warnings
-    assert "has no colour" not in read.warnings
-
-
 # Stations
 
 
@@ -371,34 +294,7 @@ def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
     assert "view_from has no effect" in read.warnings
 
 
-def test_ptx_scanner_positions_are_stations(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    matrix = np.eye(4)
-    matrix[:3, 3] = [100.0, 200.0, 3.0]
-    table = points.copy()
-    table[::8] = 0.0
-    cloud = read(scan_files.write_ptx(tmp_path / "a.ptx", [(table, 20, matrix)]))
-    np.testing.assert_array_equal(cloud.stations, [[100.0, 200.0, 3.0]])
-    assert cloud.stations_source == "file"
-    assert len(cloud) == 350
-    assert read.metrics["n_invalid"] == 50
-    assert cloud.row is not None
-    assert cloud.row.dtype == np.uint32
-    np.testing.assert_array_equal(cloud.row, (np.arange(400) % 20)[np.arange(400) % 8 != 0])
-
-
 # Intensity
-
-
-def test_limits_in_an_e57_header_set_the_scale(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    fields = cartesian(points, intensity=np.linspace(100.0, 300.0, 400))
-    scan = {"fields": fields, "intensity_limits": (0.0, 400.0)}
-    cloud = read(scan_files.write_e57(tmp_path / "a.e57", [scan]))
-    np.testing.assert_allclose(cloud.intensity, np.linspace(0.25, 0.75, 400), atol=1e-6)
-    assert scan_of(cloud)["intensity"] == {"low": 0.0, "high": 400.0, "rule": "stated"}
 
 
 def test_the_user_can_set_full_intensity(
@@ -465,17 +361,6 @@ def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
 # The method as a whole
 
 
-def test_reading_twice_gives_the_same_bits(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
-    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=np.arange(400), rgb=rgb)
-    first, second = read(path).to_payload(), read(path).to_payload()
-    assert first.metadata == second.metadata
-    for name, array in first.arrays.items():
-        np.testing.assert_array_equal(array, second.arrays[name])
-
-
 def test_the_way_a_file_is_cut_into_blocks_does_not_show(
     tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -487,13 +372,6 @@ def test_the_way_a_file_is_cut_into_blocks_does_not_show(
     parted = read(path)
     np.testing.assert_array_equal(parted.points_world(), whole.points_world())
     np.testing.assert_array_equal(parted.intensity, whole.intensity)
-
-
-def test_no_path_enters_the_cloud(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    cloud = read(write_text(tmp_path / "a.xyz", points))
-    assert str(tmp_path) not in json.dumps(cloud.source)
 
 
 def test_a_picture_from_above_is_drawn(
@@ -540,11 +418,6 @@ def test_an_empty_cloud_is_refused(
         read(write(tmp_path))
 
 
-def test_an_input_without_files_is_refused(read: Reader) -> None:
-    with pytest.raises(InputError, match="the input scan names no files"):
-        read()
-
-
 def test_columns_without_a_text_file_are_said_to_do_nothing(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -562,15 +435,6 @@ def test_too_little_scratch_space_is_said_before_anything_is_written(
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(StoreError, match=r"400 points need 0\.00 GB of scratch space, but only"):
         read(scan_files.write_las(tmp_path / "a.laz", points))
-
-
-def test_more_scans_than_can_be_numbered_are_refused(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(assembly, "_MOST_SCANS", 2)
-    paths = [write_text(tmp_path / f"{name}.xyz", points) for name in "abc"]
-    with pytest.raises(InputError, match="there are more than 2 scans"):
-        read(*paths)
 
 
 def test_a_cancelled_step_stops_between_blocks(tmp_path: Path, points: NDArray[np.float64]) -> None:

@@ -22,22 +22,6 @@ def scan(
     )
 
 
-def test_posed_scans_stood_where_they_say() -> None:
-    found = choose_stations(
-        [scan((1.0, 2.0, 3.0), is_posed=True), scan((4.0, 5.0, 6.0), is_posed=True)], (9.0, 9, 9)
-    )
-    assert found.positions is not None
-    assert found.positions.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
-    assert (found.source, found.per_scan) == ("file", True)
-
-
-def test_a_scan_without_a_station_leaves_the_others_theirs() -> None:
-    found = choose_stations([scan((1.0, 2.0, 3.0), is_posed=True), scan(None)], None)
-    assert found.positions is not None
-    assert found.positions.tolist() == [[1.0, 2.0, 3.0]]
-    assert (found.source, found.per_scan) == ("file", False)
-
-
 @pytest.mark.parametrize(
     ("low", "is_believed"),
     [
@@ -64,12 +48,3 @@ def test_two_scans_without_poses_did_not_both_stand_at_the_origin() -> None:
     mixed = choose_stations([scan(), scan((1.0, 0.0, 0.0), is_posed=True)], None)
     assert mixed.positions is not None
     assert mixed.positions.tolist() == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-
-
-def test_the_users_viewpoint_counts_where_no_file_tells_one() -> None:
-    found = choose_stations([scan(None), scan()], (1.0, 2.0, 3.0))
-    assert found.source == "file"
-    alone = choose_stations([scan(None)], (1.0, 2.0, 3.0))
-    assert alone.positions is not None
-    assert alone.positions.tolist() == [[1.0, 2.0, 3.0]]
-    assert (alone.source, alone.per_scan) == ("view_from", False)

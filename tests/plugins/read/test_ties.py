@@ -47,11 +47,6 @@ def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Pa
     np.testing.assert_array_equal(ties.wall, [-1, -1, -1])
 
 
-def test_points_come_out_in_metres(tmp_path: Path) -> None:
-    ties = read(tmp_path, "a.jpg,1,2,1000,2000,3000\n", unit="ft")
-    np.testing.assert_allclose(ties.points_world, [[304.8, 609.6, 914.4]], rtol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -82,17 +77,3 @@ def test_all_problems_are_said_at_once(tmp_path: Path) -> None:
         "ties0.csv:2",
         "ties0.csv:4",
     ]
-
-
-def test_names_that_are_near_are_sought_for_what_is_told_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Of a hundred thousand ties in photos that are not there, this took an hour.
-    sought = []
-    monkeypatch.setattr(
-        "difflib.get_close_matches", lambda name, *_, **__: sought.append(name) or []
-    )
-    text = "photo,u_px,v_px,x,y,z\n" + "c.jpg,1,2,3,4,5\n" * 500
-    with pytest.raises(InputError, match=r"\.\.\. and 480 more problems"):
-        read(tmp_path, text)
-    assert len(sought) == 20
