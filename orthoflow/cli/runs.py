@@ -123,7 +123,7 @@ def runs(
     else:
         print_runs(kept, found, metrics=metrics)
     if page is not None:
-        from orthoflow.report.run_tables import write_run_table
+        from orthoflow.report.browsing import write_run_table
 
         write_run_table(kept, page, among=found)
         if not (as_json or as_csv):
@@ -304,7 +304,7 @@ def _row_json(
 ) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "n_values", "variants"):
+    for name in ("labels", "n_values", "parameters"):
         del values[name]
     return values | {"facts": dict(facts), "differs": dict(differs)}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,17 +18,15 @@ from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
-from orthoflow.records.published import MetricRow, cell_metrics
-from orthoflow.records.runs import Run
+from orthoflow.records.published import cell_metrics
+from orthoflow.records.runs import REPORT_FILE, Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import FLAG, Sense, is_flag, sense_of
 from orthoflow.report.summaries import headline_keys
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 
@@ -39,33 +37,54 @@ _NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pyc
 # In the folder of a run: parts of it, and what was exported.
 _OF_A_RUN: Final = frozenset({"datasets", "export"})
 _FIRST_LINE_BYTES: Final = 1 << 16
+_PICTURE_PX: Final = 180
+_PICTURES_MOST: Final = 200  # about 8 kB each
+_KEYS_MOST: Final = 6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fact:
-    """Something in which runs may differ.
+class Parameter(NamedTuple):
+    """A value of a parameter in one cell.
 
     Attributes:
-        values: of it, as JSON; one, but of a sweep all.
-        shared: of one of several datasets, its name without it.
-        set_as: of a parameter of a variant, the baseline's too, `step.variant.parameter`.
-        beside: of a parameter of another variant, the name that the fact of the baseline has.
+        step: name of the step.
+        data: the dataset; empty for none.
+        variant: of the step, as `--set` names it: without what a sweep appends; empty for none.
+        cell_variant: the same as the cell has it.
+        name: of the parameter.
+        value: its value.
     """
 
-    values: tuple[JsonValue, ...]
-    shared: str = ""
-    set_as: str = ""
-    beside: str = ""
+    step: str
+    data: str
+    variant: str
+    cell_variant: str
+    name: str
+    value: JsonValue
+
+    def address(self, *, with_data: bool, variant: str) -> str:
+        """Return its name, with the dataset or a variant where these are told apart."""
+        at = f"@{DATA}={self.data}" if with_data and self.data else ""
+        if not variant:
+            return f"{self.step}{at}.{self.name}"
+        return (
+            f"{self.step}{at},{self.step}={variant}.{self.name}"
+            if at
+            else (f"{self.step}.{variant}.{self.name}")
+        )
 
     @property
-    def told(self) -> JsonValue:
-        """The value, of a sweep all of them as one text."""
-        return self.values[0] if len(self.values) == 1 else "|".join(map(_sorted_json, self.values))
+    def addresses(self) -> frozenset[str]:
+        """All its names."""
+        return frozenset(
+            self.address(with_data=with_data, variant=variant)
+            for with_data in (False, True)
+            for variant in ("", self.variant, self.cell_variant)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """What a table of runs says of one.
+    """A row of a table of runs.
 
     Attributes:
         folder: of the run, as its finder named it.
@@ -82,11 +101,9 @@ class RunSummary:
         labels: what each of these is, in words.
         headlines: those that say how good the result is, most important first.
         flags: those that are 1 where something is so and 0 where not.
-        facts: what may differ between runs: parameters of the baseline by `step.parameter`, its
-            methods by `step.use`, and parameters of other variants by `step.variant.parameter`;
-            `seed`, `orthoflow` (its version), and inputs by `input <name>`.
-        variants: all values of parameters as `--set` names them for one variant,
-            `step.variant.parameter`; of one with a sweep those of all that it became.
+        facts: what may differ between runs beside parameters: `seed`, `orthoflow` (its version),
+            methods of the baseline by `step.use`, and inputs by `input <name>`.
+        parameters: of all cells.
     """
 
     folder: Path
@@ -101,27 +118,21 @@ class RunSummary:
     labels: Mapping[str, str] = field(default_factory=dict)
     headlines: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
-    facts: Mapping[str, Fact] = field(default_factory=dict)
-    variants: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
+    facts: Mapping[str, JsonValue] = field(default_factory=dict)
+    parameters: tuple[Parameter, ...] = ()
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> frozenset[str]:
         """What `values` knows something of."""
-        shared = (fact.shared for fact in self.facts.values() if fact.shared)
-        return (*self.metrics, *self.facts, *shared, *self.variants)
+        of_parameters = (name for one in self.parameters for name in one.addresses)
+        return frozenset((*self.metrics, *self.facts, *of_parameters))
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
-        """Give a metric or a fact: of a sweep all values, without a dataset those of every one."""
-        if name in self.metrics:
-            return (self.metrics[name],)
-        if name in self.variants:
-            return self.variants[name]
-        return tuple(
-            value
-            for own, fact in self.facts.items()
-            if name in (own, fact.shared)
-            for value in fact.values
-        )
+        """Return a metric, a fact, or all values of a parameter that a name is of."""
+        for known in (self.metrics, self.facts):
+            if name in known:
+                return (known[name],)
+        return tuple(one.value for one in self.parameters if name in one.addresses)
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -145,7 +156,7 @@ def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """What of its told facts tells each run from others of the same workflow, by its folder.
+    """What of its distinct facts tells each run from others of the same workflow, by its folder.
 
     A fact that some of them lack differs only where two others disagree on it.
     """
@@ -165,62 +176,51 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
 
 
 def distinct_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """All facts of each run, by its folder: each once, by the name that `--set` takes.
+    """All facts and parameters of each run, by its folder: each once, by the name of `--set`.
 
-    Of a sweep all values are told, without the dataset what is the same on all datasets of each
-    run of the workflow, and without the variant what is the same in all variants.
+    Of a sweep all values are told as one text, without the dataset what is the same on all
+    datasets of each run of the workflow, and without the variant what all variants of a step have
+    and is the same in them.
     """
-    apart: set[tuple[str, str]] = set()
+    by_data: set[tuple[str, str, str]] = set()
+    by_variant: set[tuple[str, str, str]] = set()
+    told = {run.folder: _told_values(run) for run in runs}
     for run in runs:
-        on_datasets: dict[str, set[str]] = {}
-        for fact in run.facts.values():
-            if fact.shared:
-                on_datasets.setdefault(fact.shared, set()).add(_sorted_json(fact.told))
-        apart |= {(run.workflow, short) for short, found in on_datasets.items() if len(found) > 1}
+        variants: dict[str, set[str]] = {}
+        for one in run.parameters:
+            variants.setdefault(one.step, set()).add(one.variant)
+        for (step, name), found in told[run.folder].items():
+            key = run.workflow, step, name
+            for variant in {variant for _, variant in found}:
+                own = {value for (_, other), value in found.items() if other == variant}
+                by_data |= {key} if len(own) > 1 else set()
+            for data in {data for data, _ in found}:
+                of_data = {other: value for (one, other), value in found.items() if one == data}
+                is_one = len({*of_data.values()}) == 1 and of_data.keys() == variants[step]
+                by_variant |= set() if is_one else {key}
+    facts: dict[Path, dict[str, JsonValue]] = {run.folder: {**run.facts} for run in runs}
+    for run in runs:
+        for one in run.parameters:
+            key = run.workflow, one.step, one.name
+            name = one.address(
+                with_data=key in by_data, variant=one.variant if key in by_variant else ""
+            )
+            values = told[run.folder][one.step, one.name][one.data, one.variant]
+            facts[run.folder][name] = one.value if len(values) == 1 else "|".join(values)
+    return facts
 
-    def called(run: RunSummary, name: str) -> str:
-        short = run.facts[name].shared or name
-        return name if (run.workflow, short) in apart else short
 
-    names = _names_as_set(runs, called)
+def _told_values(
+    run: RunSummary,
+) -> dict[tuple[str, str], dict[tuple[str, str], tuple[str, ...]]]:
+    """Values of parameters as JSON, of a sweep several: step and name -> dataset and variant."""
+    found: dict[tuple[str, str], dict[tuple[str, str], dict[str, None]]] = {}
+    for one in run.parameters:
+        at = found.setdefault((one.step, one.name), {}).setdefault((one.data, one.variant), {})
+        at[_sorted_json(one.value)] = None
     return {
-        run.folder: {
-            name: fact.told
-            for own, fact in run.facts.items()
-            if (name := names.get((run.workflow, called(run, own)), called(run, own)))
-        }
-        for run in runs
+        key: {place: tuple(values) for place, values in own.items()} for key, own in found.items()
     }
-
-
-def _names_as_set(
-    runs: Sequence[RunSummary], called: Callable[[RunSummary, str], str]
-) -> dict[tuple[str, str], str]:
-    """Other names of parameters that several variants take, by workflow and name.
-
-    Where another variant has the baseline's value in every run, its own name is empty: what is
-    said of the baseline holds for it. Where not, the baseline's is named with its variant, too,
-    as long as that is the same one in all runs.
-    """
-    follows: dict[tuple[str, str], bool] = {}
-    of_baseline: dict[tuple[str, str], set[str]] = {}
-    for run in runs:
-        for own, fact in run.facts.items():
-            name = run.workflow, called(run, own)
-            if first := run.facts.get(fact.beside):
-                follows[name] = fact.told == first.told and follows.get(name, True)
-            elif not fact.beside:
-                of_baseline.setdefault(name, set()).add(fact.set_as)
-    names = {name: "" for name, does in follows.items() if does}
-    for run in runs:
-        for own, fact in run.facts.items():
-            name = run.workflow, called(run, own)
-            if fact.beside in run.facts and not follows[name]:
-                of_first = run.workflow, called(run, fact.beside)
-                if len(of_baseline[of_first]) == 1:
-                    (written,) = of_baseline[of_first]
-                    names[of_first] = written or of_first[1]
-    return names
 
 
 def _sorted_json(value: JsonValue) -> str:
@@ -284,29 +284,30 @@ def _summary(folder: Path) -> RunSummary:
 def _of_run(folder: Path, run: Run) -> RunSummary:
     record = run.record
     failed = next((cell for cell in record.cells if cell.status == "failed"), None)
-    said: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
+    facts: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
     parts = parts_of(run)
     if parts:
-        said["datasets"] = len(parts)
+        facts["datasets"] = len(parts)
     for given in record.inputs:
-        said[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
-    baseline = {cell.address for part in parts.values() or (run,) for cell in baseline_cells(part)}
-    facts = {name: Fact(values=(value,)) for name, value in said.items()}
-    for one in _alike(record.cells, baseline):
-        facts |= one.facts
-    values = _values(run)
-    measured = [
-        row
-        for part in parts.values() or (run,)
-        for cell in baseline_cells(part)
-        for row in cell_metrics(cell)
-    ]
-    flags = tuple(
-        name
-        for row in measured
-        if is_flag(row.unit)
-        for name in (row.metric, f"{row.step}.{row.metric}")
-    )
+        facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
+    values: dict[str, list[float]] = {}
+    labels: dict[str, str] = {}
+    flags: dict[str, None] = {}
+    of_parts = [baseline_cells(part) for part in parts.values() or (run,)]
+    for cells in of_parts:
+        own: dict[str, float] = {}
+        for cell in cells:
+            if cell.status != "skipped":
+                facts[f"{cell.step}.use"] = cell.method
+            for row in cell_metrics(cell):
+                # Of several datasets errors with signs are given by their sizes.
+                is_size = len(parts) > 1 and sense_of(row.better) is Sense.LESS
+                for name in (f"{row.step}.{row.metric}", row.metric):
+                    own[name] = abs(row.value) if is_size else row.value
+                    labels[name] = row.title
+                    flags |= {name: None} if is_flag(row.unit) else {}
+        for name, value in own.items():
+            values.setdefault(name, []).append(value)
     return RunSummary(
         folder=folder,
         state=record.status,
@@ -320,29 +321,26 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         },
         n_datasets=len(parts),
         n_values={name: len(found) for name, found in values.items()} if parts else {},
-        labels=_labels(measured),
+        labels=labels,
         headlines=tuple(
-            name
-            for _, name in headline_keys(
-                cell for part in parts.values() or (run,) for cell in baseline_cells(part)
-            )
+            name for _, name in headline_keys(cell for cells in of_parts for cell in cells)
         ),
-        flags=flags,
+        flags=tuple(flags),
         facts=facts,
-        variants=_variants(record.cells),
+        parameters=tuple(
+            Parameter(
+                cell.step,
+                cell.assignment.get(DATA, ""),
+                _called_by_set(cell),
+                cell.assignment.get(cell.step, ""),
+                name,
+                value,
+            )
+            for cell in record.cells
+            if cell.repeat == 0 and cell.status != "skipped"
+            for name, value in cell.params.items()
+        ),
     )
-
-
-def _variants(cells: Sequence[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
-    found: dict[str, list[JsonValue]] = {}
-    for cell in cells:
-        variant = cell.assignment.get(cell.step, "")
-        if not variant or cell.repeat or cell.status == "skipped":
-            continue
-        for name in {variant, _called_by_set(cell)} - {""}:
-            for parameter, value in cell.params.items():
-                found.setdefault(f"{cell.step}.{name}.{parameter}", []).append(value)
-    return {name: tuple(values) for name, values in found.items()}
 
 
 def _called_by_set(cell: RecordedCell) -> str:
@@ -350,91 +348,6 @@ def _called_by_set(cell: RecordedCell) -> str:
     variant = cell.assignment.get(cell.step, "")
     swept = [f"-{variant}".find(f"-{parameter}-") for parameter in cell.params]
     return variant[: min((max(at - 1, 0) for at in swept if at >= 0), default=None)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Alike:
-    """Cells of a step whose parameters `--set` changes together, whatever varies before them.
-
-    Attributes:
-        step: theirs.
-        data: their dataset, empty for none.
-        variant: of their step as `--set` names it, empty for none.
-        cells: one, or of a sweep one for each of its values.
-        chosen: the cell of the baseline, if it is among them.
-    """
-
-    step: str
-    data: str
-    variant: str
-    cells: tuple[RecordedCell, ...]
-    chosen: RecordedCell | None
-
-    @property
-    def facts(self) -> dict[str, Fact]:
-        """Their parameters, and the method of the baseline, by the names that no others have."""
-        values: dict[str, dict[str, JsonValue]] = {}
-        for cell in self.cells:
-            for name, value in cell.params.items():
-                values.setdefault(name, {})[_sorted_json(value)] = value
-        if self.chosen:
-            values["use"] = {"": self.chosen.method}
-        written = f"{self.step}.{self.variant}" if self.variant else self.step
-        of_baseline = f"{self.step}@{DATA}={self.data}" if self.data else self.step
-        is_beside = bool(self.variant) and self.chosen is None
-        own = of_baseline
-        if is_beside:
-            own = f"{of_baseline},{self.step}={self.variant}" if self.data else written
-        # Without the dataset the baseline's is its step, whatever its variant.
-        shared = written if is_beside else self.step
-        return {
-            f"{own}.{name}": Fact(
-                values=tuple(several.values()),
-                shared=f"{shared}.{name}" if self.data else "",
-                set_as=f"{written}.{name}" if self.variant else "",
-                beside=f"{of_baseline}.{name}" if is_beside else "",
-            )
-            for name, several in values.items()
-        }
-
-
-def _alike(cells: Iterable[RecordedCell], baseline: Collection[str]) -> Iterator[_Alike]:
-    """Put together what `--set` does; `baseline` has the addresses of the baseline's cells."""
-    found: dict[tuple[str, str, str], list[RecordedCell]] = {}
-    for cell in cells:
-        if cell.repeat == 0 and cell.status != "skipped":
-            key = cell.step, cell.assignment.get(DATA, ""), _called_by_set(cell)
-            found.setdefault(key, []).append(cell)
-    for (step, data, variant), several in found.items():
-        chosen = next((cell for cell in several if cell.address in baseline), None)
-        yield _Alike(step=step, data=data, variant=variant, cells=tuple(several), chosen=chosen)
-
-
-def _values(run: Run) -> dict[str, list[float]]:
-    """Numbers of the baseline, one of each dataset that has one.
-
-    Of several datasets errors with signs are given by their sizes, as in the report.
-    """
-    values: dict[str, list[float]] = {}
-    parts = parts_of(run)
-    for part in parts.values() or (run,):
-        own: dict[str, float] = {}
-        for cell in baseline_cells(part):
-            for row in cell_metrics(cell):
-                is_size = len(parts) > 1 and sense_of(row.better) is Sense.LESS
-                value = abs(row.value) if is_size else row.value
-                own |= {f"{row.step}.{row.metric}": value, row.metric: value}
-        for name, value in own.items():
-            values.setdefault(name, []).append(value)
-    return values
-
-
-def _labels(measured: Iterable[MetricRow]) -> dict[str, str]:
-    """What the numbers of the baseline are; of several datasets, as the last has them."""
-    found: dict[str, str] = {}
-    for row in measured:
-        found |= {f"{row.step}.{row.metric}": row.title, row.metric: row.title}
-    return found
 
 
 def _unfinished(folder: Path) -> RunSummary:
@@ -455,3 +368,58 @@ def _unfinished(folder: Path) -> RunSummary:
         run_id=str(said.get("run_id", "")),
         started=str(said.get("time", "")),
     )
+
+
+def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[RunSummary]) -> None:
+    """Write a page with a row per run.
+
+    Args:
+        runs: in the order of the rows.
+        path: file to write.
+        among: those that they were chosen from; in what they differ is told against all of these.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    from orthoflow.report.rendering import environment, write_whole  # noqa: PLC0415 - few ask
+
+    facts = differing_facts(among)
+    known = dict.fromkeys(name for run in runs for name in run.metrics if "." not in name)
+    names = {
+        name: next(run.labels[name] for run in runs if name in run.labels)
+        for name in told_apart(known, runs)
+    }
+    rows = []
+    for index, run in enumerate(runs):
+        report = run.folder / REPORT_FILE
+        link = Path(os.path.relpath(report, path.parent)).as_posix() if report.is_file() else ""
+        picture = _picture(run.folder) if index < _PICTURES_MOST else ""
+        differs = ", ".join(
+            f"{name}={json.dumps(value, ensure_ascii=False)}"
+            for name, value in facts[run.folder].items()
+        )
+        rows.append({"run": run, "link": link, "picture": picture, "differs": differs})
+    page = (
+        environment()
+        .get_template("runs.html.j2")
+        .render(
+            title=f"{len(runs)} runs",
+            rows=rows,
+            names=names,
+            key_names=set(told_apart(key_metrics(runs, most=_KEYS_MOST), runs)),
+            reasons={str(run.folder): run.reason for run in runs if run.reason},
+        )
+    )
+    write_whole(path, page)
+
+
+def _picture(folder: Path) -> str:
+    """The first orthoimage of a run; none where its record cannot be read."""
+    from orthoflow.report.pictures import thumbnail  # noqa: PLC0415 - few ask
+
+    try:
+        run = open_run(folder)
+        made = {cell.address for cell in baseline_cells(run)}
+        return thumbnail(run, made, longest_side_px=_PICTURE_PX)
+    except (OrthoflowError, OSError, KeyError, ValueError):
+        return ""

@@ -6,8 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -29,9 +28,8 @@ from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
 from orthoflow.report.rankings import Sense, cost_share, is_flag
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.expand import variants_text
+from orthoflow.workflow.model import DATA
 
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120
@@ -194,74 +192,55 @@ def _unswept(
     return found_alone
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Point:
-    x: float
-    y: float
+class _Value(NamedTuple):
+    """What one combination measured, and in how many of its repeats."""
+
+    value: float
     spread: float
-    found: tuple[_Value, ...]  # what it stands for, one of each dataset
     is_baseline: bool
-    is_level: bool = False  # the end of a line of what was not swept
+    dataset: str
+    n_repeats: int
+    n_all: int
 
-    @property
-    def n(self) -> int:
-        return len(self.found)
 
-    @property
-    def origins(self) -> list[tuple[str, int]]:
-        """The datasets, and how many repeats of each have a value."""
-        return sorted((one.dataset, one.n_repeats) for one in self.found)
-
-    @property
-    def partly(self) -> list[str]:
-        """What has a value of only some repeats, in words."""
-        at = "" if self.is_level else f" at {number(self.x)}"
-        return [
-            f"{one.dataset}{at} ({one.n_repeats} of {one.n_all})".lstrip()
-            for one in self.found
-            if one.n_repeats < one.n_all
-        ]
+# Value of the parameter, None of what was not swept -> what combinations measured there.
+_Line = dict[float | None, list[_Value]]
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     columns = comparison_columns(combinations)
     is_asked = any(wanted_metrics(part) for part in parts)
-    chosen = [
-        one
-        for one in columns
-        if is_asked or one.is_key or one.is_described or one.sense is not Sense.NEITHER
-    ]
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}
     found = list(sweeps(cells))
     for sweep in found:
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
-    behind = {step: {cell.step for cell in cells if step in cell.assignment} for step, _ in swept}
     of_walls = (
-        {cell.step: " Not all are of the same wall." for cell in cells if gives(cell, *_OF_WALLS)}
+        {cell.step for cell in cells if gives(cell, *_OF_WALLS)}
         if unequal_walls(combinations)
-        else {}
+        else set()
     )
-    unswept = {place: _unswept(cells, *place, found) for place in swept}
-    for column in sorted(chosen, key=lambda one: not one.is_key):
-        for (step, parameter), alike in swept.items():
+    for column in sorted(columns, key=lambda one: not one.is_key):
+        is_good = column.is_key or column.is_described or column.sense is not Sense.NEITHER
+        for (step, parameter), alike in swept.items() if is_asked or is_good else ():
             # A parameter over itself says nothing.
-            is_itself = (column.step, column.metric) == (step, parameter)
-            if is_itself or column.step not in behind[step]:
+            is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
+            if (column.step, column.metric) == (step, parameter) or not is_behind:
                 continue
-            lines: dict[str, list[_Point]] = {}
-            are_several = len(alike) + len(unswept[step, parameter]) > 1
-            for sweep in (*alike, *unswept[step, parameter]):
-                own = _lines(combinations, sweep, column, is_over=len(parts) > 1)
-                method = sweep.method if are_several else ""
-                lines |= {", ".join(filter(None, [method, name])): own[name] for name in own}
-            if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
-                shown_lines = _levelled(dict(list(lines.items())[:_MOST_LINES]))
-                curve = _curve(alike[0], column, shown_lines, n_datasets=len(parts))
-                caveats = _unequal_photos(combinations, column) + of_walls.get(column.step, "")
-                yield replace(curve, caption=curve.caption + caveats)
+            drawn = [*alike, *_unswept(cells, step, parameter, found)]
+            lines: dict[str, _Line] = {}
+            for sweep in drawn:
+                method = sweep.method if len(drawn) > 1 else ""
+                for name, line in _lines(combinations, sweep, column).items():
+                    lines[", ".join(filter(None, [method, name]))] = line
+            if any(len(line) >= _FEWEST_VALUES for line in lines.values()):
+                first = dict(list(lines.items())[:_MOST_LINES])
+                caveats = _unequal_photos(combinations, column)
+                if column.step in of_walls:
+                    caveats += " Not all are of the same wall."
+                yield _curve(f"{step}.{parameter}", column, first, len(parts), caveats)
 
 
 def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
@@ -276,172 +255,129 @@ def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
     return " Not all sum up as many photos: without difficult ones errors are smaller."
 
 
-class _Value(NamedTuple):
-    """What one combination measured, and of how many of its repeats."""
-
-    value: float
-    spread: float
-    is_baseline: bool
-    dataset: str = ""
-    n_repeats: int = 1
-    n_all: int = 1
-
-
-def _lines(
-    combinations: Sequence[Combination], sweep: Sweep, column: Column, *, is_over: bool
-) -> dict[str, list[_Point]]:
+def _lines(combinations: Sequence[Combination], sweep: Sweep, column: Column) -> dict[str, _Line]:
     """One line per combination of the other variants."""
-    values: dict[str, dict[float, list[_Value]]] = {}
+    lines: dict[str, _Line] = {}
     for one in combinations:
         variant = one.assignment.get(sweep.step, "")
         measured = one.measured(column.step, column.metric)
         if variant not in sweep.values or measured is None or one.failure is not None:
             continue
-        if not abs(measured.value) < _LARGEST:
-            continue
-        variants = (
-            f"{step}={chosen}"
-            for step, chosen in one.assignment.items()
-            if step not in (sweep.step, DATA)
-        )
-        others = ", ".join(filter(None, [sweep.others[variant], *variants]))
-        at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
-        at.append(
-            _Value(
-                measured.value,
-                measured.spread,
-                one.is_baseline,
-                one.assignment.get(DATA, ""),
-                measured.n_repeats,
-                measured.n_all,
+        if abs(measured.value) < _LARGEST:
+            others = {k: v for k, v in one.assignment.items() if k not in (sweep.step, DATA)}
+            name = ", ".join(filter(None, [sweep.others[variant], variants_text(others)]))
+            x = sweep.values[variant]
+            lines.setdefault(name, {}).setdefault(None if math.isnan(x) else x, []).append(
+                _Value(
+                    measured.value,
+                    measured.spread,
+                    one.is_baseline,
+                    one.assignment.get(DATA, ""),
+                    measured.n_repeats,
+                    measured.n_all,
+                )
             )
-        )
-    return {
-        name: [
-            _point(x, found, is_over=is_over, column=column) for x, found in sorted(line.items())
-        ]
-        for name, line in values.items()
-    }
-
-
-def _levelled(lines: Mapping[str, list[_Point]]) -> dict[str, list[_Point]]:
-    """Draw what has no value of the parameter from its least to its largest."""
-    xs = [point.x for points in lines.values() for point in points if not math.isnan(point.x)]
-    ends = (min(xs), max(xs))
-    return {
-        name: [replace(points[0], x=x, is_level=True) for x in ends]
-        if math.isnan(points[0].x)
-        else points
-        for name, points in lines.items()
-    }
-
-
-def _point(x: float, found: Sequence[_Value], *, is_over: bool, column: Column) -> _Point:
-    is_baseline = any(one.is_baseline for one in found)
-    numbers = np.array([one.value for one in found])
-    if column.sense is Sense.LESS:
-        # Errors of both signs would make each other small, and the most negative look best.
-        numbers = np.abs(numbers)
-    if len(found) == 1:
-        # A bar over datasets is how far they lie apart, not how far the repeats of one do.
-        y, spread = float(numbers[0]), math.nan if is_over else found[0].spread
-    else:
-        y, spread = middle_of(numbers, column.unit), spread_of(numbers, column.unit)
-    return _Point(x=x, y=y, spread=spread, found=tuple(found), is_baseline=is_baseline)
-
-
-def _are_alike(one: _Point, other: _Point) -> bool:
-    """Whether both are of the same datasets and as many repeats of each.
-
-    The hard datasets are often those that a value fails on: no line says that it is better.
-    """
-    return one.origins == other.origins
-
-
-def _unlike(lines: Mapping[str, Sequence[_Point]], *, is_over: bool) -> str:
-    """Return what is missing behind points: datasets and repeats; empty where nothing is."""
-    partly = [said for points in lines.values() for point in points for said in point.partly]
-    some = f"; of only some repeats: {first_few(partly)}" if partly else ""
-    if all(_are_alike(*pair) for points in lines.values() for pair in pairwise(points)):
-        return some
-    what = "datasets or repeats" if is_over else "numbers of repeats"
-    return f", no line between those of unlike {what}{some}"
-
-
-def _behind(points: Sequence[_Point], n_datasets: int, unit: str) -> str:
-    """Return how many datasets points over datasets are of: those that failed have no part."""
-    least, most = min(point.n for point in points), max(point.n for point in points)
-    if most == 1:
-        return f"each of the only one of {n_datasets} datasets that has a value, without bars"
-    counted = f"{least}" if least == most else f"{least} to {most}"
-    of_all = f" of {n_datasets}" if least < n_datasets else ""
-    if is_flag(unit):
-        return (
-            f"means of {counted}{of_all} datasets: the share of them, and of their repeats, "
-            "where it is so (1)"
-        )
-    where = ", where there is more than one" if least == 1 else ""
-    return (
-        f"medians of {counted}{of_all} datasets, bars 1.4826 times the median absolute "
-        f"deviation{where}"
-    )
+    return lines
 
 
 def _curve(
-    sweep: Sweep,
-    column: Column,
-    lines: Mapping[str, Sequence[_Point]],
-    *,
-    n_datasets: int,
+    parameter: str, column: Column, lines: Mapping[str, _Line], n_datasets: int, caveats: str
 ) -> Curve:
-    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
-    has_spread = any(math.isfinite(point.spread) for points in lines.values() for point in points)
-    if n_datasets > 1:
-        every = [point for points in lines.values() for point in points]
-        said = _behind(every, n_datasets, column.unit)
-    elif has_spread:
-        said = "means of the repeats, bars their standard deviation"
-    else:
-        said = "one value each: without repeats nobody knows how far they scatter"
-    said += _unlike(lines, is_over=n_datasets > 1)
-    good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
+    is_over = n_datasets > 1
+    xs = [x for line in lines.values() for x in line if x is not None]
+    drawn: dict[str, list[ChartPoint]] = {}
+    partly: list[str] = []
+    is_broken = False
+    for name, line in lines.items():
+        before: list[tuple[str, int]] | None = None
+        for x, found in sorted(line.items(), key=lambda one: one[0] or 0.0):
+            # The hard datasets are often those that a value fails on: no line between points of
+            # unlike datasets or repeats says that one is better.
+            origins = sorted((one.dataset, one.n_repeats) for one in found)
+            is_joined = before in (None, origins)
+            is_broken |= not is_joined
+            before = origins
+            # What has no value of the parameter is drawn from its least to its largest.
+            for place in (min(xs), max(xs)) if x is None else (x,):
+                point = _point(place, found, column, is_over=is_over, is_joined=is_joined)
+                drawn.setdefault(name, []).append(point)
+            at = "" if x is None else f" at {number(x)}"
+            partly += [
+                f"{one.dataset}{at} ({one.n_repeats} of {one.n_all})".lstrip()
+                for one in found
+                if one.n_repeats < one.n_all
+            ]
+    every = [point for points in drawn.values() for point in points]
+    # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
+    is_size = column.sense is Sense.LESS and all(point.y >= 0.0 for point in every)
+    is_share = column.sense is Sense.MORE and all(0.0 <= point.y <= 1.0 for point in every)
+    said = _points_words(lines, column.unit, n_datasets)
+    if is_broken:
+        what = "datasets or repeats" if is_over else "numbers of repeats"
+        said += f", no line between those of unlike {what}"
+    if partly:
+        said += f"; of only some repeats: {first_few(partly)}"
+    if column.sense is not Sense.NEITHER:
+        said += f"; {column.sense.value}"
     if column.sense is Sense.LESS and not cost_share(column.unit):
-        good += ", of signed errors their sizes"
-    if any(point.is_level for points in lines.values() for point in points):
-        good += "; level lines are of what was not swept"
-    base = [one for points in lines.values() for one in points if one.is_baseline]
-    if base:
-        what = "level line with filled points" if base[0].is_level else "filled point"
-        good += f"; the {what} is the baseline"
+        said += ", of signed errors their sizes"
+    if any(None in line for line in lines.values()):
+        said += "; level lines are of what was not swept"
+    if base := [x for line in lines.values() for x, found in line.items() if found[0].is_baseline]:
+        filled = "level line with filled points" if base[0] is None else "filled point"
+        said += f"; the {filled} is the baseline"
     shape = (
         "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
         "decides the result."
         if max(map(len, lines.values())) > _FEWEST_VALUES
         else "Of two values a line shows the difference alone, and nothing of what lies between."
     )
-    every = [point for points in lines.values() for point in points]
-    # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
-    is_size = column.sense is Sense.LESS and all(point.y >= 0.0 for point in every)
-    is_share = column.sense is Sense.MORE and all(0.0 <= point.y <= 1.0 for point in every)
     return Curve(
-        name=f"{column.step}.{column.metric}_over_{sweep.step}.{sweep.parameter}",
-        title=title,
-        caption=f"Points are {said}{good}. {shape}",
-        lines={name: tuple(_chart_points(points)) for name, points in lines.items()},
-        below=f"{sweep.step}.{sweep.parameter}",
+        name=f"{column.step}.{column.metric}_over_{parameter}",
+        title=f"{column.label} ({column.step}) over {parameter}",
+        caption=f"Points are {said}. {shape}{caveats}",
+        lines=drawn,
+        below=parameter,
         beside=column.label,
         bounds=(0.0 if is_size or is_share else -math.inf, 1.0 if is_share else math.inf),
     )
 
 
-def _chart_points(points: Sequence[_Point]) -> Iterator[ChartPoint]:
-    before: _Point | None = None
-    for point in points:
-        yield ChartPoint(
-            x=point.x,
-            y=point.y,
-            spread=point.spread,
-            is_filled=point.is_baseline,
-            is_joined=before is None or _are_alike(before, point),
+def _point(
+    x: float, found: Sequence[_Value], column: Column, *, is_over: bool, is_joined: bool
+) -> ChartPoint:
+    numbers = np.array([one.value for one in found])
+    if column.sense is Sense.LESS:
+        # Errors of both signs would make each other small, and the most negative look best.
+        numbers = np.abs(numbers)
+    spread = spread_of(numbers, column.unit)
+    if len(found) == 1:
+        # A bar over datasets is how far they lie apart, not how far the repeats of one do.
+        spread = math.nan if is_over else found[0].spread
+    return ChartPoint(
+        x=x,
+        y=middle_of(numbers, column.unit) if len(found) > 1 else float(numbers[0]),
+        spread=spread,
+        is_filled=any(one.is_baseline for one in found),
+        is_joined=is_joined,
+    )
+
+
+def _points_words(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
+    """What the points are, and over datasets how many these are: what failed has no part in it."""
+    found = [values for line in lines.values() for values in line.values()]
+    if n_datasets < 2:
+        if any(math.isfinite(one.spread) for values in found for one in values):
+            return "means of the repeats, bars their standard deviation"
+        return "one value each: without repeats nobody knows how far they scatter"
+    least, most = min(map(len, found)), max(map(len, found))
+    if most == 1:
+        return f"each of the only one of {n_datasets} datasets that has a value, without bars"
+    counted = f"{least}" if least == most else f"{least} to {most}"
+    counted += f" of {n_datasets}" if least < n_datasets else ""
+    if is_flag(unit):
+        return (
+            f"means of {counted} datasets: the share of them, and of their repeats, "
+            "where it is so (1)"
         )
-        before = point
+    return f"medians of {counted} datasets, bars 1.4826 times the median absolute deviation"

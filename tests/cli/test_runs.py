@@ -16,7 +16,7 @@ from orthoflow_provenance.document import Metric, RecordedFile, RecordedInput
 from orthoflow_provenance.record import write_record
 
 from orthoflow.cli import runs as module
-from orthoflow.report.browsing import Fact, RunSummary
+from orthoflow.report.browsing import RunSummary
 from tests.hostile_records import reseal
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
@@ -331,7 +331,7 @@ def test_a_condition_is_a_name_a_sign_and_a_number(
                 folder=Path("a"),
                 state="ok",
                 metrics={} if facts else {name: value},
-                facts={name: Fact(values=(value,))} if facts else {},
+                facts={name: value} if facts else {},
             )
             for value in (1, 2, 3)
         }
@@ -340,7 +340,7 @@ def test_a_condition_is_a_name_a_sign_and_a_number(
 
 @pytest.mark.parametrize("value", [True, "2", None, [2]])
 def test_what_is_no_number_meets_no_condition(value: object) -> None:
-    run = RunSummary(folder=Path("a"), state="ok", facts={"seed": Fact(values=(value,))})  # type: ignore[arg-type]
+    run = RunSummary(folder=Path("a"), state="ok", facts={"seed": value})  # type: ignore[arg-type]
     assert not any(module._Condition.of(f"seed {sign} 2").is_met_by(run) for sign in module._SIGNS)
     assert not module._Condition.of("other = 2").is_met_by(run)
 

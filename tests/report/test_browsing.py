@@ -14,7 +14,7 @@ from orthoflow_provenance.record import write_record
 from orthoflow.errors import ArgumentError
 from orthoflow.report import browsing as module
 from orthoflow.report.browsing import (
-    Fact,
+    Parameter,
     RunSummary,
     differing_facts,
     distinct_facts,
@@ -55,8 +55,7 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
 
 
 def summary(name: str, workflow: str = "hall", **facts: object) -> RunSummary:
-    told = {key: Fact(values=(value,)) for key, value in facts.items()}  # type: ignore[arg-type]
-    return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=told)
+    return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=facts)  # type: ignore[arg-type]
 
 
 def test_what_all_runs_of_a_workflow_share_tells_none_of_them() -> None:
@@ -155,14 +154,13 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
     told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
     run = HeldRun(path=tmp_path / "run.h5", record=told)
-    assert sorted(module._values(run)["rms_mm"]) == [1.0, 2.0, 5.0]
-    # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
-    assert sorted(module._values(run)["plane_offset_mm"]) == [1.0, 2.0, 5.0]
-    assert sorted(module._values(run)["omega_deg"]) == [-5.0, -2.0, -1.0]
-    alone = record(cells[1:2], workflow_resolved=json.dumps({"datasets": {"stairs": {}}}))
-    assert module._values(replace(run, record=alone))["plane_offset_mm"] == [-2.0]
     summary = module._of_run(tmp_path, run)
     assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
+    # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
+    assert (summary.metrics["plane_offset_mm"], summary.metrics["omega_deg"]) == (2.0, -2.0)
+    alone = record(cells[1:2], workflow_resolved=json.dumps({"datasets": {"stairs": {}}}))
+    of_one = module._of_run(tmp_path, replace(run, record=alone))
+    assert of_one.metrics["plane_offset_mm"] == -2.0
     assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
     facts, labels = distinct_facts([summary])[tmp_path], summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "points to the first plane, RMS"
@@ -203,7 +201,8 @@ def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> No
     plain = replace(
         single,
         folder=tmp_path / "p",
-        facts={"check.tries": Fact(values=(4,))},
+        facts={},
+        parameters=(Parameter("check", "", "", "", "tries", 4),),
         n_datasets=0,
     )
     of_both = [facts["check.tries"] for facts in differing_facts([swept, plain]).values()]

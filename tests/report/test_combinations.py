@@ -38,21 +38,6 @@ CELLS = (
 )
 
 
-def test_a_combination_that_is_part_of_a_larger_one_is_no_row() -> None:
-    found = combinations_of(run(*CELLS))
-    assert [one.name for one in found] == [
-        "plane=hough",
-        "plane=ransac, orient=pnp",
-        "plane=ransac, orient=dlt",
-    ]
-    assert [[each.step for each in one.cells] for one in found] == [
-        ["scan", "plane"],
-        ["scan", "plane", "orient", "orient"],
-        ["scan", "plane", "orient"],
-    ]
-    assert not any(one.is_baseline for one in found)
-
-
 def test_without_variants_there_is_one_combination_of_everything() -> None:
     [one] = combinations_of(run(cell("scan"), cell("plane")))
     assert (one.name, len(one.cells), len(one.varied_cells)) == ("", 2, 2)

@@ -10,13 +10,10 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from orthoflow.report import curves as module
-from orthoflow.report.comparisons import Column, comparison_table
+from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.curves import Curve, curve_files, curves, curves_over, sweeps
-from orthoflow.report.rankings import Mark, Sense
+from orthoflow.report.rankings import Mark
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
-
-CUT = "points to the first plane, RMS / mm"
 
 
 def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
@@ -207,15 +204,6 @@ def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
     assert sorted(found.values.values()) == [0.02, 0.05, 0.1]
 
 
-def test_points_lie_in_the_order_of_values_whatever_that_of_the_variants(tmp_path: Path) -> None:
-    (curve,) = curves(held(tmp_path, swept(0.1, 0.02, 0.05)))
-    assert curve.title == f"{CUT} (plane) over plane.tolerance_m"
-    assert "without repeats nobody knows" in curve.caption
-    assert (curve.below, curve.beside) == ("plane.tolerance_m", CUT)
-    assert [x for x, _ in points(curve)] == [0.02, 0.05, 0.1]
-    assert [y for _, y in points(curve)] == pytest.approx([0.002, 0.005, 0.01])
-
-
 def test_repeats_have_bars_and_what_failed_has_no_point(tmp_path: Path) -> None:
     (curve,) = curves(held(tmp_path, swept(0.02, 0.05, 0.1, 0.2, repeats=3, failed=3)))
     assert len(points(curve)) == len(bars(curve)) == 3
@@ -381,36 +369,6 @@ def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
         assert list(curve.lines) == [f"mode=m{k}" for k in range(n_drawn)]
 
 
-def test_bars_of_errors_end_at_zero(tmp_path: Path) -> None:
-    cells = [
-        cell(
-            f"plane@plane=v{index}" + (f"#{repeat}" if repeat else ""),
-            params={"tolerance_m": float(index)},
-            # 1 on average, with a deviation of 1.7.
-            metrics=metrics(plane_offset_mm=(0.0, 0.0, 3.0)[repeat]),
-        )
-        for index in range(1, 4)
-        for repeat in range(3)
-    ]
-    asked = record(cells, workflow_resolved=compared_resolved("plane.plane_offset_mm"))
-    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=asked))
-    assert curve.bounds[0] == 0.0
-
-
-def test_a_negative_error_of_one_dataset_is_no_good_one(tmp_path: Path) -> None:
-    cells = [
-        cell(
-            f"plane@plane=tolerance_m-{value:g}",
-            params={"tolerance_m": value},
-            metrics=metrics(plane_offset_mm=-value),
-        )
-        for value in (0.02, 0.05)
-    ]
-    one, nothing = held(tmp_path, cells), held(tmp_path, [])
-    for (curve,) in (curves(one), curves_over({"hall": one, "yard": nothing})):
-        assert [y for _, y in points(curve)] == [0.02, 0.05]
-
-
 def test_a_drawing_stands_alone_as_a_file(tmp_path: Path) -> None:
     cells = [replace(one, step="a/b") for one in swept(0.02, 0.05)]  # type: ignore[type-var]
     cells = [replace(one, assignment={"a/b": one.assignment["plane"]}) for one in cells]
@@ -462,12 +420,3 @@ def test_a_curve_over_different_walls_is_drawn_with_a_word_of_that(
         for curve in curves(held(tmp_path, cells))
     }
     assert (said["plane"], said["check"]) == (False, is_said)
-
-
-@pytest.mark.parametrize(("is_error", "y"), [(True, 3.0), (False, -2.0)])
-def test_of_errors_the_sizes_have_a_median(is_error: bool, y: float) -> None:
-    found = [module._Value(value, math.nan, False) for value in (-4.0, 3.0, -2.0)]
-    sense = Sense.LESS if is_error else Sense.NEITHER
-    column = Column(step="plane", metric="shift_mm", label="", sense=sense)
-    point = module._point(1.0, found, is_over=True, column=column)
-    assert (point.y, point.n) == (y, 3)

@@ -17,7 +17,7 @@ from orthoflow.errors import StoreError
 from orthoflow.records.datasets import datasets_of, parts_of
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
-from orthoflow.report import dataset_tables, write_page, write_report
+from orthoflow.report import write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.paired import (
     MethodOverDatasets,
@@ -140,18 +140,6 @@ def test_the_baseline_is_what_others_are_compared_with(rooms: Run) -> None:
     assert slow.median == 4.0
 
 
-def test_pairs_are_of_the_datasets_that_both_have(rooms: Run) -> None:
-    paired = methods(rooms)["plane=quick"].paired
-    assert paired is not None
-    # Differences -1, -1.5, 0.5, -8, 0, -0.1; without the zero the ranks are 3, 4, 2, 5, 1.
-    assert (paired.n, paired.wins, paired.losses) == (6, 4, 1)
-    assert paired.median == pytest.approx(-0.55)
-    assert paired.effect == pytest.approx((13 - 2) / 15)
-    # Of 32 signs of five ranks those with a sum of at most 2 are {}, {1} and {2}, on either side.
-    assert paired.p == pytest.approx(2 * 3 / 32)
-    assert paired.deciding == {"tower": -8.0}
-
-
 def swept(folder: Path, n_rooms: int, *, step_mm: float) -> HeldRun:
     """Two detectors at three tolerances; the second is better by some millimetres at each."""
     cells = []
@@ -236,17 +224,6 @@ def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:
     quick = methods(told)["plane=quick"]
     assert quick.paired is not None
     assert (quick.paired.n, quick.paired.wins, quick.n_unlike) == (5, 3, 1)
-
-
-@pytest.mark.parametrize("n", [5, 8])
-def test_a_method_that_is_better_everywhere_has_the_whole_effect(n: int) -> None:
-    worse = {f"r{index}": -1.0 - index / 10 for index in range(n)}
-    paired = paired_differences(worse, Sense.LESS)
-    assert (paired.wins, paired.losses, paired.effect) == (n, 0, 1.0)
-    assert paired.p == pytest.approx(2 / 2**n)
-    opposite = paired_differences({name: -value for name, value in worse.items()}, Sense.LESS)
-    assert (opposite.wins, opposite.losses, opposite.effect) == (0, n, -1.0)
-    assert opposite.p == pytest.approx(paired.p)
 
 
 def test_methods_that_agree_everywhere_have_no_test() -> None:
@@ -370,37 +347,3 @@ def test_a_step_called_data_makes_no_datasets(rooms: Run) -> None:
     told = replace(rooms, record=replace(rooms.record, workflow_resolved="{}"))
     assert datasets_of(told) == ()
     assert parts_of(told) == {}
-
-
-@pytest.mark.parametrize("n_metrics", [6, 7])
-def test_a_table_of_datasets_has_six_columns_at_most(tmp_path: Path, n_metrics: int) -> None:
-    # The first ones of all that say how good a result is; photos have a column of their own.
-    names = ["rmse_u_mm", "rmse_v_mm", "nmad_u_mm", "nmad_v_mm", "depth_rmse_mm", "completeness"]
-    names = [*names, "completeness_seen_by_both"][:n_metrics]
-    cells = [
-        cell(f"check@data={room}", metrics=metrics(**dict.fromkeys(names, 1.0)))
-        for room in ("hall", "stairs")
-    ]
-    resolved = {"datasets": {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs")}}
-    told = record(cells, workflow_resolved=json.dumps(resolved))
-    table = dataset_table(parts_of(HeldRun(path=tmp_path / "run.h5", record=told)), {})
-    assert len(table.columns) == 6
-    assert [step for step, _ in table.columns] == ["check"] * 6
-    assert all(len(row.values) == 6 for row in table.rows)
-    assert not table.has_photos
-
-
-@pytest.mark.parametrize(
-    ("n_rooms", "side"), [(1, 220), (41, 220), (42, 218), (400, 70), (500, 64), (9000, 64)]
-)
-def test_pictures_of_many_datasets_become_smaller(
-    monkeypatch: pytest.MonkeyPatch, rooms: Run, n_rooms: int, side: int
-) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr(
-        dataset_tables,
-        "thumbnail",
-        lambda _run, _cells, *, longest_side_px: asked.append(longest_side_px) or "",
-    )
-    dataset_tables._picture(rooms, frozenset(), n_rooms)
-    assert asked == [side]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from orthoflow.records.comparison import CellFacts, ComparedMetric, Pair
+from orthoflow.records.comparison import ComparedMetric, Pair
 from orthoflow.report import differences
 from orthoflow.report.differences import Difference
 from tests.compared_runs import compared
@@ -109,36 +108,7 @@ def test_a_product_says_how_far_each_field_lies_apart_and_why() -> None:
     )
 
 
-def test_facts_of_a_step_are_said_as_far_as_there_are_any() -> None:
-    facts = CellFacts(
-        status="ok",
-        method="plane.ransac",
-        result_version=3,
-        distribution="orthoflow 1.0",
-        determinism="seeded",
-        code={"orthoflow": "0123456789abcdef"},
-        tools={"open3d": "0.19"},
-        seed=5,
-        error="",
-    )
-    assert str(facts) == (
-        "ok, plane.ransac result version 3, orthoflow 1.0, code of orthoflow 01234567, "
-        "open3d 0.19, seed 5"
-    )
-    few = replace(facts, seed=None, error="no plane", distribution="", code={}, tools={})
-    assert str(few) == "ok, plane.ransac result version 3, no plane"
-
-
 def test_files_are_named_with_the_beginning_of_their_digest() -> None:
     file: Any = SimpleNamespace(name="a.e57", sha256="0123456789abcdef")
     assert differences._files_text([file, file]) == "a.e57 0123456789ab, a.e57 0123456789ab"
     assert differences._files_text([]) == "not given"
-
-
-def test_a_parameter_that_was_set_says_so() -> None:
-    value: Any = SimpleNamespace(value=["\N{LATIN SMALL LETTER U WITH DIAERESIS}", 1], is_set=True)
-    assert (
-        differences._parameter_text(value) == '["\N{LATIN SMALL LETTER U WITH DIAERESIS}", 1] (set)'
-    )
-    value.is_set = False
-    assert not differences._parameter_text(value).endswith("(set)")

@@ -8,11 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from orthoflow_provenance.document import RecordedCell, RecordedFigure
 
 from orthoflow.files.images import decode_image, encode_png, encode_webp
-from orthoflow.report import figures as module
 from orthoflow.report.figures import baseline_addresses, figure_groups, write_figures
 from tests.report_runs import HeldRun, cell, compared_resolved, record
 
@@ -42,20 +40,6 @@ def noise(seed: int, side: int = 300) -> bytes:
     return encode_png(
         np.random.default_rng(seed).integers(0, 256, (side, side, 3)).astype(np.uint8)
     )
-
-
-def test_of_far_too_many_bytes_only_the_smallest_size_is_tried(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    tried: list[int] = []
-
-    def keep(figure: RecordedFigure, side_px: int) -> RecordedFigure:
-        tried.append(side_px)
-        return figure
-
-    monkeypatch.setattr(module, "_smaller", keep)
-    module._fitted((figure("a", b"x" * 10_000),), 1.0)
-    assert tried == [min(module._SIDES_PX)]
 
 
 def test_equal_figures_and_those_of_repeats_are_shown_once() -> None:
@@ -97,16 +81,6 @@ def test_files_lie_beside_the_page_for_the_baseline_and_what_all_share() -> None
 # --- sharing the bytes of a page ---
 
 
-def test_few_figures_stay_as_they_are() -> None:
-    data = noise(1)
-    cells = [cell("plane@plane=fine", figures=(figure("a", data), figure("b", noise(2))))]
-    share = (2 * len(data) + 10_000) / 3_900_000
-    assert [size for *_, size in shown(run(cells), share=share)] == [len(data), len(noise(2))]
-    # A little less than they take: both are drawn smaller.
-    less = shown(run(cells), share=share - 20_000 / 3_900_000)
-    assert all(size < 0.5 * len(data) for *_, size in less)
-
-
 def test_all_figures_of_a_page_take_less_than_four_megabytes() -> None:
     large = [figure(f"f{k}", noise(k, 700)) for k in range(5)]
     n_bytes = len(large[0].data)
@@ -134,46 +108,6 @@ def test_the_baseline_has_seven_tenths_before_the_others_share_the_rest() -> Non
     # What the others do not need is the baseline's as well.
     alone = run([cells[0], replace(cells[1], figures=(figure("b", b"small"),))])
     assert shown(alone, share=whole / 0.95)[0][2] == len(ours)
-
-
-def test_drawings_and_small_figures_are_never_drawn_anew() -> None:
-    small, large = noise(3, 80), noise(4, 84)
-    assert len(small) < 20_000 < len(large)
-    many = (
-        figure("small", small),
-        figure("large", large),
-        figure("drawing", b"<svg" + b" " * 30_000 + b"/>", SVG),
-    )
-    sizes = {one.name: len(one.data) for one in module._fitted(many, 1.0)}
-    assert sizes["small"] == len(small)
-    assert sizes["drawing"] == 30_006
-    assert sizes["large"] < len(large)
-
-
-@pytest.mark.parametrize(("wanted_share", "side"), [(0.9, 700), (0.06, 340), (0.001, 240)], ids=str)
-def test_figures_are_as_large_as_their_share_allows(wanted_share: float, side: int) -> None:
-    rows, columns = np.indices((600, 900))
-    picture = np.dstack([rows % 251, columns % 241, (rows * columns) % 239]).astype(np.uint8)
-    one = figure("a", encode_png(picture))
-    (found,) = module._fitted((one,), wanted_share * len(one.data))
-    assert (found.name, found.caption, found.media_type) == ("a", "about a", WEBP)
-    height, width = decode_image(found.data).shape[:2]
-    assert width == side
-    assert height == pytest.approx(side * 600 / 900, abs=1)
-
-
-def test_a_figure_that_would_grow_stays_as_it_is() -> None:
-    rng = np.random.default_rng(1)
-    picture = rng.integers(0, 256, (400, 400, 3)).astype(np.uint8)
-    packed = figure("packed", encode_webp(picture, quality=1), WEBP)
-    assert len(packed.data) > 20_000
-    assert module._smaller(packed, 10_000) is packed
-
-
-def test_a_damaged_figure_costs_its_place_and_not_the_page() -> None:
-    broken = figure("broken", b"\x89PNG" + bytes(30_000))
-    (found,) = module._fitted((broken,), 10.0)
-    assert (found.data, found.caption) == (b"", "about broken (the picture is damaged)")
 
 
 # --- files ---

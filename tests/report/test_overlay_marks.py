@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from orthoflow.report.combinations import combinations_of
-from orthoflow.report.comparisons import Origins, _letter, comparison_table
+from orthoflow.report.comparisons import Origins, comparison_table
 from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders
@@ -206,10 +206,6 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     # Times that differ by less than 30 % are not told apart.
     assert (fine.memory.text, fine.time.mark, coarse.time.mark) == ("0", Mark.NONE, Mark.NONE)
     assert fine.remark == "1 of 5 steps cached, with their time in run r0"
-
-
-def test_letters_go_on_behind_z() -> None:
-    assert [_letter(k) for k in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 
 
 def test_environments_and_data_have_letters_of_their_own() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +20,6 @@ from orthoflow.report.paired import (
     paired_differences,
 )
 from orthoflow.report.rankings import Sense
-from tests.report_runs import HeldRun, cell, record
 
 ALIKE = AlikeEnvironments(first={}, words={})
 
@@ -105,14 +103,6 @@ def test_methods_are_paired_at_the_value_that_both_sweep(
     assert module._alike(known, "first", "own") == partner
     assert module._alike(known, "first", "unheard-of") == "first"
     assert module._alike({"own": known["own"]}, "first", "own") == "first"
-
-
-def test_one_dataset_compares_nothing() -> None:
-    assert module.over_datasets({}) == ()
-    (cell_,) = swept_cells = [cell("plane@data=hall,plane=a")]
-    assert cell_.assignment["data"] == "hall"
-    alone = HeldRun(path=Path("run.h5"), record=record(swept_cells))
-    assert module.over_datasets({"hall": alone}) == ()
 
 
 def leading(n_methods: int, p: float) -> Any:
@@ -204,15 +194,6 @@ def test_what_differs_by_rounding_is_level_and_tests_nothing(
     assert math.isnan(found.p)
     assert math.isnan(found.effect)
     assert found.deciding == {}
-
-
-def test_rank_tests_leave_out_what_differs_by_rounding() -> None:
-    # Five that differ, all for the better, and three that would make p 0.0078 of 0.0625.
-    differing = [(1.0, 1.0 + 0.1 * k) for k in range(1, 6)]
-    found = pairs(Sense.LESS, *differing, *[(2.0, 2.0 + 1e-7)] * 3)
-    assert (found.n, found.wins, found.losses) == (8, 5, 0)
-    assert found.p == pytest.approx(0.0625)
-    assert found.effect == 1.0
 
 
 def test_more_than_rounding_and_every_count_is_a_difference() -> None:

@@ -17,7 +17,6 @@ from orthoflow.report import photo_plans as module
 from orthoflow.report.pages import write_page
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import wall_pictures
-from orthoflow.report.tables import Table
 from tests import samples
 from tests.report_runs import HeldRun, camera, cell, compared_run, given
 
@@ -191,15 +190,3 @@ def test_walls_and_photos_lie_in_metres_of_the_world() -> None:
     assert np.ptp(walls[1].corners_m, axis=0) == pytest.approx([0.0, 4.0], abs=1e-9)
     np.testing.assert_allclose([photo.foot_m for photo in photos], [[103.0, 194.0], [109.0, 197.0]])
     np.testing.assert_allclose([photo.look for photo in photos], [[0.0, 1.0], [-0.6, 0.8]])
-
-
-@pytest.mark.parametrize("n_photos", [1, 60, 61])
-def test_a_plan_of_any_number_of_photos_is_drawn(n_photos: int) -> None:
-    many = [
-        standing(f"{k}.jpg", 20.0 * (k % 6), 10.0 * (k // 6), (0.0, 1.0)) for k in range(n_photos)
-    ]
-    walls, photos = module._drawn(UP, many, WALLS)
-    table = Table(name="", caption="", head=(), rows=(), numeric=frozenset())
-    plan = module.PhotoPlan(walls=walls, photos=photos, caption="", cell="orient", table=table)
-    assert plan.file("png").startswith(b"\x89PNG")
-    assert plan.picture.uri.startswith("data:image/svg+xml;base64,")

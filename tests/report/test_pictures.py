@@ -21,7 +21,6 @@ from orthoflow.report.pictures import (
     depth_colours,
     embedded_products,
     orthoimage_pictures,
-    side_px,
     sliders,
     thumbnail,
     wall_pictures,
@@ -77,16 +76,6 @@ def run(
 
 
 # --- sizes ---
-
-
-@pytest.mark.parametrize(
-    ("n_pictures", "side"),
-    [(0, 1000), (1, 1000), (24, 1000), (25, 980), (96, 500), (234, 320), (10_000, 320)],
-)
-def test_two_dozen_pictures_are_large_and_more_share_their_bytes(
-    n_pictures: int, side: int
-) -> None:
-    assert side_px(n_pictures) == side
 
 
 def test_the_baseline_is_shown_down_to_its_cells() -> None:

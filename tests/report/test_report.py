@@ -18,17 +18,11 @@ from orthoflow.report import comparisons, write_figures, write_page, write_repor
 from orthoflow.report.combinations import Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns, comparison_table
 from orthoflow.report.figures import figure_groups
-from orthoflow.report.numbers import number_with_unit
-from orthoflow.report.overlays import residuals_on_wall
-from orthoflow.report.pictures import depth_colours
-from orthoflow.report.rankings import Mark, Sense, Value, rank
+from orthoflow.report.rankings import Mark, Sense, Value
 from orthoflow.report.rendering import cited
 from orthoflow.report.summaries import answers, citations, limits, results
 from tests.report_runs import (
-    FOCAL_PX,
-    FRAME,
     HeldRun,
-    camera,
     cell,
     compared_resolved,
     compared_run,
@@ -723,77 +717,6 @@ def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:
     assert [row.run for row in table.rows] == [
         f"toy <run> --set wall.n={walls}, {Path.cwd().name}, r{walls}" for walls in (1, 4)
     ]
-
-
-def test_a_value_within_the_spread_of_the_best_is_no_loser() -> None:
-    values = [
-        Value(text="a", sort=1.0, spread=0.2),
-        Value(text="b", sort=1.2, spread=0.1),
-        Value(text="c", sort=-3.0, spread=0.1),
-        Value(),
-    ]
-    marks = [value.mark for value in rank(values, Sense.LESS)]
-    assert marks == [Mark.NEAR, Mark.NEAR, Mark.WORST, Mark.NONE]
-
-
-def test_equal_values_have_no_winner() -> None:
-    values = [Value(text="a", sort=1.0), Value(text="b", sort=1.0)]
-    assert rank(values, Sense.MORE) == values
-
-
-def test_residuals_in_a_photo_become_lengths_on_the_wall() -> None:
-    points_world = FRAME.world_from_wall(np.array([[10.0, 10.0], [100.0, 70.0]]))
-    # The camera looks square at the wall from 2 m: 1 px is 2 m over the focal length.
-    residual_px = np.array([[1.0, 0.0], [0.0, -2.0]])
-    lengths_m = residuals_on_wall(camera(), points_world, residual_px, FRAME)
-    np.testing.assert_allclose(lengths_m, residual_px * 2.0 / FOCAL_PX, atol=1e-8)  # metres
-
-
-def test_depths_run_from_blue_over_white_to_red() -> None:
-    colours = depth_colours(np.array([[-1.0, 0.0, 1.0, 9.0, np.nan]], np.float32), 1.0)[0]
-    assert colours[0].tolist() == [33, 102, 172]
-    assert colours[1].tolist() == [247, 247, 247]
-    assert colours[2].tolist() == colours[3].tolist() == [178, 24, 43]
-    assert colours[4].tolist() == [247, 247, 247]
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "printed"),
-    [
-        (0.0123456, "mm", "0.01235 mm"),
-        (12.0, "1", "12"),
-        (0.0, "px", "0 px"),
-        (-3.5, "m", "-3.5 m"),
-    ],
-)
-def test_numbers_have_four_digits_and_their_unit(value: float, unit: str, printed: str) -> None:
-    assert number_with_unit(value, unit) == printed
-
-
-@pytest.mark.parametrize(
-    ("factor_u", "factor_v", "factor_cost", "n_told"), [(1, 1, 1, 4), (3, 1, 1, 3), (3, 3, 3, 1)]
-)
-def test_a_glance_says_in_how_many_numbers_nobody_leads(
-    factor_u: float, factor_v: float, factor_cost: float, n_told: int, tmp_path: Path
-) -> None:
-    cells = [
-        cell(
-            f"check@plane={name}{repeat}",
-            metrics=metrics(rmse_u_mm=u + 0.01 * len(repeat), rmse_v_mm=v + 0.01 * len(repeat)),
-            wall_s=cost,
-            peak_rss_mib=100.0 * cost,
-        )
-        for name, u, v, cost in (("fine", 1, 1, 1), ("coarse", factor_u, factor_v, factor_cost))
-        for repeat in ("", "#1")
-    ]
-    asked = compared_resolved("check.rmse_*")
-    told = (
-        f"; in {n_told} of them no combination leads (all are level, or cannot be ranked), which"
-        " counts for nobody"
-    )
-    write_report([run(*cells, workflow_resolved=asked)], tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert f"Numbers that have a good side: 4{told if n_told else ''}. " in page
 
 
 def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:

@@ -17,8 +17,8 @@ from orthoflow.report.combinations import (
     wanted_metrics,
 )
 from orthoflow.report.differences import Difference, ProductRow, differences
-from orthoflow.report.rankings import Sense, Value, badness, rank
-from orthoflow.report.summaries import Limit, answers, limits
+from orthoflow.report.rankings import Sense, Value, rank
+from orthoflow.report.summaries import answers
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -27,7 +27,6 @@ from tests.report_runs import (
     metric,
     metrics,
     record,
-    warned,
 )
 
 
@@ -86,22 +85,6 @@ def test_a_mean_is_printed_to_the_second_digit_of_its_spread(
     assert numbers.number_with_spread(value, spread) == printed
 
 
-@pytest.mark.parametrize(
-    ("seconds", "printed"),
-    [
-        (0.0, "0.00 s"),
-        (9.994, "9.99 s"),
-        (10.0, "10.0 s"),
-        (59.94, "59.9 s"),
-        (60.0, "1 min 00 s"),
-        (61.4, "1 min 01 s"),
-        (3725.0, "62 min 05 s"),
-    ],
-)
-def test_a_time_is_printed_in_seconds_or_minutes(seconds: float, printed: str) -> None:
-    assert numbers.seconds_in_words(seconds) == printed
-
-
 def test_numbers_may_have_fewer_digits() -> None:
     assert numbers.number(0.14151, significant=2) == "0.14"
     assert numbers.number_with_unit(0.14151, "m", significant=2) == "0.14 m"
@@ -123,20 +106,6 @@ def marks(sense: Sense, *values: tuple[float, ...], groups: str = "") -> list[st
     return [value.mark.name for value in found]
 
 
-def test_the_best_and_the_worst_are_marked() -> None:
-    assert marks(Sense.LESS, (2,), (-1,), (3,), (-3,)) == ["NONE", "BEST", "NONE", "NONE"]
-    assert marks(Sense.MORE, (2,), (-1,), (3,)) == ["NONE", "WORST", "BEST"]
-    assert marks(Sense.ONE, (2,), (0.9,), (0.0,), (4,)) == ["NONE", "BEST", "WORST", "NONE"]
-    assert marks(Sense.NEITHER, (2,), (-1,)) == ["NONE", "NONE"]
-    assert marks(Sense.LESS, (2,), (2,)) == ["NONE", "NONE"]
-    assert marks(Sense.LESS, (2,), (math.nan,)) == ["NONE", "NONE"]
-    assert marks(Sense.LESS, (2,), (math.nan,), (1,)) == ["WORST", "NONE", "BEST"]
-    assert marks(Sense.LESS, (1,), (2,), (3,), (4,), groups="abab") == [
-        *("BEST", "BEST"),
-        *("WORST", "WORST"),
-    ]
-
-
 def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
     # 3 and 4 in quadrature are 5.
     assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "NONE"]
@@ -150,63 +119,7 @@ def test_nothing_is_ranked_beside_a_single_run() -> None:
     assert marks(Sense.LESS, (2, 0.1), (9, 0.1)) == ["BEST", "WORST"]
 
 
-def test_badness_grows_as_values_get_worse() -> None:
-    assert badness(-2.0, Sense.LESS) == 2.0
-    assert badness(-2.0, Sense.MORE) == 2.0
-    assert badness(2.0, Sense.ONE) == badness(0.5, Sense.ONE) == math.log(2.0)
-    assert badness(0.0, Sense.ONE) == math.inf
-    with pytest.raises(ValueError, match="a metric without a good side cannot be ranked"):
-        badness(1.0, Sense.NEITHER)
-
-
 # --- combinations ---
-
-
-def test_parts_of_larger_combinations_are_no_rows_of_their_own() -> None:
-    cells = [
-        cell("scan"),
-        cell("plane@plane=a", metrics=metrics(rms_mm=1.0)),
-        cell("plane@plane=a#1", metrics=metrics(rms_mm=4.0)),
-        cell("plane@plane=b", status="failed"),
-        cell("orient@plane=a,orient=c"),
-        cell("orient@plane=a,orient=d", status="failed"),
-        cell("orient@plane=a,orient=d#1", status="failed"),
-        cell("orient@plane=a,orient=d#2", status="failed"),
-    ]
-    found = combinations_of(run(*cells, workflow_resolved=compared_resolved("*.wall_s", "a.b")))
-    assert [one.name for one in found] == [
-        "plane=b",
-        "plane=a, orient=c",
-        "plane=a, orient=d",
-    ]
-    failed, good, bad = found
-    assert [one.is_baseline for one in found] == [False, False, False]
-    assert failed.failure is not None
-    assert failed.failure.address == "plane@plane=b"
-    assert good.failure is None
-    assert bad.failure is not None
-    assert bad.failure.address == "orient@plane=a,orient=d"
-    assert (good.n_failed_repeats, bad.n_failed_repeats) == (0, 2)
-    assert [item.address for item in good.cells] == [
-        *("scan", "plane@plane=a", "plane@plane=a#1"),
-        "orient@plane=a,orient=c",
-    ]
-    assert [item.address for item in good.varied_cells] == [
-        "plane@plane=a",
-        "orient@plane=a,orient=c",
-    ]
-    measured = good.measured("plane", "rms_mm")
-    assert measured is not None
-    assert (measured.value, measured.n_repeats, measured.unit) == (2.5, 2, "mm")
-    assert measured.spread == pytest.approx(3.0 / math.sqrt(2.0), rel=1e-12)
-    once = good.measured("plane", "wall_s")
-    assert once is not None
-    assert (once.value, once.spread, once.unit) == (1.0, 0.0, "s")
-    single = good.measured("orient", "wall_s")
-    assert single is not None
-    assert math.isnan(single.spread)
-    assert good.measured("plane", "other") is None
-    assert good.measured("scan", "rms_mm") is None
 
 
 def test_the_baseline_is_what_the_workflow_says() -> None:
@@ -225,21 +138,6 @@ def test_the_baseline_is_what_the_workflow_says() -> None:
 
 
 # --- what the first screen says ---
-
-
-def test_limits_name_all_cells_that_say_the_same() -> None:
-    told = run(
-        cell("plane@plane=coarse", **warned("odd", "few points")),
-        cell("plane@plane=fine", **warned("few points")),
-        cell("plane@plane=bad", status="failed", error_message="no plane"),
-        cell("plane@plane=worse", status="failed", error_message="no plane", **warned("odd")),
-        workflow_resolved=compared_resolved(),
-    )
-    assert limits(told) == (
-        Limit(text="no plane", cells=("plane@plane=bad", "plane@plane=worse"), is_failure=True),
-        Limit(text="few points", cells=("plane@plane=fine", "plane@plane=coarse")),
-        Limit(text="odd", cells=("plane@plane=coarse", "plane@plane=worse")),
-    )
 
 
 # --- differences ---
