@@ -7,22 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import cell_errors
 from orthoflow_plugins.inspect.cell_errors import (
-    BLOCK_CELLS,
     Sampling,
     WallSamples,
-    _gross_colours,
-    _inner,
-    _shifts,
     depth_step_band,
     sample_findings,
-    sampling,
-    sampling_rule,
     wall_errors,
 )
 from orthoflow_plugins.inspect.findings import pooled
-from scipy.ndimage import gaussian_filter
 
 from orthoflow.geometry import frame_over
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask
@@ -39,58 +31,6 @@ def image(mask: np.ndarray) -> Orthoimage:
         mask=mask.astype(np.uint8),
         sources=("photo",),
     )
-
-
-def test_a_small_wall_is_compared_whole() -> None:
-    wall = image(np.full((130, 250), OrthoMask.PAINTED))
-    rule = sampling_rule([wall], colour_cells_most=32_500, seen_cells_most=32_500)
-    chosen = sampling(wall, rule, 0)
-    assert chosen.coloured.all()
-    assert chosen.lattice.all()
-
-
-@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
-def test_a_large_wall_is_compared_evenly(share: float) -> None:
-    side = 40 * BLOCK_CELLS
-    walls = [image(np.full((side, side), OrthoMask.PAINTED))] * 2
-    most = round(2 * share * side**2)
-    rule = sampling_rule(walls, colour_cells_most=most, seen_cells_most=most)
-    chosen = sampling(walls[0], rule, 0)
-    blocks = chosen.coloured.reshape(40, BLOCK_CELLS, 40, BLOCK_CELLS)
-    np.testing.assert_array_equal(blocks.any(axis=(1, 3)), blocks.all(axis=(1, 3)))
-    # Every tenth of the wall has its share of blocks, but for a few of them.
-    tenths = blocks[:, 0, :, 0].reshape(4, 10, 10, 4).mean(axis=(1, 3))
-    np.testing.assert_allclose(tenths, share, atol=0.08)
-    assert chosen.coloured.mean() == pytest.approx(share, rel=0.05)
-    rows, columns = np.nonzero(chosen.lattice)
-    steps = {int(step) for axis in (rows, columns) for step in np.diff(np.unique(axis))}
-    assert steps == {rule.lattice_step}
-    assert share / 3 < chosen.lattice.mean() <= share
-
-
-@pytest.mark.parametrize("n_blocks", [1, 2, 3])
-def test_a_part_of_a_wall_is_compared_where_the_whole_is(n_blocks: int) -> None:
-    mask = np.full((6 * BLOCK_CELLS + 17, 7 * BLOCK_CELLS), OrthoMask.PAINTED)
-    mask[:40] = OrthoMask.NONE
-    whole = image(mask)
-    rule = sampling_rule([whole], colour_cells_most=mask.size // 3, seen_cells_most=mask.size // 50)
-    chosen = sampling(whole, rule, 0)
-    for first in range(0, len(mask), n_blocks * BLOCK_CELLS):
-        rows = slice(first, first + n_blocks * BLOCK_CELLS)
-        part = sampling(image(mask[rows]), rule, first)
-        np.testing.assert_array_equal(part.coloured, chosen.coloured[rows])
-        np.testing.assert_array_equal(part.lattice, chosen.lattice[rows])
-    assert 0 < chosen.lattice.sum() < mask.size / 40
-    assert 0.2 < chosen.coloured.mean() < 0.45
-
-
-def test_what_shows_nothing_has_no_colours_to_compare() -> None:
-    mask = np.full((3 * BLOCK_CELLS, 3 * BLOCK_CELLS), OrthoMask.NONE)
-    mask[5, 5], mask[BLOCK_CELLS + 5, 2 * BLOCK_CELLS + 5] = OrthoMask.PAINTED, OrthoMask.FILLED
-    wall = image(mask)
-    rule = sampling_rule([wall], colour_cells_most=1_000_000, seen_cells_most=1_000_000)
-    coloured = sampling(wall, rule, 0).coloured[::BLOCK_CELLS, ::BLOCK_CELLS]
-    np.testing.assert_array_equal(coloured, [[1, 0, 0], [0, 0, 1], [0, 0, 0]])
 
 
 # --- errors of cells ---
@@ -258,86 +198,3 @@ def test_patches_further_off_than_the_rest_are_displaced() -> None:
         cells = np.vstack([spread, [far, 0.0]])
         found = numbers_of(samples_of(shift_cells=cells, shift_m=0.01 * cells))
         assert found["displaced_share"] == pytest.approx(share, abs=1e-9), far
-
-
-@pytest.mark.parametrize(("others", "n_patches"), [(OrthoMask.FILLED, 4), (OrthoMask.NONE, 0)])
-def test_patches_are_measured_between_scattered_cells_of_filled_colours(
-    others: OrthoMask, n_patches: int
-) -> None:
-    """Whose surface is shown; what nothing shows is a rim, about which smoothing leans."""
-    rng = np.random.default_rng(5)
-    rgb = gaussian_filter(rng.uniform(0.0, 255.0, (64, 65, 3)), (1.5, 1.5, 0.0))
-    mask = np.where(rng.random((64, 64)) < 0.4, others, OrthoMask.PAINTED).astype(np.uint8)
-    image_: Any = SimpleNamespace(rgb=np.rint(rgb[:, :-1]).astype(np.uint8), mask=mask)
-    true: Any = SimpleNamespace(rgb=rgb[:, 1:], frame=SimpleNamespace(gsd_m=0.004))
-    found = _shifts(image_, true, np.ones((64, 64), dtype=np.bool_))
-    assert len(found.centre) == n_patches
-    # The image shows everything a cell further to the right than it is.
-    np.testing.assert_allclose(found.shift, np.tile([1.0, 0.0], (n_patches, 1)), atol=0.05)
-
-
-@pytest.mark.parametrize(("rise_m", "is_step"), [(0.0035, False), (0.0045, True)])
-def test_a_joint_is_no_step_and_a_ledge_of_half_a_centimetre_is(
-    rise_m: float, is_step: bool
-) -> None:
-    depth_m = np.zeros((9, 12), dtype=np.float32)
-    depth_m[:, 6:] = rise_m
-    band = np.zeros((9, 12), dtype=np.bool_)
-    band[:, 4:8] = is_step
-    np.testing.assert_array_equal(depth_step_band(depth_m), band)
-    np.testing.assert_array_equal(depth_step_band(depth_m.T), band.T)
-
-
-def test_one_cell_is_enough_for_one_that_is_asked_for() -> None:
-    mask = np.full((8, 8), OrthoMask.NONE)
-    mask[2, 3] = OrthoMask.PAINTED
-    rule = sampling_rule([image(mask)], colour_cells_most=1, seen_cells_most=16)
-    assert (rule.colour_share, rule.lattice_step) == (1.0, 2)
-
-
-@pytest.mark.parametrize(("gsd_m", "reach"), [(0.01, 3), (0.0041, 5), (0.002, 8)])
-def test_patches_are_looked_for_two_centimetres_off_within_three_to_eight_cells(
-    gsd_m: float, reach: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def measure(*_images: object, reach_cells: int) -> None:
-        asked.append(reach_cells)
-
-    monkeypatch.setattr(cell_errors, "measure_shifts", measure)
-    image_, _, true = scene()
-    true.frame = SimpleNamespace(gsd_m=gsd_m)
-    _shifts(image_, true, true.rectangle >= 0)
-    assert asked == [reach]
-
-
-def test_colours_are_gross_that_no_true_colour_within_a_cell_is_near() -> None:
-    rgb = np.zeros((5, 20, 3), dtype=np.float32)
-    rgb[:, 10:] = 200.0
-    rgb[:, 18:] = np.nan
-    true: Any = SimpleNamespace(rgb=rgb)
-    for value, on_dark, on_bright in (
-        (0, False, True), (40, False, True), (41, True, True),
-        (159, True, True), (160, True, False), (200, True, False),
-    ):  # fmt: skip
-        shown: Any = SimpleNamespace(rgb=np.full((5, 20, 3), value, dtype=np.uint8))
-        expected = np.zeros((5, 18), dtype=np.bool_)
-        # Beside the edge both are near.
-        expected[:, :9], expected[:, 11:] = on_dark, on_bright
-        np.testing.assert_array_equal(_gross_colours(shown, true)[:, :18], expected)
-
-
-def test_colours_are_judged_where_those_about_them_are_known_too() -> None:
-    coloured = np.zeros((6, 10), dtype=np.bool_)
-    coloured[:, :5] = True
-    known = np.ones((6, 10), dtype=np.bool_)
-    known[3:, 5:] = False
-    expected = coloured.copy()
-    # Beside the fifth column lies what is known and was not asked for, in the first three rows.
-    expected[:4, 4] = False
-    np.testing.assert_array_equal(_inner(coloured, known), expected)
-
-
-def test_a_deviation_of_nothing_states_nothing() -> None:
-    samples = samples_of(depth_m=np.array([0.001, 0.0]), sigma_m=np.array([0.0, 0.001]))
-    assert numbers_of(samples)["depth_within_3sigma"] == 1.0

@@ -101,23 +101,6 @@ def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
     }
 
 
-def test_each_point_is_told_the_farthest_off_first(tmp_path: Path) -> None:
-    said: list[str] = []
-    walls = inspect_scenes.walls()
-    assert GSD_M == 0.004
-    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0]])
-    off = np.array([[1.0, 0.25], [0.25, -2.0], [-0.5, 0.25]])
-    points = points_at(walls.walls[0].frame.world_from_wall(places), pixels=places + off)
-    ctx = replace(context(tmp_path), listen=lambda event: said.append(event.text))
-    inputs = InspectCheckpoints.In(checkpoints=points, walls=walls)
-    InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
-    assert [text for text in said if text.startswith("check point ")] == [
-        "check point P1: u +1.00 mm, v -8.00 mm",
-        "check point P0: u +4.00 mm, v +1.00 mm",
-        "check point P2: u -2.00 mm, v +1.00 mm",
-    ]
-
-
 def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     frame = walls.walls[0].frame
@@ -363,71 +346,6 @@ def test_points_are_measured_without_memory_per_cell(
     finally:
         tracemalloc.stop()
     assert metrics["mean_x_mm"] == pytest.approx(0.25e3 * GSD_M)
-
-
-def test_the_log_names_the_points_that_are_furthest_off_and_not_thousands(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    told: list[str] = []
-    monkeypatch.setattr(ctx, "log", told.append)
-    shift_m = np.column_stack([1e-5 * np.arange(300), np.full(300, -1e-3)])
-    checkpoints._tell(shift_m, [f"p{k}" for k in range(300)], ctx)
-    assert len(told) == 200
-    assert told[0] == "check point p299: u +2.99 mm, v -1.00 mm"
-    assert told[-1].startswith("check point p100: ")
-
-
-def test_a_point_that_is_not_found_has_no_place_in_the_table() -> None:
-    gone, found = (
-        ShownPoint(
-            how=how,
-            wall=wall,
-            expected=np.array([10.0, 20.0]),
-            place=np.array(place),
-            point_world=np.full(3, np.nan),
-        )
-        for how, wall, place in (
-            ("not found", 0, [np.nan, 5.0]),
-            ("target", 2, [11.25, 19.5]),
-        )
-    )
-    surveyed = CheckPoints(
-        names=("a", "b"),
-        points_world=np.zeros((2, 3)),
-        classes=("wall", "niche"),
-        wall=np.array([0, 2], dtype=np.int32),
-        pixels_wall=np.zeros((2, 2)),
-    )
-    rows = checkpoints._table([gone, found], surveyed, {0: 0.01, 2: 0.004}, {0: 7, 2: 9})
-    assert rows == [
-        {"name": "a", "class": "wall", "how": "not found"},
-        {
-            "name": "b",
-            "class": "niche",
-            "how": "target",
-            "wall": 9,
-            "u_px": 11.25,
-            "v_px": 19.5,
-            # 4 mm a cell.
-            "x_mm": 5.0,
-            "y_mm": -2.0,
-        },
-    ]
-
-
-def test_classes_are_told_apart_where_there_is_more_than_one() -> None:
-    shift_m = np.array([[0.001, 0.0], [0.003, 0.0]])
-
-    def prefixes(*classes: str) -> set[str]:
-        names = [item.name for item in checkpoints._findings(shift_m, classes, 0.004)]
-        return {name.removesuffix("n_found") for name in names if name.endswith("n_found")}
-
-    assert prefixes("", "") == prefixes("a", "a") == {""}
-    assert prefixes("a", "") == {"", "a_"}
-    assert prefixes("A (high)", "b") == {"", "a_high_", "b_"}
-    found = {item.name: item.value for item in checkpoints._findings(shift_m, ("a", "b"), 0.004)}
-    assert (found["a_rms_mm"], found["b_rms_mm"]) == (pytest.approx(1.0), pytest.approx(3.0))
 
 
 def shown_at(wall: int, place: list[float], point_world: list[float]) -> ShownPoint:

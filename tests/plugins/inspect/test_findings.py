@@ -91,23 +91,6 @@ def test_a_scale_shows_in_every_length_and_a_shift_in_none() -> None:
     assert length_findings(places_m[:1], shift_m[:1], wall[:1]) == []
 
 
-def test_a_cap_that_binds_is_told_in_the_name() -> None:
-    """Lengths of two kinds: the iterated rule goes on until its cap, the plain one does not."""
-    two_kinds = np.append(np.full(40, 0.1), np.linspace(1.0, 2.0, 28))
-    shift_m = 1e-3 * two_kinds[:, None] * np.array([0.6, 0.8])
-    found = {item.name: item.value for item in check_findings(shift_m, 0.004, prefix="all_")}
-    rms = np.sqrt((two_kinds**2).mean())
-    assert found["all_n_outliers_once"] == np.count_nonzero(two_kinds > 2.0 * rms)
-    assert found["all_n_outliers_iterated_capped"] == 17
-    left = np.sort(two_kinds)[:-17]
-    assert found["all_rms_after_iterated_capped_mm"] == pytest.approx(np.sqrt((left**2).mean()))
-    assert "all_n_outliers_iterated" not in found
-    # More than the cap would be found, but the rule ends before it: nothing was cut off.
-    few = np.array([3.0, *np.linspace(1.0, 1.2, 17), *np.linspace(0.05, 0.1, 19)])
-    numbers = {item.name: item.value for item in check_findings(few[:, None] * [0.6, 0.8], 0.004)}
-    assert numbers["n_outliers_iterated"] == 1
-
-
 def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: Path) -> None:
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
 
@@ -128,22 +111,3 @@ def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: P
         "n_photos": 6.0,
     }
     assert {metric.unit for metric in ctx.metrics} == {"mm"}
-
-
-def test_of_very_many_points_of_a_wall_an_even_part_says_all_about_lengths() -> None:
-    places_m = np.random.default_rng(3).uniform(0.0, 8.0, (2_500, 2))
-    wall = np.zeros(2_500, dtype=np.int32)
-    found = {item.name: item.value for item in length_findings(places_m, 0.002 * places_m, wall)}
-    assert found["length_error_rms_share"] == pytest.approx(0.002)
-    # Of three million pairs.
-    assert found["n_lengths"] < 1_000_000
-
-
-def test_lengths_of_centimetres_are_judged_as_those_of_metres() -> None:
-    places_m = np.random.default_rng(4).uniform(0.0, 5.0, (20, 2))
-    wall = np.zeros(20, dtype=np.int32)
-    large, small = (
-        {item.name: item.value for item in length_findings(places, 0.002 * places, wall)}
-        for places in (places_m, 0.01 * places_m)
-    )
-    assert small == pytest.approx(large)

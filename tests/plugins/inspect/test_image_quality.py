@@ -7,19 +7,16 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect import image_quality
 from orthoflow_plugins.inspect.image_quality import (
-    OrthoimageGrey,
     cells_per_pixel,
     completeness,
     quality_findings,
     sharpness_findings,
-    stretch_findings,
 )
 from orthoflow_plugins.inspect.patches import GreyImage
 from scipy.special import erf
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Orthoimage, OrthoMask, Wall, is_shown
-from orthoflow.testing import photographed as ms
+from orthoflow.products import Orthoimage, OrthoMask, Wall
 from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -42,42 +39,6 @@ def numbers(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -
     return {item.name: item.value for item in sharpness_findings(image, 3)}
 
 
-@pytest.mark.parametrize(("rows", "is_told"), [(19, False), (20, True)])
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_twenty_edges_tell_how_sharp_an_image_is(rows: int, is_told: bool, turns: int) -> None:
-    found = numbers(np.rot90(edge(rows), turns))
-    assert bool(found) == is_told
-    if is_told:
-        assert found["n_edges"] == rows
-        # From 10 to 90 % of a Gaussian; its MTF halves at sqrt(ln 2 / 2) / pi.
-        assert found["edge_width_cells"] == pytest.approx(2.563, rel=0.03)
-        assert found["mtf50_per_cell"] == pytest.approx(0.1874, rel=0.03)
-
-
-@pytest.mark.parametrize(("contrast", "is_told"), [(29.5, False), (30.5, True), (-30.5, True)])
-def test_paler_edges_than_thirty_grey_levels_tell_nothing(contrast: float, is_told: bool) -> None:
-    assert bool(numbers(edge(contrast=contrast))) == is_told
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize(("slope", "is_told"), [(5.9, True), (6.9, False)])
-def test_either_side_of_an_edge_is_even_to_a_seventh(
-    side: int, slope: float, is_told: bool
-) -> None:
-    # From three cells off on grey changes, by 2.75 cells' worth within what is looked at.
-    off = np.arange(61) - EDGE
-    grey = edge() + slope * side * np.clip(side * off - 4.0, 0.0, None)
-    assert bool(numbers(grey)) == is_told
-
-
-@pytest.mark.parametrize(("reach", "is_told"), [(7, False), (8, True)])
-def test_edges_lie_eight_cells_from_what_is_not_known(reach: int, is_told: bool) -> None:
-    valid = np.zeros((40, 61), dtype=np.bool_)
-    valid[:, EDGE - reach : EDGE + reach + 1] = True
-    found = numbers(np.where(valid, edge(), 0.0), valid)
-    assert bool(found) == is_told
-
-
 def image(
     mask: NDArray[np.uint8], rgb: NDArray[np.uint8] | None = None, **known: object
 ) -> Orthoimage:
@@ -96,18 +57,6 @@ def masked() -> NDArray[np.uint8]:
 def wall(depth_m: NDArray[np.float32] | None = None) -> Wall:
     plain = np.zeros(FRAME.shape, dtype=np.float32)
     return samples.wall(FRAME, depth_m=plain if depth_m is None else depth_m)
-
-
-def test_what_is_shown_is_painted_or_filled_and_the_rest_is_black() -> None:
-    rgb = np.full((*FRAME.shape, 3), 200, dtype=np.uint8)
-    rgb[..., 1] = 100
-    made = image(masked(), rgb)
-    np.testing.assert_array_equal(is_shown(made.mask)[:, 0], np.arange(SIDE) < 7)
-    grey = OrthoimageGrey(made).cut((slice(0, SIDE), slice(0, SIDE)))
-    np.testing.assert_array_equal(grey.valid, is_shown(made.mask))
-    expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 200
-    np.testing.assert_allclose(grey.grey[:7], expected, atol=0.01)
-    assert not grey.grey[7:].any()
 
 
 def test_completeness_is_of_the_scanned_surface() -> None:
@@ -137,25 +86,6 @@ def camera(cells_across: float, cells_down: float) -> ViewingCamera:
     return samples.camera(looking_at(centre, middle, UP), centre, fx=fx, fy=fy, **lens)
 
 
-@pytest.mark.parametrize(
-    ("across", "down", "stretched", "smeared"),
-    [
-        (1.9, 1.0, 0.0, 0.0),
-        (2.1, 1.0, 1.0, 0.0),
-        (1.0, 2.1, 1.0, 0.0),
-        (4.9, 0.2, 1.0, 0.0),
-        (5.1, 5.0, 1.0, 1.0),
-    ],
-)
-def test_pixels_wider_than_two_cells_are_stretched_and_than_five_smeared(
-    across: float, down: float, stretched: float, smeared: float
-) -> None:
-    painted = np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8)
-    cameras = ms.cameras(ms.oriented(camera(across, down), name="a.jpg"))
-    found = {f.name: f.value for f in stretch_findings(image(painted), wall(), cameras)}
-    assert found == {"stretch_share": stretched, "smear_share": smeared}
-
-
 def test_only_cells_that_a_photo_painted_are_asked() -> None:
     mask = masked()
     source = np.zeros(FRAME.shape, dtype=np.int16)
@@ -175,16 +105,6 @@ def test_an_edge_is_looked_at_as_far_on_either_side_of_it() -> None:
     np.testing.assert_allclose(np.diff(image_quality._ALONG), np.diff(image_quality._ALONG)[0])
 
 
-def test_shares_of_a_single_cell_are_whole() -> None:
-    mask = np.full(FRAME.shape, OrthoMask.NO_SURFACE, dtype=np.uint8)
-    mask[3, 4] = OrthoMask.FILLED
-    depth = np.full(FRAME.shape, np.nan, dtype=np.float32)
-    depth[3, 4] = 0.0
-    found = {f.name: f.value for f in quality_findings(image(mask), wall(depth), None)}
-    assert found == {"filled_share": 1.0}
-    assert completeness(image(mask), wall(depth)).value == 1.0
-
-
 @pytest.mark.parametrize(
     ("first", "last", "is_told"), [(0.09, 0.91, True), (0.11, 0.91, False), (0.09, 0.89, False)]
 )
@@ -195,25 +115,6 @@ def test_a_spread_that_begins_or_ends_grey_tells_nothing(
     ramp[0], ramp[-1] = first, last
     monkeypatch.setattr(image_quality, "_edge_profiles", lambda _: np.tile(ramp, (20, 1)))
     assert bool(numbers(edge())) == is_told
-
-
-def test_four_hundred_edges_are_enough() -> None:
-    assert numbers(edge(430))["n_edges"] == 400
-
-
-def test_depths_beyond_the_wall_are_not_known() -> None:
-    frame = samples.facing_south(GSD_M, 4, 3)
-    depth = np.arange(12, dtype=np.float32).reshape(3, 4)
-    rows, columns = (axis.ravel() for axis in np.mgrid[-1:4, -1:5])
-    found = image_quality._depth_at(samples.wall(frame, depth_m=depth), rows, columns)
-    padded = np.pad(depth.astype(np.float64), 1, constant_values=np.nan)
-    np.testing.assert_array_equal(found.reshape(5, 6), padded)
-
-
-def test_where_nothing_is_shown_there_are_no_profiles() -> None:
-    nowhere = np.zeros((40, 61), dtype=np.bool_)
-    image = GreyImage(grey=edge(), valid=nowhere, region=nowhere)
-    assert image_quality._edge_profiles(image).shape == (0, image_quality._ALONG.size)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1)])

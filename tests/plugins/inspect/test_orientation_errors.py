@@ -11,11 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
-    _angle_deg,
     _error_on_walls,
-    _on_walls,
     most_shown,
-    pose_details,
     pose_findings,
     tie_errors_cells,
     tie_findings,
@@ -26,7 +23,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import TieRole
-from tests import samples, scenes
+from tests import samples
 
 # Walls at y = 4, seen from the south.
 GSD_M: Final = 0.01
@@ -95,65 +92,12 @@ def test_errors_of_poses_are_summed_up_over_those_called_ok() -> None:
     assert findings_of([]).keys() == {"n_photos", "n_oriented", "n_misoriented"}
 
 
-def test_details_of_poses_are_in_millimetres_and_know_no_infinity() -> None:
-    details: Any = pose_details(ERRORS)
-    assert details[0] == {
-        "photo": "a", "status": "ok", "centre_mm": pytest.approx(1.0), "rotation_deg": 0.1,
-        "wall_mm": pytest.approx(2.0), "sigma_wall_mm": pytest.approx(1.0),
-    }  # fmt: skip
-    assert details[3]["wall_mm"] is None
-    assert details[5] == {
-        "photo": "b", "status": "few ties", "centre_mm": None, "rotation_deg": None,
-        "wall_mm": None, "sigma_wall_mm": None,
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("angle_deg", [0.0, 1e-7, 0.3, 40.0, 120.0, 180.0])
-def test_the_angle_between_orientations_is_that_of_the_rotation(angle_deg: float) -> None:
-    rotation = scenes.rotation_about(np.array([0.48, -0.6, 0.64]), angle_deg)
-    assert _angle_deg(rotation) == pytest.approx(angle_deg, abs=1e-12, rel=1e-9)
-
-
 # --- on the walls ---
 
 
 def one_wall(frame: WallFrame, *, front_m: float, behind_m: float) -> Any:
     slab = Slab(frame=frame, front_m=front_m, behind_m=behind_m)
     return SimpleNamespace(walls=(SimpleNamespace(frame=frame),), slab=lambda _: slab)
-
-
-def test_points_on_a_wall_lie_in_its_raster_and_buffer_on_a_surface_that_faces_as_it() -> None:
-    scene: Any = SimpleNamespace(
-        origin=np.array([10.0, 20.0, 30.0]),
-        # As the wall, turned round, leaning by 30 degrees, across.
-        normal=np.array([[0, -1.0, 0], [0, 1.0, 0], [0, -0.866, 0.5], [1.0, 0, 0]]),
-    )
-    frame = frame_at(9.0, 31.0, depth_m=24.0)
-    walls = one_wall(frame, front_m=0.5, behind_m=0.2)
-    # (x, y, z, rectangle, whether on the wall), relative to the scene's origin.
-    cases = [
-        (0.0, 4.0, 0.0, 0, True),
-        (0.0, 4.0, 0.0, 1, True),
-        (0.0, 4.0, 0.0, 2, False),
-        (0.0, 4.0, 0.0, 3, False),
-        (0.0, 4.0, 0.0, -1, False),
-        (-0.99, 4.0, 0.0, 0, True),
-        (-1.01, 4.0, 0.0, 0, False),
-        (0.99, 4.0, 0.0, 0, True),
-        (1.01, 4.0, 0.0, 0, False),
-        (0.0, 4.0, 0.99, 0, True),
-        (0.0, 4.0, 1.01, 0, False),
-        (0.0, 4.0, -0.99, 0, True),
-        (0.0, 4.0, -1.01, 0, False),
-        (0.0, 3.51, 0.0, 0, True),
-        (0.0, 3.49, 0.0, 0, False),
-        (0.0, 4.19, 0.0, 0, True),
-        (0.0, 4.21, 0.0, 0, False),
-    ]
-    seen: Any = SimpleNamespace(
-        points=np.array([case[:3] for case in cases]), rectangle=np.array([c[3] for c in cases])
-    )
-    np.testing.assert_array_equal(_on_walls(seen, walls, scene), [case[4] for case in cases])
 
 
 def no_rays(_: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -208,21 +152,6 @@ def test_a_photo_shows_most_of_the_nearest_wall_that_faces_it() -> None:
     assert most_shown(camera, []) == -1
 
 
-@pytest.mark.parametrize(("share", "nearest"), [(0.45, False), (0.55, True)])
-def test_the_wall_with_more_than_half_of_the_photo_is_shown_most(
-    share: float, nearest: bool
-) -> None:
-    """A square of so large a share of the photo, before a wall that fills the rest."""
-    camera = camera_at(np.array([0.0, 1.0, 0.0]))
-    half_m = 2.0 * math.sqrt(share * (500.0 / 800.0) * (400.0 / 820.0))
-    square = frame_at(-half_m, half_m, depth_m=3.0, size_m=2.0 * half_m)
-    walls: Any = [
-        SimpleNamespace(frame=square),
-        SimpleNamespace(frame=frame_at(-9.0, 9.0, depth_m=5.0, size_m=18.0)),
-    ]
-    assert most_shown(camera, walls) == (0 if nearest else 1)
-
-
 # --- ties ---
 
 
@@ -249,17 +178,6 @@ def ties_off(
     return ties, walls, SimpleNamespace(cameras=SimpleNamespace(cameras=(of_truth,)))
 
 
-def test_ties_are_off_by_the_place_that_their_pixel_looks_at() -> None:
-    off_m = GSD_M * np.array([[0.0, 0.0], [3.0, 0.0], [0.0, -4.0], [0.3, 0.4]])
-    role = np.full(4, TieRole.CONTROL, dtype=np.uint8)
-    ties, walls, truth = ties_off(off_m, role, np.zeros(4, dtype=np.int32))
-    ties.points_world[3] = (0.0, -5.0, 0.0)
-    errors = tie_errors_cells(ties, walls, truth)
-    np.testing.assert_allclose(errors[:3], [0.0, 3.0, 4.0], atol=1e-9)
-    # The true camera does not look there at all.
-    assert errors[3] == math.inf
-
-
 def test_wrong_ties_are_told_of_all_and_of_those_kept() -> None:
     lengths = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 9.0])
     role = np.full(6, TieRole.CONTROL, dtype=np.uint8)
@@ -277,16 +195,6 @@ def test_wrong_ties_are_told_of_all_and_of_those_kept() -> None:
         "tie_wrong_share": pytest.approx(2.0 / 5.0),
         "tie_error_median_cells": pytest.approx(1.0, abs=1e-9),
     }
-
-
-def test_ties_with_other_walls_than_these_are_not_judged() -> None:
-    role = np.full(2, TieRole.CONTROL, dtype=np.uint8)
-    for wall in ([0, 2], [-1, 0]):
-        ties, walls, truth = ties_off(np.zeros((2, 2)), role, np.array(wall, dtype=np.int32))
-        cameras: Any = SimpleNamespace(ties=ties)
-        assert tie_findings(cameras, walls, truth) == []
-    nobody: Any = SimpleNamespace(ties=None)
-    assert tie_findings(nobody, walls, truth) == []
 
 
 def test_ties_that_nobody_kept_have_no_errors_of_their_own() -> None:

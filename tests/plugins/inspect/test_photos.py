@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import truth as truth_module
-from orthoflow_plugins.inspect.orientation_errors import most_shown
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, Viewers, render_frame
 from orthoflow.products import (
@@ -27,7 +24,6 @@ from orthoflow.products import (
     Truth,
 )
 from orthoflow.sdk import StepContext
-from orthoflow.testing import photographed as ms
 from tests import samples, scenes
 from tests.inspecting import BUFFER_M, inspect
 
@@ -222,16 +218,6 @@ def test_a_cell_painted_from_the_object_is_a_ghost(tmp_path: Path, truth: Truth)
     assert metrics["nmad_u_mm"] < 1e-3
 
 
-def test_a_cell_left_out_lowers_the_completeness(tmp_path: Path, truth: Truth) -> None:
-    fair = painted(truth)
-    mask = fair.mask.copy()
-    mask[:, : mask.shape[1] // 2] = OrthoMask.NONE
-    metrics, _, _ = inspect_cameras(
-        tmp_path, truth, true_cameras(truth), image=replace(fair, mask=mask)
-    )
-    assert metrics["completeness_seen_by_both"] == pytest.approx(0.5, abs=0.1)
-
-
 def test_a_stated_sigma_is_compared_with_the_error(tmp_path: Path, truth: Truth) -> None:
     frame = rendered(truth).frame
     shift = 0.003 * (frame.u_world + frame.v_world)
@@ -321,51 +307,9 @@ def test_ties_are_wrong_beyond_one_and_a_half_cells(tmp_path: Path, truth: Truth
     assert metrics["tie_error_median_cells"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_photo_is_of_the_wall_that_covers_most_of_it() -> None:
-    scene = ms.textured_wall(0)
-    behind = ms.textured_wall(0, origin_world=np.add(scene.frame.origin_world, [0.8, 1.0, 0.0]))
-    walls = [*ms.walls_of(behind).walls, *ms.walls_of(scene).walls]
-    camera = ms.camera_before(scene)
-    assert most_shown(camera, walls) == 1
-    # The rest of the wall behind shows to the right of the one before it.
-    to_the_right = ms.camera_before(scene, centre=(3.2, -1.0, 1.0), towards=(3.5, 0.0, 1.0))
-    assert most_shown(to_the_right, walls) == 0
-    away = ms.camera_before(scene, towards=(1.2, -5.0, 1.1))
-    assert most_shown(away, walls) == -1
-
-
 def test_cameras_of_other_photos_are_refused(tmp_path: Path, truth: Truth) -> None:
     stranger = Cameras(cameras=(replace(true_cameras(truth).cameras[0], photo="holiday.jpg"),))
     with pytest.raises(
         MethodError, match=r"the truth holds no photo holiday\.jpg, it has 6 photos"
     ):
         inspect_cameras(tmp_path, truth, stranger)
-
-
-def test_bands_of_a_large_wall_say_what_the_whole_does(
-    tmp_path: Path, truth: Truth, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    off = np.array([0.012, 0.0, -0.007])
-    cameras = true_cameras(truth)
-    some = replace(cameras, cameras=tuple(moved(camera, off) for camera in cameras.cameras))
-    folders = [tmp_path / name for name in ("whole", "bands")]
-    for folder in folders:
-        folder.mkdir()
-    metrics, whole, context = inspect_cameras(folders[0], truth, some, lift_m=0.002)
-    assert metrics["n_traced"] > 10_000
-    assert metrics["n_patches"] >= 5
-    monkeypatch.setattr(truth_module, "_BAND_CELLS", 1000)
-    monkeypatch.setattr(truth_module, "_DRAWN_CELLS", max(rendered(truth).frame.shape) // 2)
-    assert len([*truth_module._bands(painted(truth))]) == 2
-    told, banded, other = inspect_cameras(folders[1], truth, some, lift_m=0.002)
-    assert told.keys() == metrics.keys()
-    for name, value in metrics.items():
-        assert told[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
-    # Which cells the drawings take may differ from band to band; what they say does not.
-    spread_m = [np.sqrt(np.mean(item.inspection.displacement_m**2)) for item in (banded, whole)]
-    assert spread_m[0] == pytest.approx(spread_m[1], rel=0.05)
-    assert [figure.name for figure in other.figures] == [item.name for item in context.figures]
-    for one, two in zip(other.figures, context.figures, strict=True):
-        sizes = [decode_image(item.path.read_bytes()).shape for item in (one, two)]
-        # Every other row and column is drawn.
-        assert sizes[0] == (-(-sizes[1][0] // 2), -(-sizes[1][1] // 2), 3)

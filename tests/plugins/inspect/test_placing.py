@@ -36,12 +36,6 @@ def slanted() -> Walls:
     return replace(given, walls=(changed,))
 
 
-def test_a_wall_on_the_image_s_own_cells_is_taken_as_it_is() -> None:
-    walls = slanted()
-    image = image_of(np.full(walls.walls[0].frame.shape, 100.0))
-    assert wall_of(image, walls) is walls.walls[0]
-
-
 def test_an_image_is_of_the_wall_of_its_plane() -> None:
     wall = slanted().walls[0]
     walls = replace(slanted(), walls=(replace(wall, plane_index=3), replace(wall, plane_index=8)))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect import point_places
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.point_places import (
     Picture,
@@ -27,46 +26,13 @@ from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints, Truth, Wall
 from orthoflow.testing.examples import example
 from tests import samples
-from tests.inspect_scenes import GSD_M, SHAPE, frame, walls
+from tests.inspect_scenes import SHAPE, walls
 
 RADIUS_M = 0.04
 
 
 def wall_with(depth_m: NDArray[np.float64]) -> Wall:
     return replace(walls().walls[0], depth_m=depth_m.astype(np.float32))
-
-
-def slope(across: float, down: float, lift_m: float) -> NDArray[np.float64]:
-    """Depths (rows, cols) of a plane: metres per cell across and down."""
-    rows, cols = (np.arange(n) + 0.5 for n in SHAPE)
-    return np.asarray(lift_m + across * cols[None, :] + down * rows[:, None])
-
-
-@pytest.mark.parametrize(
-    "place", [(180.5, 140.25), (11.0, 140.0), (4.2, 3.1), (356.5, 277.0), (100.0, 2.0)]
-)
-@pytest.mark.parametrize(("across", "down"), [(0.0, 0.0), (1e-4, -2e-4), (-3e-4, 1e-4)])
-def test_a_place_on_a_slope_has_the_depth_of_the_slope_there(
-    place: tuple[float, float], across: float, down: float
-) -> None:
-    wall = wall_with(slope(across, down, 0.03))
-    found = point_on_surface(wall, np.array(place), RADIUS_M)
-    depth = 0.03 + across * place[0] + down * place[1]
-    expected = frame().world_from_wall(np.array([place]), np.array([depth]))[0]
-    assert found is not None
-    np.testing.assert_allclose(found, expected, atol=1e-7)  # metres; depths are float32
-
-
-@pytest.mark.parametrize("radius_m", [0.016, 0.04])
-def test_a_target_before_the_wall_is_where_it_is_not_where_the_wall_is(radius_m: float) -> None:
-    depth = slope(0.0, 0.0, 0.0)
-    rows, cols = np.indices(SHAPE) + 0.5
-    from_place = np.hypot(cols - 180.5, rows - 140.5)
-    depth[from_place <= 0.8 * radius_m / GSD_M] = 0.05
-    found = point_on_surface(wall_with(depth), np.array([180.5, 140.5]), radius_m)
-    expected = frame().world_from_wall(np.array([[180.5, 140.5]]), np.array([0.05]))[0]
-    assert found is not None
-    np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
 @pytest.mark.parametrize(("n_known", "is_found"), [(0, False), (11, False), (12, True)])
@@ -76,16 +42,6 @@ def test_twelve_depths_make_a_surface(n_known: int, *, is_found: bool) -> None:
     depth[139 + rows, 179 + cols] = 0.02
     found = point_on_surface(wall_with(depth), np.array([181.0, 140.5]), RADIUS_M)
     assert (found is not None) == is_found
-
-
-def test_what_lies_beyond_the_radius_has_no_say() -> None:
-    depth = slope(0.0, 0.0, 0.01)
-    rows, cols = np.indices(SHAPE) + 0.5
-    depth[np.hypot(cols - 180.5, rows - 140.5) > RADIUS_M / GSD_M] = 0.015
-    found = point_on_surface(wall_with(depth), np.array([180.5, 140.5]), RADIUS_M)
-    expected = frame().world_from_wall(np.array([[180.5, 140.5]]), np.array([0.01]))[0]
-    assert found is not None
-    np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
 # A painted wall of 1.2 m x 1 m at y = 2, cells of 5 mm, and what lies on it.
@@ -132,22 +88,6 @@ def by_truth(
         buffers_m=(0.1, 0.1),
         search_cells=search,
     )
-
-
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (2.4, -1.3), (-4.0, 3.6)])
-@pytest.mark.parametrize("place", [(120.0, 100.0), (70.3, 60.8)])
-def test_a_place_is_found_where_its_surroundings_are_shown(
-    place: tuple[float, float], shift: tuple[float, float]
-) -> None:
-    found = by_truth(shown_grey(*shift), place)
-    assert found is not None
-    np.testing.assert_allclose(found - place, shift, atol=0.05)
-
-
-@pytest.mark.parametrize(("right", "is_found"), [(4.6, True), (9.0, False)])
-def test_a_place_is_not_looked_for_farther_off_than_asked(right: float, is_found: bool) -> None:
-    assert (by_truth(shown_grey(right, 0.0)) is not None) == is_found
-    assert by_truth(shown_grey(right, 0.0), search=12) is not None
 
 
 def test_light_and_contrast_do_not_matter_and_another_picture_shows_nothing() -> None:
@@ -236,34 +176,11 @@ def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float,
         assert np.isnan(found.place).all()
 
 
-@pytest.mark.parametrize(
-    ("column", "row"), [(-0.5, 100.0), (240.5, 100.0), (9.0, -0.5), (9.0, 200.5)]
-)
-def test_a_point_beside_all_walls_is_outside(column: float, row: float) -> None:
-    assert finder(at(column, row, 0.0), truth=True).find(0).how == "outside"
-
-
 def test_a_point_found_by_the_scene_is_where_the_picture_shows_it() -> None:
     found = finder(at(120.0, 100.0, 0.0), truth=True).find(0)
     np.testing.assert_allclose(found.place - found.expected, [1.5, 0.5], atol=0.05)
     assert np.isnan(found.point_world).all()
     assert found.point_world.shape == (3,)
-
-
-def test_what_was_measured_is_taken_as_it_is() -> None:
-    pixels = np.array([[33.0, 44.0]])
-    found = finder(at(120.0, 100.0, 0.0), pixels_wall=pixels, wall=5).find(0)
-    assert (found.how, found.wall) == ("measured", 1)
-    np.testing.assert_array_equal(found.place, [33.0, 44.0])
-    # The wall that it was measured on, however far it lies from there.
-    far = finder(at(120.0, 100.0, 3.0), pixels_wall=pixels, wall=4).find(0)
-    assert (far.how, far.wall) == ("measured", 0)
-
-
-def test_without_a_scene_a_target_is_looked_for() -> None:
-    found = finder(at(120.0, 100.0, 0.0)).find(0)
-    assert (found.how, found.wall) == ("not found", 0)
-    assert np.isnan(found.place).all()
 
 
 @pytest.mark.parametrize(("off_m", "is_found"), [(0.015, True), (0.045, False)])
@@ -289,24 +206,6 @@ def test_a_target_is_found_within_the_search_and_carried_back_into_space(
         np.testing.assert_allclose(found.place, [120.0, 100.0], atol=0.05)
         # Half of the target's radius says how deep it lies.
         np.testing.assert_allclose(found.point_world[None], at(120.0, 100.0, 0.01), atol=3e-4)
-
-
-@pytest.mark.parametrize(("search_m", "cells"), [(0.001, 2), (0.0199, 4), (0.5, 12)])
-def test_a_scene_is_looked_at_two_to_twelve_cells_about_a_point(
-    search_m: float, cells: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def look(*_: object, search_cells: int, **__: object) -> None:
-        asked.append(search_cells)
-
-    monkeypatch.setattr(point_places, "find_by_truth", look)
-    finding = replace(finder(at(120.0, 100.0, 0.0), truth=True), search_m=search_m)
-    found = finding.find(0)
-    assert asked == [cells]
-    assert found.how == "not found"
-    assert found.place.shape == (2,)
-    assert np.isnan(found.place).all()
 
 
 def test_places_in_metres_count_before_those_in_cells() -> None:

@@ -30,18 +30,6 @@ def test_blurred_edges_tell_their_blur(sigma: float) -> None:
     assert found["mtf50_per_cell"] == pytest.approx(0.1874 / sigma, rel=0.1)
 
 
-def test_scattered_voids_leave_the_sharpness_as_it_is() -> None:
-    rows, columns = np.mgrid[:600, :600]
-    place = np.mod(columns + 0.13 * rows, 40.0)
-    signed = np.where(place < 20.0, place - 10.0, 30.0 - place) / np.hypot(1.0, 0.13)
-    grey = 120.0 + 60.0 * erf(signed / (1.5 * np.sqrt(2.0)))
-    valid = np.random.default_rng(2).random(grey.shape) > 0.05
-    holed = GreyImage(grey=np.where(valid, grey, 0.0), valid=valid, region=valid)
-    found = {finding.name: finding.value for finding in sharpness_findings(holed, 0)}
-    assert found["n_edges"] >= 20
-    assert found["edge_width_cells"] == pytest.approx(2.563 * 1.5, rel=0.1)
-
-
 def test_an_image_without_edges_tells_nothing() -> None:
     flat = np.full((100, 100), 90.0)
     for valid in (np.ones(flat.shape, dtype=np.bool_), np.zeros(flat.shape, dtype=np.bool_)):

@@ -37,40 +37,6 @@ def numbers_of(*errors: SourceErrors) -> dict[str, float]:
     return {item.name: item.value for item in source_findings(samples, 0)}
 
 
-def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
-    errors = source_errors()
-    cell_m = errors.frame.gsd_m
-    far = replace(errors, displacement_m=errors.displacement_m.copy())
-    far.displacement_m[0, 0] = (0.0, 3.1 * cell_m)
-    near = replace(errors, displacement_m=errors.displacement_m.copy())
-    near.displacement_m[0, 0] = (0.0, 2.9 * cell_m)
-    found = {item.name: item for item in source_findings(errors.samples(), 4)}
-    u = np.array([1.0, -2.0, 3.0, 4.0])
-    v = np.array([0.0, 1.0, 0.0, -5.0])
-    expected = {"n_traced": 9.0, "ghost_share": 2 / 9, "n_ghost_cells": 2.0}
-    for name, values in (("u", u), ("v", v)):
-        middle = np.median(values)
-        expected |= {
-            f"rmse_{name}_mm": np.sqrt((values**2).mean()),
-            f"mean_{name}_mm": values.mean(),
-            f"nmad_{name}_mm": 1.4826 * np.median(np.abs(values - middle)),
-            f"p99_{name}_mm": np.percentile(np.abs(values), 99),
-        }
-    expected |= {"step_rmse_u_mm": np.sqrt(500.0), "step_rmse_v_mm": 20.0}
-    expected["completeness_seen_by_both"] = 0.75
-    for name, value in expected.items():
-        assert found[name].value == pytest.approx(value, rel=1e-4), name
-        assert found[name].unit == ("mm" if name.endswith("_mm") else "1")
-        assert found[name].wall == 4
-    assert found.keys() == expected.keys() | {"far_source_share"}
-    shares = [numbers_of(some)["far_source_share"] for some in (near, far)]
-    # Of nine cells, one more is further away than three.
-    assert shares[1] - shares[0] == pytest.approx(1.0 / 9.0)
-    # What looks at nothing is far away too.
-    n_far = np.count_nonzero(np.linalg.norm(near.displacement_m[0, :8], axis=1) > 3.0 * cell_m)
-    assert shares[0] == pytest.approx((n_far + 1) / 9.0)
-
-
 def test_shares_within_what_the_orthoimage_states_are_of_both_coordinates() -> None:
     errors = source_errors()
     stated = np.full(errors.traced.shape, 0.002, np.float32)
@@ -97,22 +63,3 @@ def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out()
             expected = 3 * errors.n_seen_painted / (3 * errors.n_seen_by_both)
         if not name.startswith("p99"):
             assert twice[name] == pytest.approx(expected), name
-
-
-def test_every_so_manyth_error_of_many_is_kept_and_all_are_counted() -> None:
-    errors = source_errors()
-    all_of_them, some = errors.samples(), errors.samples(3)
-    np.testing.assert_array_equal(some.away_m, all_of_them.away_m[::3])
-    np.testing.assert_array_equal(some.step_m, all_of_them.step_m[::3])
-    assert (some.n_traced, some.n_far, some.n_ghosts) == (9, all_of_them.n_far, 2)
-
-
-def test_what_is_not_known_is_left_out() -> None:
-    errors = source_errors()
-    only_steps = replace(errors, steps=errors.traced, n_seen_by_both=0)
-    assert numbers_of(only_steps).keys() == {
-        "n_traced", "step_rmse_u_mm", "step_rmse_v_mm", "far_source_share", "ghost_share",
-        "n_ghost_cells",
-    }  # fmt: skip
-    no_steps = replace(errors, steps=np.zeros((1, 10), dtype=np.bool_))
-    assert "step_rmse_u_mm" not in numbers_of(no_steps)

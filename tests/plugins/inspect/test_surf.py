@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import patches, surf
-from orthoflow_plugins.inspect.image_quality import OrthoimageGrey
-from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
+from orthoflow_plugins.inspect import surf
+from orthoflow_plugins.inspect.key_pairs import KeyPairs, no_pairs
 from orthoflow_plugins.inspect.surf import InspectSurf
 
 from orthoflow.errors import MethodError
@@ -46,18 +45,6 @@ def test_a_displacement_is_told_to_a_tenth_of_a_cell(
         assert metrics[f"surf_floor_rmse_{axis}_mm"] > metrics[f"floor_rmse_{axis}_mm"]
     assert len(found.displacement_m) == metrics["n_pairs"]
     assert [figure.name for figure in context.figures] == ["wall_0_displacements"]
-
-
-def test_pairs_do_not_hang_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    # So that several parts are refined at once.
-    monkeypatch.setattr(patches, "_AT_ONCE", 20)
-    shown, true = (OrthoimageGrey(displaced(*by)) for by in ((1.4, -0.6), (0.0, 0.0)))
-    one, two = (
-        find_key_pairs(shown, true, radius_cells=40.0, threads=threads) for threads in (1, 2)
-    )
-    assert len(one) >= 50
-    for name in ("places", "shift", "found"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 def test_no_key_points_are_looked_for_where_nothing_is_shown(
@@ -124,57 +111,3 @@ def test_an_image_on_cells_of_its_own_is_compared_there(tmp_path: Path) -> None:
     elsewhere = replace(coarse, origin_world=coarse.origin_world + 0.5 * coarse.normal_world)
     with pytest.raises(MethodError, match=r"lies 0\.500 m before wall 0"):
         inspect(tmp_path, inspect_scenes.image_of(means, elsewhere))
-
-
-def some_pairs(count: int, shift_cells: float = 1.0) -> KeyPairs:
-    places = np.column_stack([np.arange(count, dtype=np.float64), np.full(count, 9.0)])
-    shift = np.full((count, 2), shift_cells)
-    return KeyPairs(
-        places=places, shift=shift, found=2.0 * shift, n_points=(40, 30), n_matched=count
-    )
-
-
-@pytest.mark.parametrize(("n_pairs", "is_inspected"), [(9, False), (10, True)])
-def test_ten_pairs_say_something(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_pairs: int, is_inspected: bool
-) -> None:
-    monkeypatch.setattr(surf, "find_key_pairs", lambda *_, **__: some_pairs(n_pairs))
-    metrics, found, context = inspect(tmp_path, displaced(0.0, 0.0), unfit="warn")
-    assert metrics["n_walls_inspected"] == is_inspected
-    assert [f"{n_pairs} pairs of SURF" in text for text in context.warnings] == (
-        [] if is_inspected else [True]
-    )
-    if is_inspected:
-        assert metrics["matched_kept_share"] == 1.0
-        assert (metrics["n_key_points"], metrics["n_key_points_intensity"]) == (40, 30)
-        assert metrics["surf_rmse_x_mm"] == pytest.approx(2.0 * metrics["rmse_x_mm"])
-        # What the floor was laid aside by is taken off.
-        assert metrics["floor_rmse_x_mm"] == pytest.approx(0.5e3 * GSD_M)
-        assert metrics["floor_rmse_y_mm"] == pytest.approx(0.75e3 * GSD_M)
-        assert metrics["surf_floor_rmse_y_mm"] == pytest.approx(1.75e3 * GSD_M)
-        assert len(found.displacement_m) == 10
-
-
-def test_walls_together_have_the_pairs_of_all_in_cells_of_the_coarsest() -> None:
-    image = displaced(0.0, 0.0)
-    coarse = inspect_scenes.image_of(np.full((140, 180), 90.0))
-    coarse = replace(coarse, wall=1, frame=replace(coarse.frame, gsd_m=2 * GSD_M))
-    items = [
-        surf._Verdict(image=image, pairs=some_pairs(30, 1.0)),
-        surf._Verdict(image=coarse, pairs=some_pairs(10, -2.0)),
-    ]
-    found = {item.name: item.value for item in surf._together(items)}
-    assert found["n_pairs"] == 40.0
-    shifts_m = GSD_M * np.append(np.full(30, 1.0), np.full(10, -4.0))
-    assert found["mean_x_mm"] == pytest.approx(1e3 * shifts_m.mean())
-    assert found["rmse_x_cells"] == pytest.approx(np.sqrt((shifts_m**2).mean()) / (2 * GSD_M))
-    assert not any(name.startswith("floor") for name in found)
-    both = surf._inspection(items, [], None)
-    assert both.wall.tolist() == [0] * 30 + [1] * 10
-    np.testing.assert_allclose(both.displacement_m[:, 0], shifts_m)
-    for item, own in zip(items, (slice(0, 30), slice(30, None)), strict=True):
-        expected = item.image.frame.world_from_wall(item.pairs.places)
-        np.testing.assert_allclose(both.points_world[own], expected)
-    assert found.keys() == {item.name for item in surf._together(items[::-1])}
-    single = surf._Verdict(image=image, pairs=some_pairs(1))
-    assert {item.name: item.value for item in single.findings()}["matched_kept_share"] == 1.0

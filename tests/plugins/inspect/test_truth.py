@@ -178,25 +178,6 @@ def test_another_programs_image_is_compared_on_its_own_cells(tmp_path: Path, tru
     assert metrics["n_patches"] > 5
 
 
-def test_a_part_of_a_wall_says_what_the_whole_does(tmp_path: Path, truth: Truth) -> None:
-    true = rendered(truth, (1.0, 0.0))
-    mask = painted(true).mask.copy()
-    mask[:, : mask.shape[1] // 3] = OrthoMask.NONE
-    image = replace(painted(true), mask=mask)
-    whole, part = (
-        inspect(tmp_path, truth, image, walled(rendered(truth)), params)[0]
-        for params in (None, InspectTruth.Params(colour_cells_most=30_000, seen_cells_most=10_000))
-    )
-    assert part["n_patches"] < 0.7 * whole["n_patches"]
-    assert part["mean_u_mm"] == pytest.approx(whole["mean_u_mm"], abs=0.05 * 1e3 * GSD_M)
-    assert part["mean_v_mm"] == pytest.approx(0.0, abs=0.05 * 1e3 * GSD_M)
-    assert part["completeness"] == pytest.approx(whole["completeness"], abs=0.01)
-    assert part["colour_rmse_grey"] == pytest.approx(whole["colour_rmse_grey"], rel=0.15)
-    assert part["gross_colour_share"] == pytest.approx(whole["gross_colour_share"], abs=0.03)
-    # Depths are compared everywhere.
-    assert part["depth_rmse_mm"] == whole["depth_rmse_mm"]
-
-
 def test_a_wall_measured_too_near_has_that_depth_error(tmp_path: Path, truth: Truth) -> None:
     image = rendered(truth)
     near = replace(walled(image), depth_m=image.depth_m + np.float32(0.005))
@@ -319,15 +300,6 @@ def inspect_planes(
     inputs = InspectTruth.In(truth=truth, planes=planes, labels=labels, cloud=cloud)
     InspectTruth().run(inputs, InspectTruth.Params(), context)
     return {metric.name: metric.value for metric in context.metrics}
-
-
-def test_planes_alone_are_compared_without_orthoimages(tmp_path: Path, truth: Truth) -> None:
-    true = truth.planes
-    metrics = inspect_planes(tmp_path, truth, true, PointLabels(plane_index=truth.labels))
-    assert metrics["true_planes_found"] == metrics["true_planes"] == len(true)
-    assert metrics["worst_plane_angle_deg"] < 1e-5
-    assert metrics["worst_plane_offset_mm"] < 1e-9
-    assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
 
 
 def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
