@@ -87,27 +87,6 @@ def test_a_place_that_two_photos_see_is_one_point(tmp_path: Path) -> None:
     assert written.n_points == int((ties.role != TieRole.REJECTED).sum()) - 1
 
 
-def test_a_tie_that_was_rejected_or_of_a_refused_photo_is_not_written(tmp_path: Path) -> None:
-    cameras = oriented()
-    ties = cameras.ties
-    assert ties is not None
-    # All four photos have ties that count, but the last of them is not oriented.
-    role = np.full(len(ties.photo), TieRole.CONTROL, dtype=np.uint8)
-    residual_px = np.tile([3.0, 4.0], (len(ties.photo), 1))
-    role[0] = TieRole.REJECTED
-    kept = (ties.photo < 3) & (role == TieRole.CONTROL)
-    all_kept = replace(cameras, ties=replace(ties, role=role, residual_px=residual_px))
-    assert write_colmap_model(tmp_path, all_kept).n_points == int(kept.sum())
-    points = pycolmap.Reconstruction(str(tmp_path)).points3D
-    # Grey, and with the length of the residual as their error.
-    assert {(*point.color.tolist(), point.error) for point in points.values()} == {
-        (128, 128, 128, 5.0)
-    }
-    # Nor one of a photo that is not there at all.
-    fewer = write_colmap_model(tmp_path, replace(all_kept, cameras=cameras.cameras[:3]))
-    assert fewer.n_points == int(kept.sum())
-
-
 def test_without_ties_the_cameras_are_written(tmp_path: Path) -> None:
     written = write_colmap_model(tmp_path, replace(oriented(), ties=None))
     assert (written.n_cameras, written.n_images, written.n_points) == (1, 3, 0)

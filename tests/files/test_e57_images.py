@@ -185,21 +185,6 @@ def test_a_size_that_is_not_the_photos_is_refused(tmp_path: Path) -> None:
         read(path)
 
 
-def test_a_calibration_of_a_fisheye_cannot_be_for_a_photo_inside(tmp_path: Path) -> None:
-    path = written(tmp_path, pinhole())
-    calibration = tmp_path / "calibration.yaml"
-    calibration.write_text(
-        "cameras: {'*': {model: fisheye, width: 64, height: 48, fx: 20, fy: 20, cx: 31, cy: 23}}"
-    )
-    inputs = ReadPhotos.In(
-        files=InputFiles(name="photos", paths=(path,)),
-        calibration=InputFiles(name="calibration", paths=(calibration,)),
-    )
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    with pytest.raises(InputError, match=r"room_000\.jpg is inside an E57 file, but its calib"):
-        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
-
-
 def test_a_lens_that_is_none_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, pinhole(numbers=NUMBERS | {"pixelWidth": 0.0}))
     with pytest.raises(InputError, match=r"the lens of photo room_000\.jpg is none"):

@@ -178,17 +178,6 @@ def test_the_focal_length_follows_the_stored_array(
     assert rule in focal.reason
 
 
-@pytest.mark.parametrize(
-    ("unit", "per_unit"), [(2, 4064), (3, 1600), (4, 160), (None, 4064)], ids=str
-)
-def test_the_unit_of_the_focal_plane_counts(unit: int | None, per_unit: int) -> None:
-    inner: dict[int, made.Value] = {made.FOCAL: (50, 1), made.RESOLUTION_X: (per_unit, 1)}
-    if unit is not None:
-        inner[made.RESOLUTION_UNIT] = unit
-    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
-    assert focal_length(exif, 6000, 4000).value_px == pytest.approx(8000.0, rel=1e-12)
-
-
 @pytest.mark.parametrize("said_mm", [0.01, 65535])
 def test_a_focal_length_that_no_lens_has_is_not_multiplied_by_the_pitch(said_mm: float) -> None:
     focal = focal_length(exif_of(focal_mm=said_mm, resolution_px_per_mm=160), 6000, 4000)
@@ -246,23 +235,6 @@ def test_two_percent_of_another_shape_is_a_photo_that_was_cut(
     found = focal_length(TAKEN, width, height)
     assert (found.value_px is None) is is_cropped
     assert found.reason.startswith("the photo was cut") is is_cropped
-
-
-@pytest.mark.parametrize(("equivalent_mm", "contradicts"), [(57.0, False), (60.0, True)])
-def test_a_pitch_that_contradicts_the_equivalent_by_a_seventh_is_left(
-    equivalent_mm: float, contradicts: bool
-) -> None:
-    # 30 mm at 200 px/mm are 6000 px; over a diagonal of 5000 px that is 51.9 mm.
-    exif = dataclasses.replace(TAKEN, focal_35mm=equivalent_mm)
-    found = focal_length(exif, 4000, 3000)
-    if contradicts:
-        assert found.reason == "35 mm equivalent over the diagonal"
-        assert found.value_px == pytest.approx(equivalent_mm / DIAGONAL_MM * 5000.0)
-    else:
-        assert (found.reason, found.value_px) == ("pixel pitch of the focal plane", 6000.0)
-    # As much too short is as much a contradiction.
-    short = dataclasses.replace(TAKEN, focal_35mm=51.9**2 / equivalent_mm)
-    assert (focal_length(short, 4000, 3000).reason == found.reason) is True
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from orthoflow.errors import InputError, ProductError
+from orthoflow.errors import InputError
 from orthoflow.files import images
 
 
@@ -35,21 +35,6 @@ def test_colours_keep_their_order_in_a_png(channels: int) -> None:
     np.testing.assert_array_equal(opened(encoded), image)
     rgb = np.dstack([image] * 3) if channels == 1 else image[..., :3]
     np.testing.assert_array_equal(images.decode_image(encoded), rgb)
-
-
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.zeros((4, 4), dtype=np.float32),
-        np.zeros((4, 4, 2), dtype=np.uint8),
-        np.zeros((4, 4, 5), dtype=np.uint8),
-        np.zeros(4, dtype=np.uint8),
-    ],
-    ids=["shares", "two-channels", "five-channels", "flat"],
-)
-def test_what_is_no_picture_is_not_encoded(image: NDArray[np.uint8]) -> None:
-    with pytest.raises(ProductError, match="an image to encode must be uint8 or uint16 of shape"):
-        images.encode_png(image)
 
 
 def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None:
@@ -129,29 +114,6 @@ def test_a_very_large_one_is_averaged_band_by_band(
     check_halves(images._preview(shown.shape, cells, 16))
     assert len(asked) == math.ceil(32 / band_px)
     assert asked[0] == (slice(0, 2 * min(32, band_px)), slice(0, 48))
-
-
-@pytest.mark.parametrize(
-    ("least_px", "longest_px", "factor"),
-    [(0, 1000, 1), (8, 1000, 1), (9, 1000, 2), (33, 1000, 5), (33, 17, 2), (33, 15, 1)],
-)
-def test_a_picture_of_few_cells_shows_each_as_a_square(
-    least_px: int, longest_px: int, factor: int
-) -> None:
-    image = np.arange(4 * 8, dtype=np.uint8).reshape(4, 8) * 8
-    whole = np.ones(image.shape, dtype=np.bool_)
-    preview = opened(
-        images.cells_webp(
-            image.shape,
-            lambda part: (image[part], whole[part]),
-            longest_side_px=longest_px,
-            least_px=least_px,
-        )
-    )
-    assert preview.shape[:2] == (4 * factor, 8 * factor)
-    centres = preview[factor // 2 :: factor, factor // 2 :: factor, 0].astype(int)
-    # WebP is not exact: neighbouring cells are eight grey levels apart.
-    assert np.abs(centres - image).max() <= (40 if factor == 1 else 24)
 
 
 def test_previews_in_webp_are_those_in_png() -> None:

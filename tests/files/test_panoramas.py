@@ -10,9 +10,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.cube_faces import (
     FACES,
     MOST_PX,
-    face_in,
     face_lens,
-    face_name,
     face_picture,
     face_rays,
     faces_of,
@@ -54,24 +52,6 @@ def test_left_of_the_first_column_is_the_last() -> None:
     panorama[:, 0] = panorama[:, -1] = 200
     back = face_picture(panorama, "back")
     assert back[len(back) // 2, len(back) // 2] == 200
-
-
-@pytest.mark.parametrize(
-    ("name", "found"),
-    [
-        ("hall_front.png", ("hall", "front")),
-        ("a_b_down.png", ("a_b", "down")),
-        ("hall_front.jpg", None),
-        ("hall_front", None),
-        ("_front.png", None),
-        ("front.png", None),
-        ("hall_fore.png", None),
-    ],
-)
-def test_a_face_is_known_by_its_name(name: str, found: tuple[str, str] | None) -> None:
-    assert face_in(name) == found
-    if found is not None:
-        assert face_name(*found) == name
 
 
 @pytest.mark.parametrize(

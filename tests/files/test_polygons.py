@@ -14,7 +14,6 @@ from orthoflow.files.geotiff import GridPlace, read_raster, write_raster
 from orthoflow.files.polygons import (
     NamedPolygon,
     filled,
-    outlines,
     read_polygons,
     write_features,
 )
@@ -86,21 +85,6 @@ def test_cells_are_filled_whose_centres_lie_inside_and_in_no_hole() -> None:
     expected[0:3, 0:5] = True
     expected[1:3, 1:3] = False
     np.testing.assert_array_equal(found, expected)
-
-
-def test_areas_are_drawn_along_their_cells_and_touch_at_corners_only() -> None:
-    values = np.full((4, 5), -1, dtype=np.int16)
-    values[0:3, 0:3] = 7
-    values[1, 1] = -1
-    # Two cells that share but a corner are two areas; zero is a value as any other.
-    values[2, 3] = values[3, 4] = 0
-    found = outlines(values)
-    assert sorted(value for value, _ in found) == [0, 0, 7]
-    painted = np.full(values.shape, -1, dtype=np.int16)
-    for value, rings in found:
-        painted[filled(rings, values.shape)] = value
-        assert len(rings) == (2 if value == 7 else 1)
-    np.testing.assert_array_equal(painted, values)
 
 
 @pytest.mark.parametrize("crs", ["wall 0 (1f)", "site", "EPSG:25832"])

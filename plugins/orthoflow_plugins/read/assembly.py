@@ -81,14 +81,6 @@ class ScanCount:
         name = f" ({self.scan.name})" if self.scan.name else ""
         return f"{self.file}, scan {self.index}{name}"
 
-    def note_far(self, lost: NDArray[np.float64]) -> None:
-        """Count points (n, 3), metres, that are left out though their coordinates are finite."""
-        far = lost[np.isfinite(lost).all(axis=1)]
-        if len(far) and not self.left_out["too_far"]:
-            self.first_far_m = tuple(far[0].tolist())
-        self.left_out["too_far"] += len(far)
-        self.left_out["not_finite"] += len(lost) - len(far)
-
 
 class CloudAssembly:
     """Arrays of a growing cloud.
@@ -116,20 +108,25 @@ class CloudAssembly:
             unit_m: gives metres per unit of a scan, along x, y and z.
             box_m: (2, 3) lowest and highest coordinates of the points to keep; None for all.
         """
-        self._ctx = ctx
-        self._box_m = box_m
-        self._reach_m = _bounds(np.empty((0, 3)))
-        self._unit_m = unit_m
+        self._ctx, self._box_m, self._unit_m = ctx, box_m, unit_m
+        self._reach_m = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._capacity = sum(file.n_most for file in files)
-        _require_space(ctx, self._capacity)
-        self.fields = frozenset().union(*(file.fields for file in files))
-        self._axes = [self._new(name, np.float32) for name in "xyz"]
-        self._intensity = self._new("intensity", np.float32) if "intensity" in self.fields else None
-        self._rgb = self._new("rgb", np.uint8, 3) if "rgb" in self.fields else None
-        grid = all("grid" in scan.fields for file in files for scan in file.scans)
-        self._grid = [self._new(name, np.uint32) for name in ("row", "column")] if grid else []
-        self._scan: NDArray[Any] | None = None
-        self._has_rgb: NDArray[Any] | None = None
+        # Refused before writing: a mapped file on a full disk ends the process by a signal.
+        needed, free = self._capacity * _POINT_BYTES, shutil.disk_usage(ctx.scratch).free
+        if free < needed:
+            raise StoreError(
+                f"{self._capacity} points need {needed / 1e9:.2f} GB of scratch space, but only "
+                f"{free / 1e9:.2f} GB are free: free some space or choose another --store"
+            )
+        fields = frozenset().union(*(file.fields for file in files))
+        has_grid = all("grid" in scan.fields for file in files for scan in file.scans)
+        self._arrays = {name: self._new(name, np.float32) for name in "xyz"}
+        if "intensity" in fields:
+            self._arrays["intensity"] = self._new("intensity", np.float32)
+        if "rgb" in fields:
+            self._arrays["rgb"] = self._new("rgb", np.uint8, 3)
+        if has_grid:
+            self._arrays |= {name: self._new(name, np.uint32) for name in ("row", "column")}
         self.n_points = 0
         self.counts: list[ScanCount] = []
 
@@ -151,8 +148,11 @@ class CloudAssembly:
         ]
         first_scan = len(self.counts)
         self.counts += counts
-        n_before = sum(count.n_read for count in self.counts)
-        n_done = 0
+        if len(self.counts) > _MOST_SCANS:
+            raise InputError(
+                f"there are more than {_MOST_SCANS} scans: read them in several workflows"
+            )
+        n_before, n_done = sum(count.n_read for count in self.counts), 0
         for block in file.read():
             self._add(block, first_scan + block.scan)
             n_done += block.n_read
@@ -188,25 +188,19 @@ class CloudAssembly:
     @property
     def offsets(self) -> list[NDArray[Any]]:
         """x, y and z from the origin, cut to the points that came."""
-        return [array[: self.n_points] for array in self._axes]
+        return [self._arrays[name][: self.n_points] for name in "xyz"]
 
     def array(self, name: str) -> NDArray[Any] | None:
         """One of the other arrays, cut to the points that came; None when the files lack it."""
-        found: dict[str, NDArray[Any] | None] = {
-            "intensity": self._intensity,
-            "rgb": self._rgb,
-            "scan": self._scan,
-            "has_rgb": self._has_rgb,
-            **dict(zip(("row", "column"), self._grid, strict=False)),
-        }
-        array = found.get(name)
+        array = self._arrays.get(name)
         return None if array is None else array[: self.n_points]
 
-    def with_all_colours(self) -> NDArray[Any]:
-        """Allocate the mask of valid colours, all True, and return it cut to the points."""
-        self._has_rgb = self._new("has_rgb", np.bool_)
-        self._has_rgb[:] = True
-        return self._has_rgb[: self.n_points]
+    def colour_mask(self) -> NDArray[Any]:
+        """Return the mask of valid colours, cut to the points; all True where it was missing."""
+        if "has_rgb" not in self._arrays:
+            self._arrays["has_rgb"] = self._new("has_rgb", np.bool_)
+            self._arrays["has_rgb"][: self.n_points] = True
+        return self._arrays["has_rgb"][: self.n_points]
 
     def _add(self, block: PointBlock, scan: int) -> None:
         count = self.counts[scan]
@@ -217,80 +211,77 @@ class CloudAssembly:
         count.left_out.update(block.left_out)
         points, bounds = block.points, block.bounds
         if np.any(count.unit_m != 1.0):
-            points = points * count.unit_m
-            bounds = bounds * count.unit_m
+            points, bounds = points * count.unit_m, bounds * count.unit_m
         kept = self._kept(points, bounds, count)
         usable = points[kept]
-        n_kept = len(usable)
-        if n_kept == 0:
+        part = slice(self.n_points, self.n_points + len(usable))
+        if not len(usable):
             return
-        if self.n_points + n_kept > self._capacity:
+        if part.stop > self._capacity:
             raise InputError(f"{count.file} holds more points than its header states")
-        part = slice(self.n_points, self.n_points + n_kept)
-        for array in (*self._axes, *self._grid, self._intensity, self._rgb):
-            if array is not None:
-                _make_ready(array, part)
-        self._store_points(usable, part)
-        self._store_fields(block, kept, part, count)
-        if scan > 0:
-            self._store_scan(scan, part)
+        if scan > 0 and "scan" not in self._arrays:
+            # Zeros are right for everything that came before.
+            self._arrays["scan"] = self._new("scan", np.uint16)
+        if self.n_points == 0:
+            # The median, so that stray points far away cannot cost the scan its precision.
+            self.origin = np.floor(np.median(usable, axis=0))
+        self._store(usable, block, kept, part)
+        if "scan" in self._arrays:
+            self._arrays["scan"][part] = scan
+        if "rgb" in self._arrays:
+            self._store_colours(block, kept, part, count)
         self.n_points = count.stop = part.stop
+
+    def _store(
+        self,
+        points: NDArray[np.float64],
+        block: PointBlock,
+        kept: NDArray[np.bool_] | slice,
+        part: slice,
+    ) -> None:
+        for array in self._arrays.values():
+            _make_ready(array, part)
+        for axis, name in enumerate("xyz"):
+            target = self._arrays[name][part]
+            np.subtract(points[:, axis], self.origin[axis], out=target, casting="same_kind")
+        if "intensity" in self._arrays:
+            values = np.float32(np.nan) if block.intensity is None else block.intensity[kept]
+            self._arrays["intensity"][part] = values
+        for name, places in (("row", block.row), ("column", block.column)):
+            if name in self._arrays and places is not None:
+                self._arrays[name][part] = np.clip(places[kept], 0, 2**32 - 1)
 
     def _kept(
         self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
-        """Which points (n, 3) are usable and lie in the box, counted."""
-        usable = _usable(points, bounds)
-        n_usable = len(points)
-        if not isinstance(usable, slice):
-            lost = points[~usable]
-            n_usable -= len(lost)
-            count.note_far(lost)
-        kept = self._in_box(points, usable)
-        count.left_out["outside_box"] += n_usable - len(points[kept])
-        return kept
-
-    def _in_box(
-        self, points: NDArray[np.float64], usable: NDArray[np.bool_] | slice
-    ) -> NDArray[np.bool_] | slice:
-        """Which usable points (n, 3) lie in the box, its faces included."""
-        if self._box_m is None:
+        """Which points (n, 3) are usable and lie in the box, counted; a slice for all of them."""
+        usable: NDArray[np.bool_] | slice = slice(None)
+        # NaN passes through minimum and maximum, and compares as False.
+        if not np.all(np.abs(bounds) < FARTHEST_M) and len(points):
+            usable = is_near = np.asarray((np.abs(points) < FARTHEST_M).all(axis=1))
+            lost = points[~is_near]
+            far = lost[np.isfinite(lost).all(axis=1)]
+            if len(far) and not count.left_out["too_far"]:
+                count.first_far_m = tuple(far[0].tolist())
+            count.left_out["too_far"] += len(far)
+            count.left_out["not_finite"] += len(lost) - len(far)
+            if len(lost) < len(points):
+                bounds = np.stack([points[usable].min(axis=0), points[usable].max(axis=0)])
+        if self._box_m is None or not len(points[usable]):
             return usable
-        low, high = _bounds(points[usable])
         self._reach_m = np.stack(
-            [np.minimum(self._reach_m[0], low), np.maximum(self._reach_m[1], high)]
+            [np.minimum(self._reach_m[0], bounds[0]), np.maximum(self._reach_m[1], bounds[1])]
         )
-        inside = np.zeros(len(points), dtype=np.bool_)
-        inside[usable] = True
-        inside &= ((points >= self._box_m[0]) & (points <= self._box_m[1])).all(axis=1)
-        return inside
-
-    def _store_points(self, points: NDArray[np.float64], part: slice) -> None:
-        if self.n_points == 0:
-            # The median, so that stray points far away cannot cost the scan its precision.
-            self.origin = np.floor(np.median(points, axis=0))
-        for axis, array in enumerate(self._axes):
-            np.subtract(points[:, axis], self.origin[axis], out=array[part], casting="same_kind")
-
-    def _store_fields(
-        self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice, count: ScanCount
-    ) -> None:
-        if self._intensity is not None:
-            values = np.float32(np.nan) if block.intensity is None else block.intensity[kept]
-            self._intensity[part] = values
-        if self._rgb is not None:
-            self._store_colours(self._rgb, block, kept, part, count)
-        if self._grid and block.row is not None and block.column is not None:
-            for array, values_of in zip(self._grid, (block.row, block.column), strict=True):
-                array[part] = np.clip(values_of[kept], 0, 2**32 - 1)
+        # Its faces are included.
+        low, high = self._box_m
+        is_inside = np.asarray(((points >= low) & (points <= high)).all(axis=1))
+        if not isinstance(usable, slice):
+            is_inside &= usable
+        count.left_out["outside_box"] += len(points[usable]) - int(np.count_nonzero(is_inside))
+        return is_inside
 
     def _store_colours(
-        self,
-        stored: NDArray[Any],
-        block: PointBlock,
-        kept: NDArray[np.bool_] | slice,
-        part: slice,
-        count: ScanCount,
+        self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice, count: ScanCount
     ) -> None:
         n_points = part.stop - part.start
         valid = np.zeros(n_points, dtype=np.bool_)
@@ -300,24 +291,14 @@ class CloudAssembly:
             if rgb.dtype.kind == "f":
                 valid &= np.isfinite(rgb).all(axis=1)
             if count.colours is None:
-                count.colours = ColourScale(stored[part.start :], count.scan.rgb_limit)
+                stored = self._arrays["rgb"][part.start :]
+                count.colours = ColourScale(stored, count.scan.rgb_limit)
             count.colours.add(rgb, None if valid.all() else valid)
         count.n_without_rgb += n_points - int(np.count_nonzero(valid))
-        if self._has_rgb is None and not valid.all():
-            self._has_rgb = self._new("has_rgb", np.bool_)
-            self._has_rgb[: part.start] = True
-        if self._has_rgb is not None:
-            self._has_rgb[part] = valid
-
-    def _store_scan(self, scan: int, part: slice) -> None:
-        if scan >= _MOST_SCANS:
-            raise InputError(
-                f"there are more than {_MOST_SCANS} scans: read them in several workflows"
-            )
-        if self._scan is None:
-            # Zeros are right for everything that came before.
-            self._scan = self._new("scan", np.uint16)
-        self._scan[part] = scan
+        if not valid.all():
+            self.colour_mask()
+        if "has_rgb" in self._arrays:
+            self._arrays["has_rgb"][part] = valid
 
     def _new(self, name: str, dtype: type[np.generic], width: int = 1) -> NDArray[Any]:
         shape = (self._capacity,) if width == 1 else (self._capacity, width)
@@ -361,35 +342,6 @@ def _make_ready(array: NDArray[Any], part: slice) -> None:
     first = part.start * array.strides[0] // mmap.PAGESIZE * mmap.PAGESIZE
     with contextlib.suppress(OSError):
         mapping.madvise(_POPULATE_WRITE, first, part.stop * array.strides[0] - first)
-
-
-def _bounds(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 3) smallest and largest coordinates of points (n, 3); NaN shows, none give infinity."""
-    if not len(points):
-        return np.array([[np.inf] * 3, [-np.inf] * 3])
-    return np.stack([points.min(axis=0), points.max(axis=0)])
-
-
-def _usable(points: NDArray[np.float64], bounds: NDArray[np.float64]) -> NDArray[np.bool_] | slice:
-    """Which points can be used; a slice when all can, so that nothing need be copied."""
-    # NaN passes through minimum and maximum, and compares as False.
-    if len(points) and np.all(np.abs(bounds) < FARTHEST_M):
-        return slice(None)
-    mask: NDArray[np.bool_] = np.logical_and.reduce(
-        [np.abs(points[:, axis]) < FARTHEST_M for axis in (0, 1, 2)]
-    )
-    return mask
-
-
-def _require_space(ctx: StepContext, n_points: int) -> None:
-    """Refuse before writing: a mapped file on a full disk ends the process by a signal."""
-    needed = n_points * _POINT_BYTES
-    free = shutil.disk_usage(ctx.scratch).free
-    if free < needed:
-        raise StoreError(
-            f"{n_points} points need {needed / 1e9:.2f} GB of scratch space, but only "
-            f"{free / 1e9:.2f} GB are free: free some space or choose another --store"
-        )
 
 
 def _common_step(values: NDArray[np.float64], unit_m: float) -> float:

@@ -18,7 +18,6 @@ from orthoflow.products import JsonValue, PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
-from orthoflow_plugins.read.stations import ScanSummary, Stations
 
 # Where two sides of a scan are shorter, or longer, it is rather in another unit than of a wall or a
 # building.
@@ -110,11 +109,7 @@ FEW_STATIONS: Final = DiagnosticSpec(
     code="scan-stations-missing",
     severity="warning",
     text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest "
-    "station determines "
-    "the front of a "
-    ""
-    ""
-    "wall",
+    "station determines the front of a wall",
 )
 COARSE_OFFSETS: Final = DiagnosticSpec(
     code="scan-offsets-coarse",
@@ -259,19 +254,11 @@ def report_fields(ctx: StepContext, counts: Sequence[ScanCount], cloud: PointClo
         ctx.report(NO_INTENSITY, names=_listed(unused), candidate=candidates[0])
 
 
-def report_stations(ctx: StepContext, stations: Stations, n_scans: int, *, has_view: bool) -> None:
-    """Report that only some scans have a station, or that one that was given is not used."""
-    if stations.source != "file" or stations.positions is None:
-        return
-    if not stations.per_scan:
-        ctx.report(FEW_STATIONS, n_stations=len(stations.positions), n_scans=n_scans)
-    if has_view:
-        why = "the files state where the scanner stood"
-        ctx.report(NO_EFFECT, setting="view_from", why=why)
-
-
 def report_precision(
-    ctx: StepContext, assembly: CloudAssembly, summaries: Sequence[ScanSummary], unit: str | None
+    ctx: StepContext,
+    assembly: CloudAssembly,
+    extents: Sequence[NDArray[np.float64]],
+    unit: str | None,
 ) -> dict[str, JsonValue]:
     """Report coordinates that are coarse, and a size that no wall or building has."""
     farthest_m = max(float(np.abs(values).max()) for values in assembly.offsets)
@@ -282,8 +269,7 @@ def report_precision(
     for name, rounding in roundings.items():
         if rounding >= COARSE_M:
             ctx.report(ROUNDED, subject=name, rounding_mm=1000 * rounding)
-    low = np.min([summary.low for summary in summaries], axis=0)
-    high = np.max([summary.high for summary in summaries], axis=0)
+    low, high = np.min(extents, axis=(0, 1)), np.max(extents, axis=(0, 1))
     side_m = float(np.median(high - low))
     if not _SMALL_M <= side_m <= _LARGE_M:
         units = [unit_and_source(count, unit) for count in assembly.counts]

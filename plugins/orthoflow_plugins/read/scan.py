@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -20,12 +21,13 @@ from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
-from orthoflow_plugins.read.assembly import CloudAssembly
+from orthoflow_plugins.read.assembly import CloudAssembly, ScanCount
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.reporting import (
     COLOUR_LIMIT,
     COLOURS_GREY,
     COLOURS_ZERO,
+    FEW_STATIONS,
     INTENSITY_LUMINANCE,
     INTENSITY_ZERO,
     NO_EFFECT,
@@ -34,7 +36,6 @@ from orthoflow_plugins.read.reporting import (
     report_precision,
     report_quality,
     report_scales,
-    report_stations,
     report_summary,
     scan_json,
     warn_of_up,
@@ -47,7 +48,6 @@ from orthoflow_plugins.read.scales import (
     normalise,
     robust_range,
 )
-from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 Unit = Literal["m", "cm", "mm", "ft", "us-ft", "in", "km"]
 Corner = tuple[float, float, float]
@@ -95,10 +95,7 @@ class ReadScan(Method):
         view_from: tuple[float, float, float] | None = Field(
             None,
             description="Position of a viewer, [x, y, z], world metres (unit applied); "
-            "distinguishes the front of a wall from its "
-            "back if the files have no scanner "
-            ""
-            ""
+            "distinguishes the front of a wall from its back if the files have no scanner "
             "positions.",
         )
         columns: str | tuple[str, ...] | None = Field(
@@ -176,8 +173,7 @@ class ReadScan(Method):
             "plan",
             plan_view_png(cloud),
             "The cloud from above, brighter where denser: walls are thin bright lines; "
-            "double lines "
-            "are misaligned scans.",
+            "double lines are misaligned scans.",
         )
         polar = polar_view_png(cloud)
         if polar is not None:
@@ -261,10 +257,16 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
     rgb, has_rgb = _colours(ctx, assembly)
     intensity, scales = _intensity(ctx, assembly, params)
     intensity, intensity_source = _judged_intensity(ctx, intensity, rgb, has_rgb)
-    summaries = _summaries(assembly)
-    stations = choose_stations(summaries, params.view_from)
-    report_stations(ctx, stations, len(summaries), has_view=params.view_from is not None)
-    precision = report_precision(ctx, assembly, summaries, params.unit)
+    counts = [count for count in assembly.counts if count.n_kept]
+    extents = [_extent(assembly, count) for count in counts]
+    stations, stations_source = _choose_stations(counts, extents, params.view_from)
+    is_from_files = stations is not None and stations_source == "file"
+    is_per_scan = stations is not None and len(stations) == len(counts)
+    if is_from_files and stations is not None and not is_per_scan:
+        ctx.report(FEW_STATIONS, n_stations=len(stations), n_scans=len(counts))
+    if is_from_files and params.view_from is not None:
+        ctx.report(NO_EFFECT, setting="view_from", why="the files state where the scanner stood")
+    precision = report_precision(ctx, assembly, extents, params.unit)
     x, y, z = assembly.offsets
     cloud = PointCloud(
         origin=assembly.origin,
@@ -275,11 +277,12 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
         intensity=intensity,
         rgb=rgb,
         has_rgb=has_rgb,
-        scan=assembly.array("scan") if stations.per_scan or stations.source != "file" else None,
+        # Numbers that would not point to rows of the stations are worse than none.
+        scan=assembly.array("scan") if is_per_scan or not is_from_files else None,
         row=assembly.array("row"),
         column=assembly.array("column"),
-        stations=stations.positions,
-        stations_source=stations.source,
+        stations=stations,
+        stations_source=stations_source,
         source={
             "up": params.up,
             "intensity_source": intensity_source,
@@ -311,8 +314,7 @@ def _colours(
         if not rgb[part].any():
             ctx.report(COLOURS_ZERO, subject=count.title)
             count.n_without_rgb = count.n_kept
-            if has_rgb is None:
-                has_rgb = assembly.with_all_colours()
+            has_rgb = assembly.colour_mask()
             has_rgb[part] = False
         elif colours.misfit is not None:
             ctx.report(
@@ -377,25 +379,39 @@ def _judged_intensity(
     return None, "luminance"
 
 
-def _summaries(assembly: CloudAssembly) -> list[ScanSummary]:
-    found = []
-    for count in assembly.counts:
-        if not count.n_kept:
+def _choose_stations(
+    counts: Sequence[ScanCount],
+    extents: Sequence[NDArray[np.float64]],
+    view_from: tuple[float, float, float] | None,
+) -> tuple[NDArray[np.float64] | None, str | None]:
+    """Return the files' stations (s, 3) if there are any, else the user's viewpoint, and whose.
+
+    A scan without a pose stands for its origin only if it is the only one, and if it can have been
+    seen from there: a scan in its scanner's frame surrounds or faces the origin; a cloud in survey
+    coordinates lies anywhere.
+
+    Args:
+        counts: of the scans with points.
+        extents: (2, 3) smallest and largest coordinates of each, but for a few.
+        view_from: the user's.
+    """
+    is_only = sum(c.scan.station is not None and not c.scan.station_is_posed for c in counts) == 1
+    known = []
+    for count, extent in zip(counts, extents, strict=True):
+        if count.scan.station is None:
             continue
-        step = max(1, count.n_kept // _SAMPLE)
-        low, high = np.array(
-            [
-                np.percentile(values[count.start : count.stop : step], _PERCENTILES)
-                for values in assembly.offsets
-            ]
-        ).T
-        station = count.scan.station
-        found.append(
-            ScanSummary(
-                station=None if station is None else station * count.unit_m,
-                is_posed=count.scan.station_is_posed,
-                low=assembly.origin + low,
-                high=assembly.origin + high,
-            )
-        )
-    return found
+        station = count.scan.station * count.unit_m
+        off_m = float(np.linalg.norm(np.clip(station, *extent) - station))
+        may_be_origin = is_only and off_m <= float(np.linalg.norm(np.ptp(extent, axis=0)))
+        if count.scan.station_is_posed or may_be_origin:
+            known.append(station)
+    if known:
+        return np.vstack(known), "file"
+    return (None, None) if view_from is None else (np.array([view_from]), "view_from")
+
+
+def _extent(assembly: CloudAssembly, count: ScanCount) -> NDArray[np.float64]:
+    """Smallest and largest coordinates (2, 3) of a scan, but for a few."""
+    part = slice(count.start, count.stop, max(1, count.n_kept // _SAMPLE))
+    ends = [np.percentile(values[part], _PERCENTILES) for values in assembly.offsets]
+    return np.asarray(assembly.origin + np.array(ends).T)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, neighbourhoods_of
-from orthoflow.geometry.frames import frame_over
-from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, PointLabels
 from tests import samples
 
@@ -96,41 +94,6 @@ def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
     single = dressed(corner(scan=None, stations=stations[:1], stations_source="file"))
     assert single.scans == (0,)
     np.testing.assert_array_equal(single.station(0), stations[0])
-
-
-@pytest.mark.parametrize(
-    ("corner_m", "is_inside"),
-    [
-        ([0.0, 0.5, 0.5], True),
-        ([0.0625, 1.5, 1.5], True),
-        ([-0.125, 0.5, 1.5], True),
-        ([0.0, 0.499, 1.0], False),
-        ([0.0, 1.501, 1.0], False),
-        ([0.0, 1.0, 0.499], False),
-        ([0.0, 1.0, 1.501], False),
-        ([0.063, 1.0, 1.0], False),
-        ([-0.126, 1.0, 1.0], False),
-    ],
-)
-def test_a_wall_has_the_points_over_it_as_far_before_and_behind_it_as_it_reaches(
-    corner_m: list[float], is_inside: bool
-) -> None:
-    square = np.array([[0.0, 0.5, 1.5], [0.0, 0.5, 0.5], [0.0, 1.5, 0.5], [0.0, 1.5, 1.5]])
-    slab = Slab(frame=frame_over(square, NORMALS[0], gsd_m=0.25), front_m=0.0625, behind_m=0.125)
-    far = CORNER.points_world() - ORIGIN + 50.0
-    x, y, z = np.vstack([[corner_m], far]).astype(np.float32).T
-    cloud = PointCloud(
-        origin=np.zeros(3),
-        x=np.ascontiguousarray(x),
-        y=np.ascontiguousarray(y),
-        z=np.ascontiguousarray(z),
-        up=np.array([0.0, 0.0, 1.0]),
-    )
-    dress = dressed(cloud, near=neighbourhoods_of(cloud), wall=slab, wall_plane=0)
-    found = [block.deviation_m for block in dress.blocks()]
-    assert len(found) == is_inside
-    if is_inside:
-        np.testing.assert_allclose(found[0], [corner_m[0]], atol=1e-6)
 
 
 def test_what_no_colour_is_known_for_is_grey() -> None:

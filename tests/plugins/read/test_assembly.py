@@ -194,13 +194,3 @@ def test_a_coarse_step_is_found(step: float) -> None:
     if step in (0.005, 0.01, 0.02, 0.05, 0.1, 0.5):
         # In millimetres as well, in which half a metre is the coarsest that is looked for.
         assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
-
-
-def test_the_finest_axis_counts_and_ten_values_are_needed() -> None:
-    steps = np.array([0.5, 0.1, 0.02]) * np.arange(10)[:, None]
-    assert rounding_m(steps, 1.0) == pytest.approx(0.02)
-    # Of nine values an axis says nothing; those that are not finite are none.
-    few = steps.copy()
-    few[0, 2] = np.nan
-    assert rounding_m(few, 1.0) == pytest.approx(0.1)
-    assert rounding_m(steps[:9], 1.0) == 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import figures
 from orthoflow_plugins.read.figures import (
-    ContactSheet,
     plan_view_png,
     polar_view_png,
     scan_lines_png,
@@ -153,42 +151,3 @@ def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
 
 
 # --- the sheet ---
-
-
-@pytest.fixture
-def _exact_sheets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "encode_webp", np.array)
-
-
-@pytest.mark.usefixtures("_exact_sheets")
-def test_photos_stand_in_rows_above_their_names() -> None:
-    sheet = ContactSheet(3)
-    assert sheet.caption.startswith("The photos, as they are stored: ")
-    colours = [(200, 10, 10), (10, 200, 10), (10, 10, 200)]
-    shapes = [(400, 800), (800, 400), (200, 576)]
-    for k, (colour, shape) in enumerate(zip(colours, shapes, strict=True)):
-        sheet.add(f"photo {k}.jpg", np.full((*shape, 3), colour, dtype=np.uint8))
-    shown: Any = np.array(sheet.encoded())
-    # Two columns of 300 pixels, photos 6 from the side; 18 for the name below.
-    sizes = [(144, 288), (270, 135), (100, 288)]
-    top_of_second = 270 + 18 + 12
-    assert shown.shape == (top_of_second + 100 + 30, 600, 3)
-    corners = [(6, 6), (6, 306), (top_of_second + 6, 6)]
-    for colour, (height, width), (top, left) in zip(colours, sizes, corners, strict=True):
-        is_photo = (shown == colour).all(axis=2)
-        rows, columns = np.nonzero(is_photo)
-        assert (rows.min(), rows.max() + 1) == (top, top + height)
-        assert (columns.min(), columns.max() + 1) == (left, left + width)
-        below = shown[top + height : top + height + 18, left : left + 200]
-        assert (below < 100).any()
-    assert (shown[top_of_second:, 300:] == 245).all()
-
-
-@pytest.mark.usefixtures("_exact_sheets")
-def test_a_photo_of_one_row_is_a_line() -> None:
-    for shape, size in (((1, 3000), (1, 288)), ((3000, 1), (270, 1))):
-        sheet = ContactSheet(1)
-        sheet.add("", np.zeros((*shape, 3), dtype=np.uint8))
-        shown: Any = np.array(sheet.encoded())
-        rows, columns = np.nonzero((shown == 0).all(axis=2))
-        assert (len(set(rows)), len(set(columns))) == size

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -14,7 +13,7 @@ from orthoflow_plugins.read.photos import ReadPhotos
 from PIL import Image
 from rasterio.transform import Affine
 
-from orthoflow.errors import CancelledStepError, InputError
+from orthoflow.errors import InputError
 from orthoflow.files.images import (
     decode_image,
     decode_levels,
@@ -164,48 +163,6 @@ def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: Reader)
     assert read.warnings == ""
 
 
-def test_a_mask_of_a_fisheye_or_a_panorama_holds_for_its_faces(
-    tmp_path: Path, read: Reader
-) -> None:
-    used = np.full((48, 64), 255, dtype=np.uint8)
-    used[:, :40] = 0
-    half = np.full((64, 128), 255, dtype=np.uint8)
-    half[:, :64] = 0
-    own = np.full((40, 40), 255, dtype=np.uint8)
-    own[:20] = 0
-    files = {
-        "a.jpg": encode_jpeg(made.picture()),
-        "a_mask.png": encode_png(used),
-        "360.png": encode_png(made.picture(128, 64)),
-        "360_mask.png": encode_png(half),
-    }
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    (masks / "a_front.png").write_bytes(encode_png(own))
-    paths = made.write(tmp_path, files)
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    calibration = tmp_path / "calibration.yaml"
-    calibration.write_text(f"cameras: {{a.jpg: {FISHEYE}}}")
-    inputs = ReadPhotos.In(
-        files=InputFiles(name="photos", paths=paths),
-        calibration=InputFiles(name="calibration", paths=(calibration,)),
-        masks=InputFiles(name="masks", paths=(masks / "a_front.png",)),
-    )
-    params = ReadPhotos.Params(panoramas=("360.png",))
-    photos = {photo.name: photo for photo in ReadPhotos().run(inputs, params, ctx).photos.photos}
-    # What is masked whole is no photo.
-    assert "a_left.png" not in photos
-    assert "360_left.png" not in photos
-    assert photos["360_right.png"].mask is None
-    mask = photos["a_front.png"].mask
-    assert mask is not None
-    shown = decode_image(mask).max(axis=2) > 0
-    assert not shown[:20].any()
-    assert not shown[:, :27].any()
-    assert shown[20:, 33:].all()
-    assert ctx.warnings == []
-
-
 def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) -> None:
     (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     model = made.write(
@@ -234,41 +191,6 @@ def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) ->
     # Whoever wires the poses only is told what is missing.
     with pytest.raises(InputError, match="its lens is a fisheye: wire the same files to read"):
         run(None)
-
-
-def test_a_line_of_the_log_tells_what_is_known_of_each_photo(tmp_path: Path) -> None:
-    exif = made.exif_block({made.MODEL: "Pen", made.ORIENTATION: 6}, {made.FOCAL_35MM: 36})
-    files = {
-        "a.png": encode_png(made.picture(32, 16)),
-        "b.png": cv2.imencode(".png", made.picture().astype(np.uint16))[1].tobytes(),
-        "c.jpg": made.jpeg(made.picture(), exif),
-        "d.jpg": encode_jpeg(made.picture()),
-        "d_mask.png": encode_png(np.eye(48, 64, dtype=np.uint8) * 255),
-    }
-    paths = made.write(tmp_path, files)
-    calibration = tmp_path / "calibration.yaml"
-    calibration.write_text(f"cameras: {{d.jpg: {CAMERA}}}")
-    said: list[str] = []
-    ctx = StepContext(
-        rng=np.random.default_rng(0),
-        cores=1,
-        scratch=tmp_path,
-        listen=lambda event: said.append(event.text) if event.kind == "log" else None,
-    )
-    inputs = ReadPhotos.In(
-        files=InputFiles(name="photos", paths=paths),
-        calibration=InputFiles(name="calibration", paths=(calibration,)),
-    )
-    ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
-    diagonal_px = 36 / np.hypot(36, 24) * np.hypot(64, 48)
-    held = "EXIF orientation 6 (not applied)"
-    lens = f"focal length {diagonal_px:.1f} px from the 35 mm equivalent over the diagonal"
-    assert said == [
-        "a.png: 32 x 16, no EXIF focal length",
-        "b.png: 64 x 48, 16 bits per channel, no EXIF focal length",
-        f"c.jpg: 64 x 48, Pen, {held}, {lens}",
-        "d.jpg: 64 x 48, calibrated, focal length 60.0 px, masked",
-    ]
 
 
 # Other files in the folder
@@ -459,16 +381,6 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
 
 
 # The rest
-
-
-def test_reading_stops_when_it_is_cancelled(tmp_path: Path, read: Reader) -> None:
-    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
-    ctx = StepContext(
-        rng=np.random.default_rng(0), cores=1, scratch=tmp_path, is_cancelled=lambda: True
-    )
-    inputs = ReadPhotos.In(files=InputFiles(name="photos", paths=paths))
-    with pytest.raises(CancelledStepError):
-        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
 
 
 def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Reader) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read.scan import ReadScan
 
-from orthoflow.errors import CancelledStepError, InputError, StoreError
+from orthoflow.errors import InputError, StoreError
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import StepContext
 from tests import scan_files
@@ -361,19 +361,6 @@ def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
 # The method as a whole
 
 
-def test_the_way_a_file_is_cut_into_blocks_does_not_show(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from orthoflow.files.points import las
-
-    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=np.arange(400))
-    whole = read(path)
-    monkeypatch.setattr(las, "BLOCK_POINTS", 399)
-    parted = read(path)
-    np.testing.assert_array_equal(parted.points_world(), whole.points_world())
-    np.testing.assert_array_equal(parted.intensity, whole.intensity)
-
-
 def test_a_picture_from_above_is_drawn(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -387,64 +374,12 @@ def test_a_picture_from_above_is_drawn(
     assert [figure.name for figure in read.ctx.figures] == ["plan", "polar", "scan-lines"]
 
 
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (
-            lambda folder: scan_files.write_ptx(
-                folder / "a.ptx", [(np.zeros((6, 3)), 2, np.eye(4))]
-            ),
-            "a.ptx holds no usable points: of 6, left out are 6 no return",
-        ),
-        (
-            lambda folder: write_text(folder / "a.xyz", [], header="x y z"),
-            "a.xyz has no line with three numbers",
-        ),
-        (
-            lambda folder: scan_files.write_las(folder / "a.laz", np.empty((0, 3))),
-            "a.laz holds no points",
-        ),
-        (
-            lambda folder: write_text(folder / "a.xyz", [[1.0, 2.0, np.nan]]),
-            "a.xyz holds no usable points: of 1, left out are 1 not finite",
-        ),
-    ],
-    ids=["no-returns", "blank", "empty", "not-finite"],
-)
-def test_an_empty_cloud_is_refused(
-    tmp_path: Path, read: Reader, write: Callable[[Path], Path], message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        read(write(tmp_path))
-
-
-def test_columns_without_a_text_file_are_said_to_do_nothing(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
-) -> None:
-    read(scan_files.write_las(tmp_path / "a.laz", points), columns="x y z")
-    assert "columns has no effect: it only concerns text files" in read.warnings
-    text = write_text(tmp_path / "a.xyz", points)
-    for columns in ("x y z", None):
-        read(text, columns=columns)
-        assert "columns only concerns" not in read.warnings
-
-
 def test_too_little_scratch_space_is_said_before_anything_is_written(
     tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(StoreError, match=r"400 points need 0\.00 GB of scratch space, but only"):
         read(scan_files.write_las(tmp_path / "a.laz", points))
-
-
-def test_a_cancelled_step_stops_between_blocks(tmp_path: Path, points: NDArray[np.float64]) -> None:
-    ctx = StepContext(
-        rng=np.random.default_rng(0), cores=1, scratch=tmp_path, is_cancelled=lambda: True
-    )
-    path = write_text(tmp_path / "a.xyz", points)
-    inputs = ReadScan.In(files=InputFiles(name="scan", paths=(path,)))
-    with pytest.raises(CancelledStepError):
-        ReadScan().run(inputs, ReadScan.Params(), ctx)
 
 
 # Real scans

@@ -68,12 +68,3 @@ def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Pa
 def test_what_cannot_be_is_said_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read(tmp_path, text)
-
-
-def test_all_problems_are_said_at_once(tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, "photo,u_px,v_px,x,y,z\na.jpg,x,2,3,4,5\na.jpg,1,2,3,4,5\na.jpg,1,2,3,4,!\n")
-    assert [line.split(": ")[0] for line in str(caught.value).splitlines()] == [
-        "ties0.csv:2",
-        "ties0.csv:4",
-    ]
