@@ -17,7 +17,6 @@ module converts.
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,27 +29,14 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ValidationError,
     ValidationInfo,
     field_validator,
 )
-from pydantic_core import ErrorDetails
 
 from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.cube_faces import WIDEST_DEG, FisheyeLens, problem_of
 from orthoflow.files.sidecars import write_text
-from orthoflow.files.yaml_positions import (
-    Dialect,
-    Entry,
-    Listing,
-    Position,
-    Table,
-    Text,
-    Value,
-    describe,
-    plain,
-    read_yaml,
-)
+from orthoflow.files.yaml_positions import read_model
 from orthoflow.foreign_text import text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
@@ -63,13 +49,6 @@ MOST_CAMERAS: Final = 1000
 #: values of a calibration file, aliases expanded
 MOST_VALUES: Final = 20_000
 _REQUIRED: Final = ("width", "height", "fx", "fy", "cx", "cy")
-_START: Final = Position(line=1, column=1)
-_DIALECT: Final = Dialect(
-    is_strict=False,
-    most_values=MOST_VALUES,
-    empty="the calibration file is empty",
-    duplicate='found duplicate key "{key}"; remove one of them',
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,18 +70,21 @@ def read_calibration(path: Path) -> CalibratedLenses:
     Raises:
         InputError: the file cannot be used; one line per problem, `file:line:column: ...`.
     """
-    reader = _Reader(path.name)
-    calibration = reader.read(
-        text_of_file(
-            path,
-            MOST_BYTES,
-            "a calibration file (YAML)",
-            way_out=": give photos of one camera one entry, by a pattern",
-        )
+    text = text_of_file(
+        path,
+        MOST_BYTES,
+        "a calibration file (YAML)",
+        way_out=": give photos of one camera one entry, by a pattern",
     )
-    if calibration is None or reader.problems:
-        raise InputError("\n".join(problem for _, problem in sorted(reader.problems)))
-    return calibration
+    found, problems = read_model(text, _File, MOST_VALUES)
+    if found is None:
+        raise InputError(
+            "\n".join(
+                f"{path.name}:{place.line}:{place.column}: {message}" for place, message in problems
+            )
+        )
+    lenses = [_lens(dict(lens), lens.distortion or ()) for lens in found.cameras.values()]
+    return CalibratedLenses(patterns=tuple(found.cameras), lenses=tuple(lenses))
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -239,6 +221,14 @@ class _Lens(BaseModel):
         return values
 
 
+class _File(BaseModel):
+    """The whole file."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    cameras: Annotated[dict[str, _Lens], Field(min_length=1, max_length=MOST_CAMERAS)]
+
+
 _TERMS: Final = ("k1", "k2", "p1", "p2", "k3")
 _FISHEYE_TERMS: Final = ("k1", "k2", "k3", "k4")
 _FIELDS_ABOVE: Final = len(_Lens.model_fields) - 1
@@ -264,110 +254,6 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
         return two if _folds(lens) else ""
     problem = problem_of(lens)
     return f"the fisheye lens is none: {problem}" if problem else ""
-
-
-class _Reader:
-    """Turns the text into cameras and collects all problems with it."""
-
-    def __init__(self, file_name: str) -> None:
-        self.file_name = file_name
-        self.problems: list[tuple[Position, str]] = []
-
-    def read(self, text: str) -> CalibratedLenses | None:
-        document = read_yaml(text, self, _DIALECT)
-        if document is None:
-            return None
-        if isinstance(document, Text) and document.value is None:
-            self._add(_START, _DIALECT.empty)
-            return None
-        section = document.get("cameras") if isinstance(document, Table) else None
-        if not isinstance(document, Table) or section is None:
-            self._add(
-                _START,
-                "expected the key cameras with one entry per photo name or pattern, as cameras: "
-                f"{{'*': {{{', '.join(f'{key}: ...' for key in _REQUIRED)}}}}}",
-            )
-            return None
-        for entry in document:
-            if entry.key != "cameras":
-                self._add(entry.position, f"{entry.key}: unknown key; expected cameras")
-        if not isinstance(section.value, Table) or not section.value.entries:
-            self._add(section.position, "cameras: expected one entry per photo name or pattern")
-            return None
-        n_cameras = len(section.value.entries)
-        if n_cameras > MOST_CAMERAS:
-            self._add(
-                section.position,
-                f"cameras: expected at most {MOST_CAMERAS} entries, got {n_cameras}; give photos "
-                "of one camera one entry, by a pattern",
-            )
-            return None
-        found = {entry.key: self._lens(entry) for entry in section.value}
-        lenses = {name: lens for name, lens in found.items() if lens is not None}
-        return CalibratedLenses(patterns=tuple(lenses), lenses=tuple(lenses.values()))
-
-    def add(self, position: Position, path: str, message: str) -> None:
-        """Keep a problem of the YAML; positions are lines and columns."""
-        del path
-        self._add(position, message)
-
-    def _lens(self, entry: Entry) -> Intrinsics | FisheyeLens | None:
-        name, values = entry.key, entry.value
-        if not entry.is_text:
-            self._add(
-                entry.position, f'cameras: a photo name must be text, got {name}; write "{name}"'
-            )
-            return None
-        if not isinstance(values, Table):
-            self._add(
-                entry.position,
-                f'cameras."{name}": expected {", ".join(_REQUIRED)} [, distortion]',
-            )
-            return None
-        try:
-            lens = _Lens.model_validate(plain(values))
-        except ValidationError as error:
-            errors = error.errors(include_url=False)
-        else:
-            return _lens(dict(lens), lens.distortion or ())
-        missing = [str(each["loc"][0]) for each in errors if each["type"] == "missing"]
-        if missing:
-            self._add(entry.position, f'cameras."{name}": {", ".join(missing)} missing')
-        for each in errors:
-            if each["type"] != "missing":
-                position, path, value = _place(entry, each["loc"])
-                self._add(position, f'cameras."{name}"{path}: {_sentence(each, value)}')
-        return None
-
-    def _add(self, place: Position, message: str) -> None:
-        self.problems.append((place, f"{self.file_name}:{place.line}:{place.column}: {message}"))
-
-
-def _place(entry: Entry, location: Sequence[int | str]) -> tuple[Position, str, Value]:
-    """Position in the text of a field of an entry, its name in messages, and its value."""
-    position, value, path = entry.position, entry.value, ""
-    for key in location:
-        path += f"[{key}]" if isinstance(key, int) else f".{key}"
-        if isinstance(value, Table) and (field := value.get(str(key))) is not None:
-            position, value = field.position, field.value
-        elif isinstance(value, Listing) and isinstance(key, int):
-            value = value.items[key]
-    return position, path, value
-
-
-def _sentence(error: ErrorDetails, value: Value) -> str:
-    """Describe what pydantic found wrong with a field, and how to correct it."""
-    message = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return message
-    if error["type"] != "extra_forbidden":
-        return f"{message[0].lower()}{message[1:]}, got {describe(value)}"
-    key, known = str(error["loc"][-1]), list(_Lens.model_fields)
-    near = difflib.get_close_matches(key, known, n=1)
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    if key.isdecimal():
-        hint = ", probably a decimal comma: write decimal points"
-    return f"unknown key{hint}; expected {', '.join(known)}"
 
 
 def _folds(camera: Intrinsics) -> bool:

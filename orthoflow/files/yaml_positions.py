@@ -6,12 +6,15 @@ tags and anchor bombs are problems among others instead of the first exception.
 
 from __future__ import annotations
 
+import difflib
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol, TypeAlias
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol, TypeAlias, TypeVar, get_args
 
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import (
@@ -26,6 +29,7 @@ from ruamel.yaml.resolver import VersionedResolver
 from ruamel.yaml.scanner import Scanner
 from ruamel.yaml.tag import Tag
 
+from orthoflow.foreign_text import first_few
 from orthoflow.products.product import JsonValue
 
 #: levels of a workflow or calibration file
@@ -38,9 +42,9 @@ _LONGEST_SHOWN: Final = 100
 # Letters, by YAML's own rule.
 _LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
-_MERGE: Final = "<<"
 
 Scalar: TypeAlias = bool | int | float | str | None
+Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -72,12 +76,11 @@ class Listing:
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A key with its value; whether the key is text, and no number, date, true, false or null."""
+    """A key with its value."""
 
     position: Position
     key: str
     value: Value
-    is_text: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,29 +99,6 @@ class Table:
 
 
 Value: TypeAlias = Text | Listing | Table
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dialect:
-    """What a kind of document may hold, and how some of its mistakes are told.
-
-    Attributes:
-        is_strict: tags, keys that are no text and versions of YAML other than 1.2 are problems, and
-            `<<` is a key as any other. Else tags and versions are read over, `Entry.is_text` tells
-            what keys are, and `<<` takes in the entries of other mappings: behind the table's own
-            ones, which count first, and with the position of the table.
-        most_values: larger documents are refused, aliases expanded.
-        empty: the sentence for a document without any value.
-        duplicate: the one for a key that is there again; may name `{key}` and its first `{line}`.
-    """
-
-    is_strict: bool = True
-    most_values: int = MOST_VALUES
-    empty: str = "the document is empty"
-    duplicate: str = "the key is there already, in line {line}; remove one of them"
-
-
-STRICT: Final = Dialect()
 
 
 class Problems(Protocol):
@@ -165,13 +145,78 @@ def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
-def read_yaml(text: str, log: Problems, dialect: Dialect = STRICT) -> Value | None:
+def read_yaml(text: str, log: Problems, most_values: int = MOST_VALUES) -> Value | None:
     """Read a document; problems go to the log, None when nothing can be read."""
     try:
-        return _Converter(log=log, dialect=dialect).convert(_compose(text, dialect), "", 0)
+        node = _compose(text, most_values)
+        return _Converter(log=log, most_values=most_values).convert(node, "", 0)
     except _UnreadableError as error:
         log.add(error.position, "", str(error))
         return None
+
+
+def read_model(
+    text: str, model: type[Model], most_values: int = MOST_VALUES
+) -> tuple[Model | None, list[tuple[Position, str]]]:
+    """Read a document as a pydantic model, or find out what is wrong with it and where.
+
+    Args:
+        text: the document.
+        model: that forbids other keys.
+        most_values: larger documents are refused, aliases expanded.
+
+    Returns:
+        None with one problem at least, in the order of the text.
+    """
+    log = _Collected()
+    content = read_yaml(text, log, most_values)
+    if isinstance(content, Table) and not log.found:
+        try:
+            return model.model_validate(plain(content)), []
+        except ValidationError as error:
+            for item in error.errors(include_url=False):
+                log.add(*_located(content, model, item))
+    elif content is not None and not log.found:
+        keys = first_few(list(model.model_fields))
+        log.add(content.position, "", f"expected the keys {keys}, got {describe(content)}")
+    return None, sorted(log.found)
+
+
+@dataclass
+class _Collected:
+    found: list[tuple[Position, str]] = field(default_factory=list)
+
+    def add(self, position: Position, path: str, message: str) -> None:
+        self.found.append((position, f"{path}: {message}" if path else message))
+
+
+def _located(
+    content: Table, model: type[BaseModel], item: ErrorDetails
+) -> tuple[Position, str, str]:
+    """Find the position of a mistake in the document, and describe it."""
+    place: Value = content
+    position, keys = content.position, [key for key in item["loc"] if key != "[key]"]
+    known = model
+    for key in keys:
+        entry = place.get(str(key)) if isinstance(place, Table) else None
+        if entry is not None:
+            position, place = entry.position, entry.value
+        elif isinstance(place, Listing) and isinstance(key, int):
+            place = place.items[key]
+            position = place.position
+        kind = known.model_fields[str(key)].annotation if str(key) in known.model_fields else None
+        inner = (arg for arg in get_args(kind) if isinstance(arg, type))
+        known = next((arg for arg in inner if issubclass(arg, BaseModel)), known)
+    path, message = ".".join(map(str, keys))[:_LONGEST_SHOWN], item["msg"]
+    if item["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(keys[-1]), known.model_fields, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known.model_fields)}"
+        return position, path, f"unknown key; {hint}"
+    if item["type"] == "string_type":
+        return position, path, f"expected a text, got {describe(place)}"
+    if item["type"] in ("value_error", "missing"):
+        return position, path, message.removeprefix("Value error, ").replace("Field", "field")
+    return position, path, f"{message[0].lower()}{message[1:]}, got {describe(place)}"
 
 
 class _UnreadableError(Exception):
@@ -180,8 +225,8 @@ class _UnreadableError(Exception):
         self.position = position
 
 
-def _compose(text: str, dialect: Dialect) -> Node:
-    if dialect.is_strict and re.search(r"^%YAML +(?!1\.2\s)", text, re.MULTILINE):
+def _compose(text: str, most_values: int) -> Node:
+    if re.search(r"^%YAML +(?!1\.2\s)", text, re.MULTILINE):
         raise _UnreadableError(
             _START, "expected YAML 1.2, got a %YAML line that asks for another version"
         )
@@ -191,7 +236,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
             yaml = YAML(typ="safe", pure=True)
             yaml.Scanner, yaml.Parser = _QuickScanner, _LimitedParser
             yaml.Resolver = _CoreResolver
-            yaml.parser.most_values = dialect.most_values
+            yaml.parser.most_values = most_values
             node: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
         raise _unreadable(error, text) from error
@@ -200,7 +245,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
             _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
         ) from error
     if node is None:
-        raise _UnreadableError(_START, dialect.empty)
+        raise _UnreadableError(_START, "the document is empty")
     return node
 
 
@@ -217,7 +262,6 @@ _CORE_SCHEMA: Final = (
             r"|[-+]?(\.inf|\.Inf|\.INF)|\.nan|\.NaN|\.NAN"
         ),
     ),
-    ("merge", re.compile(re.escape(_MERGE))),
 )
 
 
@@ -335,18 +379,17 @@ class _Converter:
     """Turns composed nodes into values; aliases are expanded and counted."""
 
     log: Problems
-    dialect: Dialect
+    most_values: int
     n_nodes: int = 0
     open_nodes: set[int] = field(default_factory=set)
 
     def convert(self, node: Node, path: str, depth: int) -> Value:
         position = _mark_position(node.start_mark)
         self.n_nodes += 1
-        if self.n_nodes > self.dialect.most_values:
+        if self.n_nodes > self.most_values:
             raise _UnreadableError(
                 position,
-                f"the document has more than {self.dialect.most_values} values once aliases are "
-                "expanded",
+                f"the document has more than {self.most_values} values once aliases are expanded",
             )
         if id(node) in self.open_nodes:
             raise _UnreadableError(position, "the value contains itself through its anchor")
@@ -371,16 +414,14 @@ class _Converter:
         entries: dict[str, Entry] = {}
         for key_node, value_node in self._joined_entries(node.value, path):
             key_position = _mark_position(key_node.start_mark)
-            key, is_text = self._key(key_node, key_position, path)
+            key = self._key(key_node, key_position, path)
             value = self.convert(value_node, join(path, key), depth + 1)
             if key in entries:
                 first = entries[key].position.line
-                message = self.dialect.duplicate.format(key=key, line=first)
+                message = f"the key is there already, in line {first}; remove one of them"
                 self.log.add(key_position, join(path, key), message)
             else:
-                entries[key] = Entry(position=key_position, key=key, value=value, is_text=is_text)
-        if not self.dialect.is_strict:
-            self._merge(entries, position, path)
+                entries[key] = Entry(position=key_position, key=key, value=value)
         return Table(position=position, entries=tuple(entries.values()))
 
     def _joined_items(self, items: list[Node], path: str) -> list[Node]:
@@ -409,8 +450,7 @@ class _Converter:
     def _is_split(self, before: Node, behind: Node) -> bool:
         """Whether whole numbers have a comma and nothing else between them."""
         return (
-            self.dialect.is_strict
-            and isinstance(before, ScalarNode)
+            isinstance(before, ScalarNode)
             and isinstance(behind, ScalarNode)
             and str(before.tag) == str(behind.tag) == _TAG + "int"
             and behind.start_mark.index == before.end_mark.index + 1
@@ -426,36 +466,13 @@ class _Converter:
         )
         return ScalarNode(_TAG + "float", meant, before.start_mark, behind.end_mark)
 
-    def _key(self, node: Node, position: Position, path: str) -> tuple[str, bool]:
-        """Return a key and whether it is text."""
+    def _key(self, node: Node, position: Position, path: str) -> str:
         if not isinstance(node, ScalarNode):
             self.log.add(position, path, "a key must be text, got a list or mapping")
-            return "?", True
-        is_text = str(node.tag) == _TAG + "str"
-        if self.dialect.is_strict and str(node.tag) == _TAG + "merge":
-            return str(node.value), True
-        if self.dialect.is_strict and not is_text:
+            return "?"
+        if str(node.tag) != _TAG + "str":
             self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
-        return str(node.value), is_text
-
-    def _merge(self, entries: dict[str, Entry], position: Position, path: str) -> None:
-        """Put what `<<` takes in behind the entries of a table, which has this position."""
-        merged = entries.get(_MERGE)
-        # In quotes it is a key as any other.
-        if merged is None or merged.is_text:
-            return
-        del entries[_MERGE]
-        tables = merged.value.items if isinstance(merged.value, Listing) else (merged.value,)
-        for table in tables:
-            if not isinstance(table, Table):
-                self.log.add(
-                    merged.position,
-                    join(path, _MERGE),
-                    f"expected a mapping or a list of mappings to merge, got {describe(table)}",
-                )
-                continue
-            for entry in table:
-                entries.setdefault(entry.key, replace(entry, position=position))
+        return str(node.value)
 
     def _scalar(self, node: ScalarNode, position: Position, path: str) -> Scalar:
         tag, text = str(node.tag), str(node.value)
@@ -468,8 +485,7 @@ class _Converter:
         return text
 
     def _refuse_tag(self, node: Node, position: Position, path: str) -> None:
-        if self.dialect.is_strict:
-            self.log.add(position, path, f"tags are not allowed in a workflow, got {node.tag}")
+        self.log.add(position, path, f"tags are not allowed, got {node.tag}")
 
 
 def join(path: str, key: str) -> str:
@@ -479,7 +495,7 @@ def join(path: str, key: str) -> str:
 
 def _parse_scalar(kind: str, text: str) -> Scalar:
     match kind:
-        case "str" | "merge":
+        case "str":
             return text
         case "null":
             return None

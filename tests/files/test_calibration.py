@@ -113,10 +113,9 @@ def test_a_fisheye_has_terms_of_its_own(tmp_path: Path) -> None:
 
 
 def test_values_may_be_shared_between_cameras(tmp_path: Path) -> None:
-    text = "cameras:\n  a.jpg: &c {" + GOOD + "}\n  b.jpg: *c\n  c.jpg: {<<: *c, fx: 2900}\n"
+    text = "cameras:\n  a.jpg: &c {" + GOOD + "}\n  b.jpg: *c\n"
     calibration = read(tmp_path, text)
-    assert [item.fx for item in calibration.lenses] == [3000.0, 3000.0, 2900.0]
-    assert [item.fy for item in calibration.lenses] == [3001.5] * 3
+    assert [item.fx for item in calibration.lenses] == [3000.0, 3000.0]
 
 
 def folds(radii: np.ndarray, k1: float, k2: float, k3: float) -> bool:
@@ -195,41 +194,35 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("", "calibration.yaml:1:1: the calibration file is empty"),
-        ("- 1\n", "photo name or pattern, as cameras: {'*': {width: ..., height: ..., "),
-        ("cameras: {}\n", "1:1: cameras: expected one entry per photo name or pattern"),
-        (
-            "cameras:\n  1: {" + GOOD + "}\n",
-            '2:3: cameras: a photo name must be text, got 1; write "1"',
-        ),
-        ("cameras:\n  a.jpg: 5\n", '2:3: cameras."a.jpg": expected width, height'),
-        (
-            "cameras:\n  a.jpg: {width: 10, height: 5}\n",
-            '2:3: cameras."a.jpg": fx, fy, cx, cy missing',
-        ),
+        ("", "calibration.yaml:1:1: the document is empty"),
+        ("- 1\n", "calibration.yaml:1:1: expected the keys cameras, got a list"),
+        ("cameras: {}\n", "1:1: cameras: dictionary should have at least 1 item"),
+        ("cameras:\n  1: {" + GOOD + "}\n", "2:3: cameras: a key must be text, got 1"),
+        ("cameras:\n  a.jpg: 5\n", "2:3: cameras.a.jpg: input should be a valid dictionary"),
+        ("cameras:\n  a.jpg: {width: 10}\n", "2:3: cameras.a.jpg.fx: field required"),
         (
             "cameras:\n  a.jpg:\n    heigth: 5\n",
-            '3:5: cameras."a.jpg".heigth: unknown key (did you mean height?)',
+            "3:5: cameras.a.jpg.heigth: unknown key; did you mean height?",
         ),
         (
             "cameras:\n  a.jpg: {width: 4000, height: 3000, fx: 3000,5, fy: 3000}\n",
-            '.5: unknown key, probably a decimal comma: write decimal points; expected',
+            "3000,5 is two numbers; decimals have a point: 3000.5",
         ),
-        ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key; expected cameras"),
-        ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", 'found duplicate key "a"; remove one'),
+        ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key; there are cameras"),
+        ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", "the key is there already, in line 1"),
         ("cameras: {a: {" + GOOD + "]}", "calibration.yaml:1:14: this is not YAML: the brace"),
         (
             "cameras:\n  a.jpg: {width: 4000.5}\n",
-            '2:11: cameras."a.jpg".width: input should be a valid integer, got 4000.5',
+            '2:11: cameras.a.jpg.width: input should be a valid integer, got 4000.5',
         ),
-        ("cameras:\n  a.jpg: {fx: .nan}\n", '".fx: input should be a finite number, got nan'),
+        ("cameras:\n  a.jpg: {fx: .nan}\n", '.fx: input should be a finite number, got nan'),
         (
             'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, 0, 0]}}",
             "expected the 5 numbers [k1, k2, p1, p2, k3], got 4 values",
         ),
         (
             'cameras: {"*": {field_of_view_deg: 90, ' + GOOD + "}}",
-            'cameras."*".distortion: field_of_view_deg belongs to model: fisheye',
+            'cameras.*.distortion: field_of_view_deg belongs to model: fisheye',
         ),
         (
             'cameras: {"*": {model: fisheye, field_of_view_deg: 400, ' + GOOD + "}}",
@@ -241,7 +234,7 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         ),
         (
             'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, x, 0, 0]}}",
-            'cameras."*".distortion[2]: input should be a valid number, got the text "x"',
+            'cameras.*.distortion.2: input should be a valid number, got the text "x"',
         ),
         (
             'cameras: {"*": {' + GOOD.replace("fx: 3000", "fx: 28") + "}}",
@@ -249,11 +242,11 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         ),
         (
             'cameras: {"*": {' + GOOD.replace("cx: 1999.5", "cx: 19995") + "}}",
-            'cameras."*".cx: expected the principal point in pixels',
+            'cameras.*.cx: expected the principal point in pixels',
         ),
         (
             'cameras: {"*": {' + GOOD + ", distortion: [-1.5, 0, 0, 0, 0]}}",
-            'cameras."*".distortion: the lens model folds back inside the image',
+            'cameras.*.distortion: the lens model folds back inside the image',
         ),
     ],
 )  # fmt: skip

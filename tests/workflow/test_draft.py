@@ -462,7 +462,7 @@ def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
         (
             "calibration.yaml",
             'cameras:\n  "*.jpg": {width: 9, height: 9, fx: 9,1, fy: 9, cx: 4, cy: 4}\n',
-            "unknown key, probably a decimal comma: write decimal points",
+            "decimals have a point",
         ),
     ],
 )

@@ -205,7 +205,7 @@ CASES = {
         "steps.x.variants.a.in",
         "unknown key in",
     ),
-    "a tag": ("x: !python {use: simulate.room}", "steps.x", "tags are not allowed in a workflow"),
+    "a tag": ("x: !python {use: simulate.room}", "steps.x", "tags are not allowed"),
     "a key that is no text": ("3: {use: simulate.room}", "steps", "a key must be text, got 3"),
     "a key that is a list": ("? [a]\n: 1", "steps", "a key must be text, got a list or mapping"),
 }

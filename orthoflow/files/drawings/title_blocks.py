@@ -14,25 +14,14 @@ revisions:
 
 from __future__ import annotations
 
-import difflib
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image
-from orthoflow.files.yaml_positions import (
-    Dialect,
-    Listing,
-    Position,
-    Table,
-    Value,
-    describe,
-    plain,
-    read_yaml,
-)
+from orthoflow.files.yaml_positions import read_model
 from orthoflow.foreign_text import open_file, reading, text_of_file
 
 #: bytes of the title block of sheets
@@ -40,7 +29,6 @@ MOST_BYTES: Final = 100_000
 #: characters of one of its fields
 MOST_LETTERS: Final = 300
 _MOST_LOGO_BYTES: Final = 4_000_000
-_DIALECT: Final = Dialect(is_strict=False, empty="the title block is empty")
 
 
 def _checked_text(value: object) -> object:
@@ -106,16 +94,6 @@ class TitleBlock(_Model):
     revisions: Annotated[tuple[Revision, ...], Field(max_length=12)] = ()
 
 
-@dataclass
-class _Problems:
-    """Collects the problems of a document."""
-
-    found: list[tuple[Position, str]] = field(default_factory=list)
-
-    def add(self, position: Position, path: str, message: str) -> None:
-        self.found.append((position, f"{path}: {message}" if path else message))
-
-
 def read_title_block(path: Path) -> TitleBlock:
     """Read a title block.
 
@@ -123,21 +101,10 @@ def read_title_block(path: Path) -> TitleBlock:
         InputError: the file cannot be read, or has other content; one sentence, about the first
             place.
     """
-    problems = _Problems()
     text = text_of_file(path, MOST_BYTES, "a title block (YAML)")
-    content = read_yaml(text, problems, _DIALECT)
-    block = None
-    if isinstance(content, Table) and not problems.found:
-        try:
-            block = TitleBlock.model_validate(plain(content))
-        except ValidationError as error:
-            for item in error.errors():
-                problems.add(*_located(content, item))
-    elif content is not None and not problems.found:
-        said = f"expected fields of a title block such as project, got {describe(content)}"
-        problems.add(Position(line=1, column=1), "", said)
-    if problems.found or block is None:
-        position, message = min(problems.found)
+    block, problems = read_model(text, TitleBlock)
+    if block is None:
+        position, message = problems[0]
         raise InputError(f"{path.name}:{position.line}:{position.column}: {message}")
     if block.logo is None:
         return block
@@ -145,27 +112,3 @@ def read_title_block(path: Path) -> TitleBlock:
     with reading(logo, _MOST_LOGO_BYTES, "a logo (PNG or JPEG)"), open_file(logo) as stream:
         decode_image(stream.read(_MOST_LOGO_BYTES), logo.name)
     return block.model_copy(update={"logo": logo})
-
-
-def _located(content: Table, item: Any) -> tuple[Position, str, str]:
-    """Find the position of a mistake in the document, and describe it."""
-    place: Value = content
-    position, path = content.position, [str(key) for key in item["loc"] if key != "[key]"]
-    for key in item["loc"]:
-        entry = place.get(str(key)) if isinstance(place, Table) else None
-        if entry is not None:
-            position, place = entry.position, entry.value
-        elif isinstance(place, Listing) and isinstance(key, int):
-            place = place.items[key]
-            position = place.position
-    name = ".".join(path)[:100]
-    if item["type"] == "extra_forbidden":
-        known = list(TitleBlock.model_fields if len(path) == 1 else Revision.model_fields)
-        near = difflib.get_close_matches(path[-1], known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-        return position, name, f"no field of a title block; {hint}"
-    if item["type"] == "string_type":
-        return position, name, f"expected a text, got {describe(place)}"
-    if item["type"] == "value_error":
-        return position, name, str(item["ctx"]["error"])
-    return position, name, f"{str(item['msg'])[0].lower()}{item['msg'][1:]}, got {describe(place)}"

@@ -27,12 +27,12 @@ def test_every_field_is_read_as_text(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("projct: a\n", "block.yaml:1:1: projct: no field of a title block; did you mean project?"),
-        ("a: 1\nzzz: b\n", "block.yaml:1:1: a: no field of a title block; there are layout, lo"),
+        ("projct: a\n", "block.yaml:1:1: projct: unknown key; did you mean project?"),
+        ("a: 1\nzzz: b\n", "block.yaml:1:1: a: unknown key; there are layout, lo"),
         ("title: [1]\n", "block.yaml:1:1: title: expected a text, got a list"),
         ("title:\n", "title: expected a text, got nothing"),
-        ("- a\n", "block.yaml:1:1: expected fields of a title block such as project, got a list"),
-        ("", "the title block is empty"),
+        ("- a\n", "block.yaml:1:1: expected the keys layout, logo"),
+        ("", "the document is empty"),
         ("title: a\ntitle: b\n", "the key is there already, in line 1; remove one of them"),
         (f"note: {'a' * 301}\n", "note: has 301 letters, at most 300 fit on a sheet"),
         ("layout: middle\n", "block.yaml:1:1: layout: input should be 'column' or 'strip', got"),
@@ -40,7 +40,7 @@ def test_every_field_is_read_as_text(tmp_path: Path) -> None:
         ("title: a\nrevisions:\n  - {by: A}\n", "block.yaml:3:5: revisions.0.mark: field required"),
         (
             "revisions: [{mark: A, texts: b}]\n",
-            "block.yaml:1:23: revisions.0.texts: no field of a title block; did you mean text?",
+            "block.yaml:1:23: revisions.0.texts: unknown key; did you mean text?",
         ),
         ("logo: none.png\n", "none.png cannot be read: No such file"),
         ("logo: block.yaml\n", "block.yaml is not a JPEG, PNG, TIFF"),
